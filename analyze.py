@@ -1,0 +1,751 @@
+"""From a folder of runs to the paper's tables and figures, with statistics fit for few seeds.
+
+    python analyze.py
+    python analyze.py --runs-dir runs --out results --compare results/paper
+
+Open results/report.html first. Tables are written as csv, md and tex, figures as png and pdf.
+
+The unit of replication is the seed: a run's value at a step is the mean over its test episodes, and
+every mean, standard deviation (ddof=1) and interval is taken over runs. Only finished runs (those
+with a result.json) count; all others are listed. The paper is Khraishi and Okhrati (2023),
+https://arxiv.org/abs/2305.02882; IQM and probability of improvement are those of Agarwal et al.
+(2021), https://arxiv.org/abs/2108.13264.
+"""
+
+import json
+import re
+import sys
+from dataclasses import dataclass
+from functools import cache, reduce
+from itertools import product
+from math import ceil, comb, prod
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import tyro
+from scipy import stats
+from scipy.optimize import brentq
+
+from analyze_report import figures, text_table, write_figure, write_report, write_table
+
+BASELINE = ("", "0.00")  # a configuration is (noise, noise_rate), both as text
+EVAL_HEADER = "step,episode,episodic_return,episodic_length\n"
+# Arguments that do not change what is learned; the grids of evaluation steps are intersected.
+NOT_SETTINGS = {"env_id", "seed", "noise", "noise_rate", "runs_dir", "overwrite", "cuda", "compile"}
+NOT_SETTINGS |= {"torch_threads", "checkpoint_frequency", "eval_frequency"}
+MIN_SEEDS = 3  # with fewer there is no interval
+RESAMPLES = 2000
+# Seeds -> percent of simulated samples whose 95 % interval holds the true IQM: the worst of normal,
+# skewed and two-peaked returns, 500 samples each (tests/test_analyze.py::test_coverage).
+COVERAGE = {3: 91, 5: 95, 10: 94}
+KEYS = ["algorithm", "environment", "noise", "noise_rate"]
+PAPER_SEEDS = {"SAC": 5, "TD3": 5, "PPO": 10}
+PAPER_ENVIRONMENTS = 5
+
+
+@dataclass
+class Args:
+    """Command-line arguments."""
+
+    runs_dir: Path = Path("runs")
+    """the folder that holds the run folders"""
+    out: Path = Path("results")
+    """where the tables, the figures and report.html go"""
+    compare: Path | None = None
+    """a folder with the paper's tables as csv (results/paper): adds compare_* tables"""
+
+
+# ------------------------------------------------------------------------------------------ reading
+
+
+def rate_text(rates):
+    """Spell noise rates as the paper does: [] -> "0.00", [0.5, 1] -> "0.50 + 1.00"."""
+    texts = [f"{r:.2f}" if round(r, 2) == r else f"{r:g}" for r in map(float, rates)]
+    return " + ".join(texts) or BASELINE[1]
+
+
+def read_config(folder):
+    """Read what identifies a run from its config.json."""
+    config = json.loads((folder / "config.json").read_text())
+    args = config["args"]
+    settings = {name: value for name, value in args.items() if name not in NOT_SETTINGS}
+    return {
+        "base": config["algorithm"],
+        "environment": args["env_id"],
+        "noise": " + ".join(args["noise"]),
+        "noise_rate": rate_text(args["noise_rate"]),
+        "seed": int(args["seed"]),
+        "episodes": int(args["eval_episodes"]),
+        "total": int(args["total_timesteps"]),
+        "settings": json.dumps(settings, sort_keys=True),
+        "versions": config.get("versions", {}),
+    }
+
+
+def read_evaluations(folder, episodes, total):
+    """Read eval.csv: the evaluation steps and the mean return over the episodes of each.
+
+    Raises ValueError unless every evaluation is whole, in order, and the last is at step `total`.
+    """
+    text = (folder / "eval.csv").read_text()
+    if not text.startswith(EVAL_HEADER):
+        raise ValueError("eval.csv: unexpected header")
+    if not text.endswith("\n"):
+        raise ValueError("eval.csv: the last line is half-written")
+    if len(text) == len(EVAL_HEADER):
+        raise ValueError("eval.csv: no evaluation")
+    rows = np.loadtxt(folder / "eval.csv", delimiter=",", skiprows=1, ndmin=2, comments=None)
+    if rows.shape[1] != 4 or len(rows) % episodes or not np.isfinite(rows).all():
+        raise ValueError("eval.csv: incomplete or non-numeric lines")
+    step, episode, episodic_return, _ = np.moveaxis(rows.reshape(-1, episodes, 4), 2, 0)
+    if (episode != np.arange(episodes)).any() or (step != step[:, :1]).any():
+        raise ValueError("eval.csv: an evaluation is incomplete")
+    if (np.diff(step[:, 0]) <= 0).any() or step[-1, 0] != total:
+        raise ValueError(f"eval.csv: steps do not ascend to {total}")
+    return step[:, 0].astype(int), episodic_return.mean(axis=1)
+
+
+def read_runs(runs_dir):
+    """Read all run folders; `status` is finished, unfinished, corrupt or duplicate."""
+    rows = []
+    for folder in sorted(path for path in Path(runs_dir).iterdir() if path.is_dir()):
+        row = {"run": folder.name, "status": "corrupt"}
+        rows.append(row)
+        try:
+            row |= read_config(folder)
+            if not (folder / "result.json").exists():
+                row |= {"status": "unfinished", "reason": f"no result.json; {progress(folder)}"}
+                continue
+            result = json.loads((folder / "result.json").read_text())
+            steps, returns = read_evaluations(folder, row["episodes"], row["total"])
+            if not np.isclose(returns[-1], result["final_return_mean"], rtol=1e-3, atol=1e-3):
+                raise ValueError("eval.csv and result.json disagree on the final return")
+            row |= {"status": "finished", "steps": steps, "returns": returns}
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            row["reason"] = " ".join(f"{type(error).__name__}: {error}".split())
+    runs = pd.DataFrame(rows, columns=COLUMNS["runs"].split(), dtype=object)
+    for base, group in runs.groupby("base"):
+        runs.loc[group.index, "algorithm"] = labels(base, group)
+    twice = (runs["status"] == "finished") & runs.duplicated(["status", *KEYS, "seed"])
+    runs.loc[twice, ["status", "reason"]] = ["duplicate", "same configuration and seed as another"]
+    return runs
+
+
+def labels(base, group):
+    """Name each run's algorithm so that runs with different settings never share a row.
+
+    It is the plain name (SAC) unless runs differ in settings or in the version of one environment;
+    then it says what differs (SAC [total_timesteps=100000]).
+    """
+    settings = {text: json.loads(text) for text in set(group["settings"])}
+    names = sorted(set().union(*settings.values()))
+    names = [n for n in names if len({str(values.get(n)) for values in settings.values()}) > 1]
+    environments = set(group["environment"])
+    several = len(environments) > len({split_version(env)[0] for env in environments})
+    result = []
+    for text, env in zip(group["settings"], group["environment"], strict=True):
+        parts = [f"{name}={settings[text].get(name)}" for name in names]
+        parts += [f"environments v{split_version(env)[1]}"] if several else []
+        result.append(base + (f" [{', '.join(parts)}]" if parts else ""))
+    return result
+
+
+def split_version(environment):
+    """Split "Hopper-v5" into ("Hopper", "5"); an id without a version gives "" for it."""
+    return re.fullmatch(r"(.*?)(?:-v(\d+))?", environment).groups("")
+
+
+def progress(folder):
+    """Say in words how far an unfinished run is."""
+    try:
+        last = (folder / "eval.csv").read_text().rsplit("\n", 2)[-2]
+        return f"evaluated up to step {int(last.split(',')[0]):,}"
+    except (OSError, ValueError, IndexError):
+        return "no evaluation yet"
+
+
+def missing_runs(runs):
+    """List the runs that the grid of what was found would have, and that are not there.
+
+    Per algorithm the grid is (configurations found) x (environments found) x (seeds found).
+    """
+    rows = []
+    for algorithm, group in runs[runs["base"].notna()].groupby("algorithm"):
+        configs = {*zip(group["noise"], group["noise_rate"], strict=True), BASELINE}
+        environments, seeds = sorted(set(group["environment"])), sorted(set(group["seed"]))
+        found = set(group[[*KEYS[1:], "seed"]].itertuples(index=False, name=None))
+        for env, (noise, rate), seed in product(environments, sorted(configs, key=order), seeds):
+            if (env, noise, rate, seed) not in found:
+                rows.append((algorithm, env, noise, rate, int(seed), "missing", "no run folder"))
+    return pd.DataFrame(rows, columns=[*KEYS, "seed", "status", "reason"])
+
+
+def order(config):
+    """Sort key of a configuration: by noise, then by rates as numbers; the baseline comes first."""
+    return config[0], [float(rate) for rate in config[1].split(" + ")]
+
+
+@dataclass
+class Study:
+    """The finished runs that may be compared: one algorithm with one set of settings."""
+
+    algorithm: str
+    base: str
+    environments: list
+    seeds: list
+    steps: np.ndarray  # the evaluation steps that all runs share
+    returns: dict  # (noise, noise_rate) -> array (steps x seeds x envs), NaN where there is no run
+
+    def final(self, config):
+        """Return the (seeds x envs) array of final test returns."""
+        return self.returns[config][-1]
+
+
+def make_studies(runs):
+    """Arrange the finished runs into a list of Study, and list in words what had to be cut."""
+    studies, notes = [], []
+    finished = runs[runs["status"] == "finished"]
+    for algorithm, group in finished.groupby("algorithm"):
+        grids = list({steps.tobytes(): steps for steps in group["steps"]}.values())
+        grid = reduce(np.intersect1d, grids)
+        longest = max(map(len, grids))
+        if len(grid) < longest:
+            notes.append(
+                f"{algorithm}: runs differ in their evaluation steps; curves are cut to the "
+                f"{len(grid)} steps that all share (of up to {longest})"
+            )
+        envs, seeds = sorted(set(group["environment"])), sorted(set(group["seed"]))
+        configs = {*zip(group["noise"], group["noise_rate"], strict=True), BASELINE}
+        shape = (len(grid), len(seeds), len(envs))
+        returns = {config: np.full(shape, np.nan) for config in sorted(configs, key=order)}
+        for run in group.itertuples():
+            place = seeds.index(run.seed), envs.index(run.environment)
+            shared = np.isin(run.steps, grid)
+            returns[run.noise, run.noise_rate][:, *place] = run.returns[shared]
+        for env, values in zip(envs, returns[BASELINE][-1].T, strict=True):
+            if np.isnan(values).all():
+                notes.append(f"{algorithm}: no finished baseline on {env}, so no improvement there")
+        base = group["base"].iloc[0]
+        studies.append(Study(algorithm, base, envs, seeds, grid, returns))
+    for library in sorted(set().union(*finished["versions"])):
+        counts = finished["versions"].map(lambda v, k=library: str(v.get(k))).value_counts()
+        if len(counts) > 1:
+            found = ", ".join(f"{v} ({n} runs)" for v, n in sorted(counts.items()))
+            notes.append(f"runs with different versions of {library} share rows: {found}")
+    return studies, notes
+
+
+# -------------------------------------------------------------- statistics on (seeds x envs) arrays
+
+
+def columns(scores):
+    """Split a (seeds x envs) array into one array per environment, without the missing runs."""
+    return [column[np.isfinite(column)] for column in np.asarray(scores, float).T]
+
+
+def mean_std(values):
+    """Mean, sample standard deviation (ddof=1) and number of the values that are not NaN."""
+    values = np.asarray(values, float)
+    values = values[np.isfinite(values)]
+    mean = values.mean() if len(values) else np.nan
+    return mean, values.std(ddof=1) if len(values) > 1 else np.nan, len(values)
+
+
+def improvement_percent(noisy, baseline):
+    """100 (noisy - baseline) / |baseline|: positive is better, for negative returns too."""
+    scale = np.where(np.equal(baseline, 0), np.nan, np.abs(baseline))
+    return 100 * (noisy - baseline) / scale
+
+
+def iqm(scores):
+    """Interquartile mean over the last axis: int(n / 4) values are cut from each end.
+
+    scores (..., n) -> (...). As rliable's aggregate_iqm (Agarwal et al., 2021).
+    """
+    return stats.trim_mean(scores, 0.25, axis=-1)
+
+
+def bootstrap_iqm(scores, baseline=None, resamples=RESAMPLES):
+    """IQM over seeds and environments with its 95 % interval.
+
+    The interval is iqm +- t_{0.975, df} SE (Efron and Tibshirani, 1993, chapter 12): SE is the
+    standard deviation of the IQM over stratified bootstrap samples (seeds drawn anew within each
+    environment), and df = sum over envs of (n - 1). With a baseline the scores are improvements in
+    percent over its mean in each environment, and its seeds are resampled too: that mean is an
+    estimate as well.
+
+    scores (seeds x envs), baseline (other seeds x envs) or None -> iqm, low, high.
+    """
+    rng = np.random.default_rng(0)
+    cells = columns(scores)
+    values = [x[rng.integers(len(x), size=(resamples, len(x)))] for x in cells]
+    if baseline is not None:
+        means = columns(baseline)
+        drawn = [y[rng.integers(len(y), size=(resamples, len(y)))].mean(-1) for y in means]
+        pairs = zip(values, drawn, strict=True)
+        values = [improvement_percent(x, y[:, None]) for x, y in pairs]
+        cells = [improvement_percent(x, y.mean()) for x, y in zip(cells, means, strict=True)]
+    estimate = iqm(np.concatenate(cells))
+    sizes = [len(x) for x in cells] + ([len(y) for y in means] if baseline is not None else [])
+    if min(sizes) < MIN_SEEDS:
+        return estimate, np.nan, np.nan
+    error = iqm(np.concatenate(values, axis=-1)).std(ddof=1)
+    half = stats.t.ppf(0.975, sum(len(x) - 1 for x in cells)) * error
+    return estimate, estimate - half, estimate + half
+
+
+def win_rate(x, y):
+    """Mann-Whitney's U over (n m): the share of pairs with x > y, a tie counting half."""
+    return np.mean((x[:, None] > y) + 0.5 * (x[:, None] == y))
+
+
+def newcombe_interval(p, n, m):
+    """95 % interval of a win rate p of n against m: method 5 of Newcombe (2006).
+
+    Unlike the percentile bootstrap it does not collapse to a point at p = 0 or 1.
+    https://doi.org/10.1002/sim.2324
+    """
+    z, k = stats.norm.ppf(0.975), (n + m) / 2 - 1
+
+    def gap(t):
+        variance = t * (1 - t) * (1 + k * (1 - t) / (2 - t) + k * t / (1 + t)) / (n * m)
+        return (p - t) ** 2 - z**2 * variance
+
+    inside = np.clip(
+        p, 1e-9, 1 - 1e-9
+    )  # gap(p) < 0 between the two limits, but gap(0) = gap(1) = 0
+    low = brentq(gap, 0, inside) if p > 0 else 0.0
+    high = brentq(gap, inside, 1) if p < 1 else 1.0
+    return low, high
+
+
+def probability_of_improvement(x, y):
+    """P(x > y) averaged over environments (as rliable), with a 95 % interval.
+
+    The environments' Newcombe intervals are combined by the square-and-add rule (MOVER; Zou and
+    Donner, 2008). x (seeds x envs), y (seeds x envs) -> p, low, high.
+    """
+    x, y = columns(x), columns(y)
+    rates = np.array([win_rate(a, b) for a, b in zip(x, y, strict=True)])
+    if min(map(len, x + y)) < MIN_SEEDS:
+        return rates.mean(), np.nan, np.nan
+    limits = [newcombe_interval(p, len(a), len(b)) for p, a, b in zip(rates, x, y, strict=True)]
+    below, above = np.abs(rates[:, None] - limits).T
+    p = rates.mean()
+    return p, p - np.hypot.reduce(below) / len(x), p + np.hypot.reduce(above) / len(x)
+
+
+@cache
+def mann_whitney_null(n, m):
+    """Probabilities of U = 0 ... n m when all orders of n + m values are equally likely."""
+    if n == 0 or m == 0:
+        return np.ones(1)
+    null = np.zeros(n * m + 1)  # the largest value belongs to x (it wins m pairs) or to y
+    null[m:] += n / (n + m) * mann_whitney_null(n - 1, m)
+    null[: n * (m - 1) + 1] += m / (n + m) * mann_whitney_null(n, m - 1)
+    return null
+
+
+def mann_whitney(x, y):
+    """Exact two-sided Mann-Whitney test, stratified by environment: p, and the smallest possible p.
+
+    The statistic is the sum of U over environments; its null distribution is the convolution of
+    theirs. x (seeds x envs), y (seeds x envs) -> p, smallest p = 2 / prod over envs of C(n+m, n).
+    """
+    pairs = list(zip(columns(x), columns(y), strict=True))
+    sizes = [(len(a), len(b)) for a, b in pairs]
+    u = sum(win_rate(a, b) * len(a) * len(b) for a, b in pairs)
+    null = reduce(np.convolve, [mann_whitney_null(n, m) for n, m in sizes])
+    below, above = null[: int(np.ceil(u)) + 1].sum(), null[int(np.floor(u)) :].sum()
+    smallest = 2 / prod(comb(n + m, n) for n, m in sizes)
+    return min(1.0, 2 * min(below, above)), min(1.0, smallest)
+
+
+def leave_one_seed_out(finals):
+    """Value of the best configuration without the luck of choosing it on its own seeds.
+
+    The configuration that is best on all other seeds is measured on the seed s that was left out:
+    mean over s of finals[argmax_c mean_{t != s} finals[c, t], s].
+
+    finals (configs x seeds) -> float.
+    """
+    held_out = []
+    for seed in range(finals.shape[1]):
+        others = np.delete(finals, seed, axis=1)
+        able = finals[np.isfinite(finals[:, seed]) & np.isfinite(others).any(axis=1)]
+        if len(able):
+            means = np.nanmean(np.delete(able, seed, axis=1), axis=1)
+            held_out.append(able[means.argmax(), seed])
+    return np.mean(held_out) if held_out else np.nan
+
+
+def steps_to_reach(curves, steps, target):
+    """First step with a mean over seeds of at least `target`, or NaN. curves (steps x seeds)."""
+    curves = curves[:, np.isfinite(curves).all(axis=0)]
+    reached = np.flatnonzero(curves.mean(axis=1) >= target)
+    return steps[reached[0]] if len(reached) else np.nan
+
+
+# ------------------------------------------------------------------------------------------- tables
+
+COLUMNS = {
+    "runs": """run status reason base algorithm environment noise noise_rate seed episodes total
+        settings versions steps returns""",
+    "summary": """algorithm environment noise noise_rate n mean std n_baseline baseline_mean
+        baseline_std improvement_percent std_change_percent steps_to_baseline""",
+    "best": """algorithm environment noise noise_rate n_baseline n baseline_mean baseline_std
+        noisy_mean noisy_std improvement_percent chosen_from leave_one_seed_out_mean
+        leave_one_seed_out_percent""",
+    "consistency": """algorithm noise noise_rate percent_of_environments
+        average_improvement_percent std_improvement_percent environments n fails_at_every_rate""",
+    "early_performance": "algorithm environment noise steps_millions noise_rate mean std n",
+    "statistics": """algorithm environment noise noise_rate environments n n_baseline
+        iqm iqm_low iqm_high improvement_iqm_percent improvement_low improvement_high
+        probability_of_improvement probability_low probability_high excludes_no_improvement
+        p p_adjusted smallest_p smallest_p_adjusted""",
+}
+
+
+def frame(name, rows):
+    """Make a table of a list of dicts, with the columns of its kind even when it is empty."""
+    return pd.DataFrame(list(rows), columns=COLUMNS[name].split())
+
+
+def summary_rows(study):
+    """Yield the final mean and std of every configuration, against the baseline of its env."""
+    for (e, env), config in product(enumerate(study.environments), study.returns):
+        mean, std, n = mean_std(study.final(config)[:, e])
+        if n == 0:
+            continue
+        base_mean, base_std, base_n = mean_std(study.final(BASELINE)[:, e])
+        row = dict(zip(KEYS, (study.algorithm, env, *config), strict=True))
+        row |= {"n": n, "mean": mean, "std": std}
+        row |= {"n_baseline": base_n, "baseline_mean": base_mean, "baseline_std": base_std}
+        if config != BASELINE:
+            row["improvement_percent"] = improvement_percent(mean, base_mean)
+            row["std_change_percent"] = improvement_percent(std, base_std)
+        curves = study.returns[config][..., e]
+        yield row | {"steps_to_baseline": steps_to_reach(curves, study.steps, base_mean)}
+
+
+def best_rows(study, summary):
+    """Yield the best noise per environment, with the leave-one-seed-out value of choosing it."""
+    ours = summary[
+        (summary["algorithm"] == study.algorithm) & summary["improvement_percent"].notna()
+    ]
+    for env, group in ours.groupby("environment"):
+        best = group.loc[group["mean"].idxmax()]
+        e = study.environments.index(env)
+        finals = np.stack([study.final(c)[:, e] for c in study.returns if c != BASELINE])
+        held_out = leave_one_seed_out(finals)
+        yield best.to_dict() | {
+            "noisy_mean": best["mean"],
+            "noisy_std": best["std"],
+            "chosen_from": len(group),
+            "leave_one_seed_out_mean": held_out,
+            "leave_one_seed_out_percent": improvement_percent(held_out, best["baseline_mean"]),
+        }
+
+
+def consistency_rows(summary):
+    """Yield per noise and rate the share of envs that are matched or better, and by how much."""
+    keys = ["algorithm", "noise", "noise_rate"]
+    for key, group in summary[summary["improvement_percent"].notna()].groupby(keys):
+        mean, std, count = mean_std(group["improvement_percent"])
+        yield dict(zip(keys, key, strict=True)) | {
+            "percent_of_environments": 100 * (group["improvement_percent"] >= 0).mean(),
+            "average_improvement_percent": mean,
+            "std_improvement_percent": std,
+            "environments": count,
+            "n": group["n"].min(),
+        }
+
+
+def split_consistency(consistency):
+    """Return the rows with at least 80 % of the environments, best first, and those with 0 %."""
+    share = consistency["percent_of_environments"]
+    by = ["algorithm", "percent_of_environments", "average_improvement_percent"]
+    good = consistency[share >= 80].drop(columns="fails_at_every_rate")
+    good = good.sort_values(by, ascending=[True, False, False], kind="stable")
+    highest = share.groupby([consistency["algorithm"], consistency["noise"]]).transform("max")
+    bad = consistency.assign(fails_at_every_rate=np.where(highest == 0, "yes", "no"))[share == 0]
+    return good, bad
+
+
+def early_rows(study):
+    """Yield mean and std at every 0.2 M steps, or at every fifth of a run below 1 M steps."""
+    total = study.steps[-1]
+    stride = 200_000 if total >= 1_000_000 else total / 5
+    wanted = np.arange(1, round(total / stride) + 1) * stride
+    places = np.unique(np.searchsorted(study.steps, wanted, side="right") - 1)
+    noises = sorted({noise for noise, _ in study.returns if noise})
+    for (e, env), noise in product(enumerate(study.environments), noises):
+        configs = [config for config in study.returns if config[0] in ("", noise)]
+        for i, config in product(places[places >= 0], configs):
+            mean, std, n = mean_std(study.returns[config][i, :, e])
+            if n:
+                row = dict(zip(KEYS, (study.algorithm, env, noise, config[1]), strict=True))
+                yield row | {
+                    "steps_millions": study.steps[i] / 1e6,
+                    "mean": mean,
+                    "std": std,
+                    "n": n,
+                }
+
+
+def statistics_rows(study):
+    """Yield IQM, improvement, probability of improvement and test, per env and over several."""
+    envs = np.array(study.environments)
+    pusher = np.array([env.startswith("Pusher") for env in envs])
+    scopes = [(env, envs == env) for env in envs]
+    if len(envs) > 1:
+        scopes.append(("all", np.full(len(envs), True)))
+    if pusher.any() and (~pusher).sum() > 1:
+        scopes.append(("all but Pusher", ~pusher))
+    for (scope, chosen), config in product(scopes, study.returns):
+        x, y = study.final(config)[:, chosen], study.final(BASELINE)[:, chosen]
+        here = np.isfinite(x).any(axis=0)
+        both = here & np.isfinite(y).any(axis=0)
+        row = dict(zip(KEYS, (study.algorithm, scope, *config), strict=True))
+        if scope.startswith("all"):
+            if config == BASELINE or both.sum() < 2:
+                continue
+        elif not here.any():
+            continue
+        else:  # returns of different environments have no common scale
+            row["n"] = np.isfinite(x).sum()
+            row |= zip(("iqm", "iqm_low", "iqm_high"), bootstrap_iqm(x), strict=True)
+        yield row | (against_baseline(x[:, both], y[:, both]) if config != BASELINE else {})
+
+
+def against_baseline(x, y):
+    """Return the part of a row of statistics that compares x with y, both (seeds x envs)."""
+    if x.shape[1] == 0:
+        return {}
+    row = {"environments": x.shape[1]}
+    row |= {"n": np.isfinite(x).sum(axis=0).min(), "n_baseline": np.isfinite(y).sum(axis=0).min()}
+    names = ("improvement_iqm_percent", "improvement_low", "improvement_high")
+    row |= zip(names, bootstrap_iqm(x, y), strict=True)
+    p, low, high = probability_of_improvement(x, y)
+    names = ("probability_of_improvement", "probability_low", "probability_high")
+    row |= zip(names, (p, low, high), strict=True)
+    if np.isfinite(low):
+        verdict = "yes, better" if low > 0.5 else "yes, worse" if high < 0.5 else "no"
+        row["excludes_no_improvement"] = verdict
+    return row | dict(zip(("p", "smallest_p"), mann_whitney(x, y), strict=True))
+
+
+def adjust(statistics):
+    """Add Benjamini-Hochberg's p per (algorithm, environment), and the smallest one in reach."""
+    tested = statistics[statistics["p"].notna()]
+    for _, family in tested.groupby(["algorithm", "environment"]):
+        adjusted = stats.false_discovery_control(family["p"].astype(float))
+        statistics.loc[family.index, "p_adjusted"] = adjusted
+        alone = np.minimum(1, family["smallest_p"].astype(float) * len(family))
+        statistics.loc[family.index, "smallest_p_adjusted"] = alone
+    return statistics
+
+
+def family_notes(statistics):
+    """Say what the number of seeds can show at all after the Benjamini-Hochberg adjustment."""
+    notes = []
+    tested = statistics[statistics["p"].notna()]
+    for algorithm, rows in tested.groupby("algorithm"):
+        limits = rows.groupby("environment", sort=False)["smallest_p"].agg(["size", "min"])
+        for (size, smallest), same in limits.reset_index().groupby(["size", "min"], sort=False):
+            needed = ceil(round(size * smallest / 0.05, 9))
+            if needed <= 1:
+                reach = "a single configuration can reach 0.05"
+            elif needed <= size:
+                reach = f"below 0.05 only if {needed} or more configurations reach it together"
+            else:
+                reach = "no configuration can reach 0.05"
+            notes.append(
+                f"{algorithm}, {', '.join(same['environment'])}: {size} comparisons; the smallest "
+                f"p that this number of seeds can give is {smallest:.2g}, adjusted "
+                f"{min(1, size * smallest):.2g} for one configuration alone: {reach}."
+            )
+    return notes
+
+
+def compare_table(ours, listed, paper, mean, std, number):
+    """Set the paper's figures beside ours for every row that `paper` or `listed` has.
+
+    `ours` holds every configuration; `mean`, `std` and `number` name its columns. Rows match by
+    algorithm, environment without version, noise as run, rate and step. The difference is in
+    standard errors: (ours - paper) / sqrt(std^2 / n + paper_std^2 / paper_n).
+    """
+    keys = [name for name in (*KEYS, "steps_millions") if name in paper]
+
+    def key(table):
+        plain = table[keys].assign(algorithm=table["algorithm"].str.split(" [", regex=False).str[0])
+        if "environment" in keys:
+            plain["environment"] = plain["environment"].map(lambda env: split_version(env)[0])
+        if "steps_millions" in keys:
+            plain["steps_millions"] = plain["steps_millions"].astype(float).round(6)
+        return list(plain.itertuples(index=False, name=None))
+
+    ours, paper = ours.assign(key=key(ours)), paper.assign(key=key(paper))
+    ours = ours[ours["key"].isin({*key(listed), *paper["key"]})]
+    paper = paper.add_prefix("paper_").rename(columns={"paper_key": "key"})
+    table = ours.merge(paper, on="key", how="outer")
+    in_ours, in_paper = table["key"].isin(key(listed)), table["key"].isin(paper["key"])
+    table["listed_by"] = np.select([in_ours & in_paper, in_ours], ["both", "ours"], "paper")
+    for name in keys:
+        table[name] = table[name].fillna(table[f"paper_{name}"])
+    environments = number == "environments"
+    paper_n = PAPER_ENVIRONMENTS if environments else table["paper_algorithm"].map(PAPER_SEEDS)
+    variance = table[std] ** 2 / table[number] + table[f"paper_{std}"] ** 2 / paper_n
+    difference = table[mean] - table[f"paper_{mean}"]
+    table["difference_se"] = difference / np.sqrt(variance.where(variance > 0))
+    shown = [
+        *keys,
+        "listed_by",
+        number,
+        mean,
+        std,
+        f"paper_{mean}",
+        f"paper_{std}",
+        "difference_se",
+    ]
+    return table.sort_values(keys, kind="stable")[shown]
+
+
+def compare_tables(folder, summary, best, consistency, good, bad, early):
+    """Yield (name, table) for each of the paper's tables found in `folder`."""
+    alone = summary[summary["noise"] == ""]  # best.csv holds baselines too: rows of their own here
+    average = ("average_improvement_percent", "std_improvement_percent", "environments")
+    for pattern, ours, listed, columns in (
+        ("best.csv", summary, pd.concat([alone, best]), ("mean", "std", "n")),
+        ("consistent.csv", consistency, good, average),
+        ("consistently_worse.csv", consistency, bad, average),
+        ("early_performance*.csv", early, early.head(0), ("mean", "std", "n")),
+    ):
+        papers = [pd.read_csv(path) for path in sorted(Path(folder).glob(pattern))]
+        if not papers:
+            continue
+        paper = pd.concat(papers, ignore_index=True)
+        paper["noise"] = paper["noise_as_run"]
+        paper["noise_rate"] = paper["noise_rate"].map(lambda rate: rate_text([rate]))
+        if pattern == "best.csv":
+            noisy = paper.rename(columns={"noisy_mean": "mean", "noisy_std": "std"})
+            baseline = paper.rename(columns={"baseline_mean": "mean", "baseline_std": "std"})
+            baseline = baseline.assign(noise=BASELINE[0], noise_rate=BASELINE[1])
+            paper = pd.concat([noisy, baseline], ignore_index=True)
+        name = pattern.split(".")[0].rstrip("*")
+        yield f"compare_{name}", compare_table(ours, listed, paper, *columns)
+
+
+# --------------------------------------------------------------------------------------------- main
+
+CAPTIONS = {
+    "best": """Best noise for each algorithm and environment against the baseline without noise:
+final test return, mean \u00b1 sample standard deviation over n seeds. The best of many is chosen
+on the seeds that it is reported on, which flatters it; the leave-one-seed-out columns choose on
+all seeds but one and measure on that one.""",
+    "consistent": """Noise that matches or betters the baseline in at least 80 % of the
+environments: improvement over |baseline|, mean \u00b1 standard deviation over environments; n is
+the smallest number of seeds in any environment.""",
+    "consistently_worse": """Noise that is worse than the baseline in every environment (0 %);
+columns as in the table of consistent noise. Worse at every rate that was tried:""",
+    "early_performance": """Test return during training, by noise rate (0.00 is the baseline):
+mean \u00b1 sample standard deviation over (n) seeds.""",
+    "summary": """Final test return of every configuration: mean \u00b1 sample standard deviation
+over n seeds, improvement over |baseline|, and change of the standard deviation. Steps to
+baseline: the first evaluation at which the mean over seeds reaches the baseline's final mean.""",
+    "statistics": f"""IQM: interquartile mean of the final returns over n seeds. Improvement: IQM
+of (return - baseline mean) / |baseline mean| over seeds and environments. [ ]: 95 % intervals
+from a stratified bootstrap over seeds (Student's t times the bootstrap standard error; the
+baseline is resampled too). In simulated samples they held the true IQM in at least
+{", ".join(f"{c} % (n = {n})" for n, c in COVERAGE.items())} of the cases. P(improvement):
+probability that a noisy run beats a baseline run, averaged over environments, with Newcombe's
+interval; the next column says whether that interval excludes one half. No interval for n <
+{MIN_SEEDS}. p: exact two-sided Mann-Whitney test, stratified by environment. p adjusted:
+Benjamini-Hochberg over one family, all configurations of an algorithm in one environment, or in
+all of them together. Smallest p adjusted: what one configuration alone could reach at most with
+its number of seeds.""",
+    "missing": """Runs that are in no table and no figure. Missing are those that a full grid of
+the configurations, environments and seeds found for an algorithm would have.""",
+    "compare": """The paper's table (environments v2, 1,000,000 steps) beside ours, with the
+difference in standard errors; listed by: whose table has the row. Ours:""",
+}
+CAPTIONS = {name: " ".join(text.split()) for name, text in CAPTIONS.items()}
+
+
+def make_tables(studies, compare=None):
+    """Compute every table: a dict of name -> (frame, caption), in the order of the report."""
+    summary = frame("summary", (row for study in studies for row in summary_rows(study)))
+    best = frame("best", (row for study in studies for row in best_rows(study, summary)))
+    consistency = frame("consistency", consistency_rows(summary))
+    good, bad = split_consistency(consistency)
+    early = frame("early_performance", (row for study in studies for row in early_rows(study)))
+    statistics = frame("statistics", (row for study in studies for row in statistics_rows(study)))
+    statistics = adjust(statistics)
+    failing = bad[bad["fails_at_every_rate"] == "yes"][["algorithm", "noise"]].drop_duplicates()
+    failing = "; ".join(f"{noise} ({algorithm})" for algorithm, noise in failing.values) or "none"
+    limits = "\n".join(family_notes(statistics))
+    tables = {
+        "best": (best, CAPTIONS["best"]),
+        "consistent": (good, CAPTIONS["consistent"]),
+        "consistently_worse": (bad, f"{CAPTIONS['consistently_worse']} {failing}."),
+        "statistics": (statistics, f"{CAPTIONS['statistics']}\n{limits}"),
+        "early_performance": (early, CAPTIONS["early_performance"]),
+    }
+    for base in sorted({study.base for study in studies}):
+        labels = [study.algorithm for study in studies if study.base == base]
+        tables[f"summary_{base}"] = (
+            summary[summary["algorithm"].isin(labels)],
+            CAPTIONS["summary"],
+        )
+    if compare:
+        lengths = ", ".join(f"{study.algorithm} {study.steps[-1]:,} steps" for study in studies)
+        for name, table in compare_tables(compare, summary, best, consistency, good, bad, early):
+            tables[name] = (table, f"{CAPTIONS['compare']} {lengths}.")
+    return tables
+
+
+def main(args):
+    """Read the runs, write tables, figures and report, and print the main table."""
+    if not args.runs_dir.is_dir():
+        sys.exit(f"error: no folder {args.runs_dir}")
+    if args.compare and not any(args.compare.glob("*.csv")):
+        sys.exit(f"error: no csv files in {args.compare}")
+    runs = read_runs(args.runs_dir)
+    studies, notes = make_studies(runs)
+    missing = pd.concat([runs[runs["status"] != "finished"], missing_runs(runs)])
+    missing = missing[["status", *KEYS, "seed", "run", "reason"]]
+    counts = missing["status"].value_counts(sort=False)
+    problems = ", ".join(f"{n} {status}" for status, n in counts.items())
+    problems = f"{len(missing)} runs do not count: {problems}." if problems else ""
+    if not studies:
+        print(text_table("missing", missing))
+        sys.exit(f"error: no finished run in {args.runs_dir}")
+    tables = make_tables(studies, args.compare)
+    tables["missing"] = (missing, CAPTIONS["missing"])
+    args.out.mkdir(parents=True, exist_ok=True)
+    for name, (table, caption) in tables.items():
+        write_table(args.out, name, table, caption)
+    drawn = []
+    for name, figure, caption in figures(studies, tables):
+        write_figure(args.out, name, figure)
+        drawn.append((name, caption))
+    overview = "; ".join(
+        f"{study.algorithm}: {len(study.returns) - 1} noise configurations, "
+        f"{len(study.environments)} environments, {len(study.seeds)} seeds, "
+        f"{study.steps[-1]:,} steps"
+        for study in studies
+    )
+    overview = f"{(runs['status'] == 'finished').sum()} finished runs. {overview}."
+    write_report(args.out, tables, drawn, overview, problems, notes)
+    print(f"{overview}\n\n{text_table('best', tables['best'][0])}\n\n{tables['best'][1]}")
+    for note in notes:
+        print(f"note: {note}")
+    if problems:
+        print(f"\nWARNING: {problems}\n{text_table('missing', missing.head(20))}")
+        print(f"All of them: {args.out / 'missing.csv'}")
+    print(f"\nOpen {args.out / 'report.html'}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))

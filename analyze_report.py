@@ -1,0 +1,407 @@
+"""How analyze.py's results look: numbers as text, tables as files, figures, and report.html."""
+
+import base64
+import re
+from itertools import product
+
+import jinja2
+import matplotlib
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from tabulate import tabulate
+
+matplotlib.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
+viridis = matplotlib.colormaps["viridis"]  # ordered by lightness, so it reads in grey
+TOP = 10  # configurations in the interval plot
+
+
+def slug(text):
+    """Turn a label or a noise into a part of a file name."""
+    return re.sub(r"[^A-Za-z0-9._=+-]+", "_", text).strip("_")
+
+
+# ------------------------------------------------------------------------------------------- tables
+
+# Columns that are shown as one: "mean ± std" or "estimate [low, high]".
+MERGED = {
+    "baseline": ("baseline_mean", "baseline_std"),
+    "noisy": ("noisy_mean", "noisy_std"),
+    "mean": ("mean", "std"),
+    "average improvement %": ("average_improvement_percent", "std_improvement_percent"),
+    "IQM": ("iqm", "iqm_low", "iqm_high"),
+    "improvement (IQM) %": ("improvement_iqm_percent", "improvement_low", "improvement_high"),
+    "P(improvement)": ("probability_of_improvement", "probability_low", "probability_high"),
+}
+MERGED |= {
+    f"paper: {name}": tuple(f"paper_{c}" for c in MERGED[name]) for name in list(MERGED)[2:4]
+}
+
+
+def cell(name, value):
+    """Spell one value of the column `name`; a value that does not exist is a dash."""
+    if pd.isna(value):
+        return "\u2013"
+    if isinstance(value, str):
+        return value or ("baseline" if name == "noise" else "\u2013")
+    if name.startswith("p_") or name in ("p", "smallest_p", "smallest_p_adjusted"):
+        return f"{value:.2g}"
+    if name.startswith("probability"):
+        return f"{value:.2f}"
+    if name == "steps_millions":
+        return f"{value:g}"
+    whole = name in ("n", "n_baseline", "environments", "chosen_from", "steps_to_baseline", "seed")
+    return f"{value:,.0f}" if whole or name == "percent_of_environments" else f"{value:,.1f}"
+
+
+def shown(name, table):
+    """Return `table` as a person reads it: all text, related columns in one, rates side by side."""
+    table = table.reset_index(drop=True)
+    text = pd.DataFrame({c: [cell(c, v) for v in table[c]] for c in table}, dtype=object)
+    for title, parts in MERGED.items():
+        if parts[-1] in text:
+            first, *rest = (text[c] for c in parts)
+            both = first + " \u00b1 " + rest[0]
+            if len(parts) == 3:
+                both = first + " [" + rest[0] + ", " + rest[1] + "]"
+                both = both.where(table[parts[1]].notna(), first)
+            text[parts[0]] = both.where(table[parts[0]].notna(), "\u2013")
+            text = text.drop(columns=list(parts[1:])).rename(columns={parts[0]: title})
+    if name == "early_performance" and len(text):
+        text["mean"] += " (" + text.pop("n") + ")"
+        keys = ["algorithm", "environment", "noise", "steps_millions"]
+        text = text.pivot(index=keys, columns="noise_rate", values="mean").fillna("\u2013")
+        text = text.reset_index()
+    return text.rename(columns=lambda c: c.replace("_", " ").replace("percent", "%"))
+
+
+def text_table(name, table):
+    """Format a table for the terminal."""
+    text = shown(name, table)
+    return tabulate(text.values, text.columns, disable_numparse=True) if len(text) else "(empty)"
+
+
+def write_table(out, name, table, caption):
+    """Write {name}.csv (all digits), .md and .tex (longtable, as people read them)."""
+    table.to_csv(out / f"{name}.csv", index=False, float_format="%.10g", lineterminator="\n")
+    text = shown(name, table)
+    markdown = tabulate(text.values, text.columns, tablefmt="pipe", disable_numparse=True)
+    (out / f"{name}.md").write_text(f"{caption}\n\n{markdown}\n")
+    latex = tabulate(text.values, text.columns, tablefmt="latex_longtable", disable_numparse=True)
+    escaped = re.sub(r"([%&_#])", r"\\\1", caption).replace("|", r"\textbar{}").replace("\n", " ")
+    latex = latex.replace("\n", f"\n\\caption{{{escaped}}}\\\\\n", 1)
+    for sign, command in (("\u00b1", r"$\pm$"), ("\u2013", "--"), (" < ", " $<$ ")):
+        latex = latex.replace(sign, command)
+    (out / f"{name}.tex").write_text(latex + "\n")
+
+
+# ------------------------------------------------------------------------------------------ figures
+
+
+def figures(studies, tables):
+    """Yield (name, figure, caption) for every figure, in the order of the report."""
+    statistics = tables["statistics"][0]
+    for study in studies:
+        tested = statistics[(statistics["algorithm"] == study.algorithm) & statistics["p"].notna()]
+        summary = tables[f"summary_{study.base}"][0]
+        summary = summary[summary["algorithm"] == study.algorithm]
+        if len(tested):
+            yield interval_figure(study, tested)
+            yield heatmap_figure(study, summary)
+        noises = sorted({noise for noise, _ in study.returns if noise})
+        for noise in noises or [""]:
+            yield curves_figure(study, noise)
+        for wrapper in sorted({noise.split("(")[0] for noise in noises}):
+            variants = [n for n in noises if n.split("(")[0] == wrapper and " + " not in n]
+            if len(variants) > 1:
+                yield ablation_figure(study, summary, variants)
+
+
+def count(numbers):
+    """Spell the numbers of seeds behind a line or a panel: "n = 5", or "n = 3 to 5"."""
+    low, high = min(numbers), max(numbers)
+    return f"n = {low}" if low == high else f"n = {low} to {high}"
+
+
+def panels(environments, labels):
+    """Make one panel per environment, three in a row, above a legend with as many labels."""
+    across = min(3, len(environments))
+    down = -(-len(environments) // across)
+    columns = max(1, min(4, int(across * 42 / max(map(len, labels)))))
+    legend = 0.2 + 0.2 * -(-len(labels) // columns)
+    width, height = 1.2 + 3 * across, 2.5 * down + legend
+    fig = Figure(
+        figsize=(width, height)
+    )  # placed by hand: matplotlib's layouts take as long as drawing
+    bottom, top = (legend + 0.45) / height, 1 - 0.3 / height
+    fig.subplots_adjust(0.9 / width, bottom, 1 - 0.15 / width, top, wspace=0.25, hspace=0.45)
+    axes = fig.subplots(down, across, squeeze=False).ravel()
+    for ax in axes[len(environments) :]:
+        ax.remove()
+    for ax, env in zip(axes, environments, strict=False):
+        ax.set_title(env)
+        ax.yaxis.get_major_locator().set_params(nbins=5)
+        if ax.get_subplotspec().is_first_col():
+            ax.set_ylabel("test return\n(sum of rewards per episode)")
+    axes = axes[: len(environments)]
+
+    def add_legend():
+        handles = axes[0].get_legend_handles_labels()[0]
+        fig.legend(handles, labels, loc="lower center", ncols=columns, frameon=False)
+
+    return fig, axes, add_legend
+
+
+def curves_figure(study, noise):
+    """Draw learning curves: mean over seeds, one line per noise rate, shaded standard deviation."""
+    configs = [config for config in study.returns if config[0] in ("", noise)]
+    unit, word = (1e6, "millions") if study.steps[-1] >= 1e6 else (1e3, "thousands")
+    x, every = study.steps / unit, max(1, len(study.steps) // 8)
+    counts = [np.isfinite(study.final(config)).sum(axis=0) for config in configs]
+    labels = [f"p = {c[1]}" if c[0] else "no noise" for c in configs]
+    labels = [f"{label} ({count(n)})" for label, n in zip(labels, counts, strict=True)]
+    fig, axes, add_legend = panels(study.environments, labels)
+    for (e, ax), (i, config) in product(enumerate(axes), enumerate(configs)):
+        curves = study.returns[config][:, :, e]
+        curves = curves[:, np.isfinite(curves[-1])]
+        mean = curves.mean(axis=1) if curves.size else np.full(len(x), np.nan)
+        std = curves.std(axis=1, ddof=1) if curves.shape[1] > 1 else 0
+        color = viridis(0.85 * (i - 1) / max(1, len(configs) - 2)) if i else "black"
+        line, marker = ["-", "--", "-.", ":"][i % 4], ["", "o", "s", "^", "D", "v", "P", "X"][i % 8]
+        marks = {"marker": marker, "markevery": (min(i, every - 1), every), "markersize": 4}
+        ax.plot(x, mean, line, color=color, linewidth=1.1 if i else 1.8, label=config[1], **marks)
+        ax.fill_between(x, mean - std, mean + std, color=color, alpha=0.12, linewidth=0)
+        ax.set_xlabel(f"training steps ({word})")
+    add_legend()
+    title = f"{study.algorithm}, {noise or 'no noise'}"
+    caption = f"{title}: learning curves, mean over n seeds, shaded \u00b1 one standard deviation."
+    return f"curves_{slug(title)}", fig, caption
+
+
+def ablation_figure(study, summary, noises):
+    """Draw bars of the final return: a wrapper's parameters side by side, grouped by noise rate."""
+    groups = [summary[summary["noise"] == noise] for noise in ["", *noises]]
+    rates = sorted({rate for group in groups[1:] for rate in group["noise_rate"]}, key=float)
+    names = ["no noise", *noises]
+    labels = [
+        f"{a} ({count(g['n']) if len(g) else 'n = 0'})" for a, g in zip(names, groups, strict=True)
+    ]
+    fig, axes, add_legend = panels(study.environments, labels)
+    width = 0.8 / len(noises)
+    for (ax, env), (i, group) in product(
+        zip(axes, study.environments, strict=True), enumerate(groups)
+    ):
+        rows = group[group["environment"] == env].set_index("noise_rate")
+        rows = rows.reindex(rates if i else ["0.00"])
+        place = np.arange(len(rates)) + width * (i - 1 - (len(noises) - 1) / 2) if i else -1
+        look = {"color": str(0.8 - 0.6 * (i - 1) / (len(noises) - 1)) if i else "white"}
+        look |= {"hatch": ["", "", "//", "..", "xx"][i % 5], "edgecolor": "black", "linewidth": 0.6}
+        spread = {"yerr": rows["std"].fillna(0), "capsize": 2, "error_kw": {"elinewidth": 0.8}}
+        ax.bar(place, rows["mean"], width if i else 0.6, label=env, **look, **spread)
+        if i == 0:
+            ax.axhline(rows["mean"].iloc[0], color="black", linewidth=0.6, linestyle=":")
+            ax.axhline(0, color="black", linewidth=0.6)
+        ax.set_xticks([-1, *range(len(rates))], ["none", *rates])
+        ax.set_xlabel("noise rate p")
+    add_legend()
+    wrapper = noises[0].split("(")[0]
+    caption = f"{study.algorithm}, {wrapper}: final test return by parameters and noise rate. "
+    caption += "Bars: mean over n seeds, whiskers \u00b1 one standard deviation; dotted: no noise."
+    return f"ablation_{slug(study.algorithm)}_{wrapper}", fig, caption
+
+
+def heatmap_figure(study, summary):
+    """Draw the mean improvement over environments, noise x rate, with the numbers in the cells."""
+    rows = summary[summary["improvement_percent"].notna()]
+    grid = rows.pivot_table(index="noise", columns="noise_rate", values="improvement_percent")
+    grid = grid[sorted(grid.columns, key=lambda rate: [float(r) for r in rate.split(" + ")])]
+    fig = Figure(figsize=(4.5 + 0.7 * grid.shape[1], 1.5 + 0.32 * len(grid)), layout="constrained")
+    ax = fig.subplots()
+    image = ax.imshow(grid, cmap="cividis", vmin=-100, vmax=100, aspect="auto")
+    for (i, j), value in np.ndenumerate(grid.to_numpy()):
+        if np.isfinite(value):
+            ink = "black" if value > 0 else "white"
+            ax.text(j, i, f"{value:+.0f}", ha="center", va="center", color=ink, fontsize=8)
+    ax.set_xticks(range(grid.shape[1]), grid.columns)
+    ax.set_yticks(range(len(grid)), grid.index)
+    ax.set_xlabel("noise rate p")
+    ax.set_title(f"{study.algorithm} ({count(rows['n'])} seeds)")
+    fig.colorbar(image, ax=ax, extend="both", label="improvement over the baseline (%)")
+    caption = (
+        f"{study.algorithm}: improvement of the final mean return over the baseline in percent, "
+    )
+    caption += (
+        f"mean over {len(set(rows['environment']))} environments; colors end at \u00b1 100 %."
+    )
+    return f"heatmap_{slug(study.algorithm)}", fig, caption
+
+
+def interval_figure(study, statistics):
+    """Draw the configurations with the highest IQM of the improvement, with their intervals."""
+    scope = "all" if "all" in set(statistics["environment"]) else statistics["environment"].iloc[0]
+    rows = statistics[statistics["environment"] == scope]
+    rows = rows.sort_values("improvement_iqm_percent", kind="stable").tail(TOP)
+    fig = Figure(figsize=(9.5, 1.2 + 0.32 * len(rows)), layout="constrained")
+    left, right = axes = fig.subplots(1, 2, sharey=True, width_ratios=[3, 2])
+    place = np.arange(len(rows))
+    for ax, title, neutral in zip(
+        axes, ("improvement (IQM) %", "P(improvement)"), (0, 0.5), strict=True
+    ):
+        middle, low, high = rows[list(MERGED[title])].astype(float).to_numpy().T
+        ax.hlines(place, low, high, color="0.6", linewidth=5)
+        ax.plot(middle, place, "|", color="black", markersize=11, markeredgewidth=2)
+        ax.axvline(neutral, color="black", linewidth=0.8, linestyle="--")
+        ax.set_ylim(-0.6, len(rows) - 0.4)
+    left.set_yticks(
+        place, [f"{r.noise}, p = {r.noise_rate} (n = {r.n})" for r in rows.itertuples()]
+    )
+    left.set_xlabel("improvement over the baseline, IQM (%)")
+    right.set_xlabel("probability of improvement")
+    right.set_xlim(-0.02, 1.02)
+    where = "all environments" if scope == "all" else scope
+    caption = (
+        f"{study.algorithm}, {where}: the {len(rows)} configurations with the highest IQM of the "
+    )
+    caption += (
+        "improvement, with 95 % intervals (none for n < 3); dashed: no improvement. They are "
+    )
+    caption += "chosen on the seeds that are shown, so they look better than they are."
+    return f"intervals_{slug(study.algorithm)}", fig, caption
+
+
+def write_figure(out, name, fig):
+    """Write {name}.png and .pdf without dates, so that equal figures are equal files."""
+    fig.savefig(out / f"{name}.png", dpi=110, metadata={"Software": None})
+    fig.set_layout_engine("none")  # the layout is done
+    fig.savefig(out / f"{name}.pdf", metadata={"CreationDate": None})
+
+
+# ------------------------------------------------------------------------------------------- report
+
+PAGE = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Noisy environment augmentation: results</title>
+<style>
+:root { color-scheme: light; }
+* { box-sizing: border-box; }
+body { font: 16px/1.5 system-ui, sans-serif; color: #1a1a1a; background: #fff;
+  max-width: 76rem; margin: 0 auto; padding: 1rem; overflow-wrap: anywhere; }
+h1 { font-size: 1.6rem; line-height: 1.2; } h2 { font-size: 1.25rem; margin-top: 2.5rem; }
+nav a { display: inline-block; margin-right: 1rem; } a { color: #0b4f9c; }
+.alert { border: 2px solid #a11; border-left-width: 10px; padding: .5rem 1rem; }
+.notes { border-left: 10px solid #777; padding: .5rem 1rem; background: #f4f4f4; }
+p.caption { white-space: pre-line; }
+p.caption, figcaption { font-size: .85rem; color: #444; max-width: 60rem; }
+.scroll { overflow: auto; max-height: 75vh; border: 1px solid #ccc; }
+table { border-collapse: collapse; font-size: .85rem; font-variant-numeric: tabular-nums;
+  overflow-wrap: normal; }
+th, td { padding: .3rem .6rem; text-align: left; white-space: nowrap;
+  border-bottom: 1px solid #e2e2e2; }
+th { position: sticky; top: 0; background: #eee; padding: 0; vertical-align: bottom; }
+th button { all: unset; cursor: pointer; padding: .4rem .6rem; font-weight: 600;
+  white-space: normal; min-width: 5rem; box-sizing: border-box; }
+th button:focus-visible { outline: 2px solid #0b4f9c; outline-offset: -2px; }
+th button::after { content: " \\2195"; color: #777; }
+th[aria-sort=ascending] button::after { content: " \\2191"; color: #000; }
+th[aria-sort=descending] button::after { content: " \\2193"; color: #000; }
+td.number { text-align: right; }
+figure { margin: 1.5rem 0; } figure div { overflow-x: auto; }
+figure img { display: block; max-width: 100%; min-width: min(34rem, 100vw * 2); height: auto; }
+summary { cursor: pointer; padding: .4rem 0; }
+</style>
+</head>
+<body>
+<h1>Noisy environment augmentation: results</h1>
+<p>{{ overview }}</p>
+{% if problems %}<p class="alert"><strong>{{ problems }}</strong>
+They are in none of the tables and figures: <a href="#missing">see the list</a>.</p>{% endif %}
+{% for note in notes %}<p class="notes">{{ note }}</p>{% endfor %}
+<nav>
+{% for section in sections %}<a href="#{{ section.id }}">{{ section.title }}</a>{% endfor %}
+</nav>
+{% for section in sections %}
+<section id="{{ section.id }}">
+<h2>{{ section.title }}</h2>
+{% for table in section.tables %}
+{% if table.rows|length > 40 %}<details><summary>{{ table.rows|length }} rows: {{ table.name }}
+</summary>{% endif %}
+<p class="caption">{{ table.caption }}</p>
+{% if table.rows %}<div class="scroll"><table id="{{ table.name }}"><thead><tr>
+{%- for name in table.columns %}<th scope="col"><button type="button">{{ name }}</button></th>
+{%- endfor %}</tr></thead><tbody>
+{% for row in table.rows %}<tr>
+{%- for value in row %}<td>{{ value }}</td>{% endfor %}</tr>
+{% endfor %}</tbody></table></div>{% else %}<p>None.</p>{% endif %}
+{% if table.rows|length > 40 %}</details>{% endif %}
+{% endfor %}
+{% for figure in section.figures %}
+<figure><div><img src="data:image/png;base64,{{ figure.png }}" alt="{{ figure.caption }}"></div>
+<figcaption>{{ figure.caption }}</figcaption></figure>
+{% endfor %}
+</section>
+{% endfor %}
+<script>
+// "1,234.5 \u00b1 6" sorts as 1234.5, text as text, and a dash always comes last.
+const number = text => parseFloat(text.replaceAll(",", ""));
+for (const table of document.querySelectorAll("table")) {
+  const body = table.tBodies[0], heads = [...table.tHead.rows[0].cells];
+  heads.forEach((head, column) => {
+    const text = row => row.cells[column].textContent;
+    const full = [...body.rows].filter(row => text(row) !== "\u2013");
+    const numeric = full.length > 0 && full.every(row => /^-?[0-9]/.test(text(row)));
+    if (numeric) for (const row of body.rows) row.cells[column].className = "number";
+    head.firstChild.addEventListener("click", () => {
+      const sign = head.getAttribute("aria-sort") === "descending" ? 1 : -1;
+      heads.forEach(other => other.removeAttribute("aria-sort"));
+      head.setAttribute("aria-sort", sign > 0 ? "ascending" : "descending");
+      const compare = (a, b) => sign * (numeric ? number(text(a)) - number(text(b))
+        : text(a).localeCompare(text(b)));
+      const empty = [...body.rows].filter(row => text(row) === "\u2013");
+      body.append(...full.sort(compare), ...empty);
+    });
+  });
+}
+</script>
+</body>
+</html>
+"""
+SECTIONS = {
+    "best": "Best noise",
+    "consistent": "Consistent noise",
+    "consistently_worse": "Consistently worse",
+    "statistics": "Statistics",
+    "early_performance": "Learning curves",
+    "ablation": "Parameters",
+    "summary": "All results",
+    "missing": "Missing runs",
+}
+FIGURES_OF = {"intervals": "best", "heatmap": "consistent", "curves": "early_performance"}
+
+
+def write_report(out, tables, drawn, overview, problems, notes):
+    """Write report.html: one self-contained page with all tables and figures."""
+    sections = {key: {"id": key, "title": title} for key, title in SECTIONS.items()}
+    for section in sections.values():
+        section |= {"tables": [], "figures": []}
+    for name, (table, caption) in tables.items():
+        text = shown(name, table)
+        key = name.removeprefix("compare_")
+        entry = {
+            "name": name,
+            "caption": caption,
+            "columns": text.columns,
+            "rows": text.values.tolist(),
+        }
+        sections["summary" if key.startswith("summary") else key]["tables"].append(entry)
+    for name, caption in drawn:
+        kind = name.split("_")[0]
+        png = base64.b64encode((out / f"{name}.png").read_bytes()).decode()
+        entry = {"png": png, "caption": caption}
+        sections[FIGURES_OF.get(kind, kind)]["figures"].append(entry)
+    page = jinja2.Environment(autoescape=True, trim_blocks=True).from_string(PAGE)
+    full = [s for s in sections.values() if s["tables"] or s["figures"]]
+    html = page.render(sections=full, overview=overview, problems=problems, notes=notes)
+    (out / "report.html").write_text(html)

@@ -1,0 +1,606 @@
+"""Twin Delayed DDPG (TD3), trained in a noisy environment and tested in a clean one.
+
+The algorithm is Fujimoto et al. (2018), https://arxiv.org/abs/1802.09477, with the choices and
+defaults of CleanRL's td3_continuous_action.py. The noise is that of Khraishi and Okhrati (2023),
+"Simple Noisy Environment Augmentation for Reinforcement Learning", https://arxiv.org/abs/2305.02882.
+
+    python td3_continuous_noisy.py --env-id HalfCheetah-v5 --seed 1
+    python td3_continuous_noisy.py --noise "RandomUniformScaleReward(0.5, 1.5)" --noise-rate 0.05
+
+Writes runs/{env_id}__{exp_name}__{noise}__{seed}/: config.json, eval.csv, TensorBoard events, and
+policy.pt and result.json when done. The same command again resumes from checkpoint.pt.
+"""
+
+import fcntl
+import functools
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict, dataclass, replace
+from datetime import timedelta
+from pathlib import Path
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import torch
+import torch.nn as nn
+import torch.nn.functional as F
+import tyro
+from torch.func import functional_call, grad_and_value
+from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import hparams
+from tqdm import tqdm
+
+from noisy_wrappers import canonical_noises, make_noisy, noise_wrappers, run_name
+
+CHECKPOINT_FORMAT = 1
+TEST_SEED = 1_000_000  # of the first test episode; the same in every run and evaluation
+
+
+@dataclass
+class Args:
+    """Command-line arguments; names and defaults are CleanRL's and the paper's (Appendix A.2)."""
+
+    exp_name: str = Path(__file__).stem
+    """the name of this experiment, part of the run folder's name"""
+    seed: int = 1
+    """seed of the experiment"""
+    env_id: str = "HalfCheetah-v5"
+    """the Gymnasium environment: Box observations, Box actions"""
+    noise: tuple[str, ...] = ()
+    """noise of the training environment in the paper's notation, one or several; none: baseline"""
+    noise_rate: tuple[float, ...] = ()
+    """probability p of each noise: one for all of them, or one for each"""
+    runs_dir: str = "runs"
+    """the folder that holds the run folders"""
+    overwrite: bool = False
+    """delete what the run folder holds and start afresh"""
+
+    total_timesteps: int = 1_000_000
+    """environment steps to train for"""
+    eval_frequency: int = 10_000
+    """steps between two evaluations in the clean test environment (0: only after training)"""
+    eval_episodes: int = 10
+    """test episodes per evaluation"""
+    checkpoint_frequency: int = 50_000
+    """steps between two checkpoints, each at the next end of an episode"""
+
+    cuda: bool = False
+    """run the networks on the GPU; for networks as small as these, the CPU is a good choice"""
+    torch_threads: int = 1
+    """CPU threads per run; a sweep gains more from several runs side by side"""
+    compile: bool = True
+    """compile the updates when learning starts, where a C++ compiler is at hand"""
+    matmul_precision: str = "medium"
+    """PyTorch's float32 matmul precision: highest, high or medium (checked: see config.json)"""
+
+    buffer_size: int = 1_000_000
+    """transitions in the replay buffer"""
+    gamma: float = 0.99
+    """discount factor"""
+    tau: float = 0.005
+    """target smoothing coefficient"""
+    batch_size: int = 256
+    """transitions per update"""
+    learning_starts: int = 25_000
+    """steps with random actions before learning starts"""
+    learning_rate: float = 3e-4
+    """learning rate of both optimizers"""
+    policy_frequency: int = 2
+    """steps between two updates of the policy and of the target networks"""
+    exploration_noise: float = 0.1
+    """standard deviation of the noise on training actions, in half ranges of the action"""
+    policy_noise: float = 0.2
+    """standard deviation of the noise on target actions, likewise"""
+    noise_clip: float = 0.5
+    """largest noise on target actions, likewise"""
+
+
+def fail(message, code=2):
+    """Exit with one line that says what to do."""
+    print("error:", " ".join(str(message).split()), file=sys.stderr, flush=True)
+    raise SystemExit(code)
+
+
+def check(args, at_least_0, at_least_1, at_most_1):
+    """Return the arguments with their noise in canonical notation, or fail."""
+    for name in (at_least_0 + at_least_1 + at_most_1).split():
+        value, low = getattr(args, name), int(name in at_least_1.split())
+        high = 1 if name in at_most_1.split() else sys.float_info.max
+        if not low <= value <= high:
+            text = "in [0, 1]" if high == 1 else f"at least {low}"
+            fail(f"--{name.replace('_', '-')} must be {text}, not {value}")
+    if args.cuda and not torch.cuda.is_available():
+        fail("--cuda: PyTorch finds no GPU; leave it out to run on the CPU")
+    try:
+        noise, noise_rate = canonical_noises(args.noise, args.noise_rate)
+    except ValueError as error:
+        fail(error)
+    return replace(args, noise=noise, noise_rate=noise_rate)
+
+
+def make_env(env_id, **kwargs):
+    """Make the clean environment; training adds its noise on top."""
+    try:
+        env = gym.make(env_id, disable_env_checker=True, **kwargs)
+    except Exception as error:  # an environment's constructor may raise anything
+        fail(f"--env-id {env_id}: {error}")
+    for name, space in (("observation", env.observation_space), ("action", env.action_space)):
+        if not isinstance(space, gym.spaces.Box):
+            fail(f"--env-id {env_id}: choose one whose {name} space is a Box, not {space}")
+    flat = len(env.observation_space.shape) == 1
+    return env if flat else gym.wrappers.FlattenObservation(env)
+
+
+def mlp(inputs, outputs):
+    """Two hidden layers of 256 rectified linear units."""
+    hidden = [nn.Linear(inputs, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU()]
+    return nn.Sequential(*hidden, nn.Linear(256, outputs))
+
+
+class Critic(nn.Module):
+    """Twin Q-functions of observations (B, O) and actions (B, A)."""
+
+    def __init__(self, env):
+        super().__init__()
+        inputs = env.observation_space.shape[0] + env.action_space.shape[0]
+        self.q1, self.q2 = mlp(inputs, 1), mlp(inputs, 1)
+
+    def forward(self, observations, actions):
+        """Return Q1 (B,) and Q2 (B,)."""
+        inputs = torch.cat([observations, actions], 1)
+        return self.q1(inputs).squeeze(1), self.q2(inputs).squeeze(1)
+
+
+class Actor(nn.Module):
+    """A deterministic policy, squashed to the bounds of the action space."""
+
+    def __init__(self, env):
+        super().__init__()
+        low, high = torch.tensor(env.action_space.low), torch.tensor(env.action_space.high)
+        self.network = mlp(env.observation_space.shape[0], len(low))
+        self.register_buffer("low", low)
+        self.register_buffer("high", high)
+        self.register_buffer("action_scale", (high - low) / 2)
+        self.register_buffer("action_bias", (high + low) / 2)
+
+    def forward(self, observations, noise=0.0):
+        """Return actions (B, A), with noise (B, A) in half ranges, within the bounds."""
+        actions = torch.tanh(self.network(observations)) + noise
+        actions = actions * self.action_scale + self.action_bias
+        return torch.clamp(actions, self.low, self.high)
+
+    def policy(self, observation, noise=0.0):
+        """Return the action for one observation, NumPy to NumPy."""
+        observation = torch.as_tensor(observation, dtype=torch.float32).to(self.action_scale.device)
+        return self(observation, noise).cpu().numpy()
+
+
+def load_policy(run_dir, env):
+    """Return the policy of a finished run."""
+    actor = Actor(env).requires_grad_(False)
+    actor.load_state_dict(torch.load(Path(run_dir, "policy.pt"), weights_only=True))
+    return actor.policy
+
+
+class ReplayBuffer:
+    """The last `capacity` transitions, each observation stored once to halve the memory.
+
+    Row i + 1 holds row i's next observation, unless an episode ends at i: `final` holds that one.
+    """
+
+    ARRAYS = ("observations", "actions", "rewards", "terminated")
+
+    def __init__(self, capacity, env):
+        self.rows = capacity + 1  # one more for the newest next observation
+        self.position, self.size, self.final = 0, 0, {}
+        self.observations = np.zeros((self.rows, *env.observation_space.shape), np.float32)
+        self.actions = np.zeros((self.rows, *env.action_space.shape), np.float32)
+        self.rewards, self.terminated = np.zeros((2, self.rows), np.float32)
+
+    def add(self, observation, action, reward, next_observation, terminated, truncated):
+        """Store one transition in place of the oldest."""
+        i, j = self.position, (self.position + 1) % self.rows
+        self.observations[i], self.observations[j] = observation, next_observation
+        self.actions[i], self.rewards[i], self.terminated[i] = action, reward, terminated
+        self.final.pop(i, None)
+        if terminated or truncated:
+            self.final[i] = torch.from_numpy(self.observations[j].copy())
+        self.position, self.size = j, min(self.size + 1, self.rows - 1)
+
+    def sample(self, batch_size, rng):
+        """Draw (s, a, r, s', terminated) uniformly: float32 tensors with batch_size rows."""
+        oldest = self.position - self.size
+        i = (oldest + rng.integers(self.size, size=batch_size)) % self.rows
+        arrays = (self.observations[i], self.actions[i], self.rewards[i])
+        arrays += (self.observations[(i + 1) % self.rows], self.terminated[i])
+        batch = [torch.from_numpy(array) for array in arrays]
+        for b, row in enumerate(i.tolist()):
+            if row in self.final:
+                batch[3][b] = self.final[row]
+        return batch
+
+    def state_dict(self):
+        """The filled rows, as tensors that share the buffer's memory."""
+        filled = min(self.size + 1, self.rows)
+        state = {name: torch.from_numpy(getattr(self, name)[:filled]) for name in self.ARRAYS}
+        return state | {"final": self.final, "position": self.position, "size": self.size}
+
+    def load_state_dict(self, state):
+        """Copy the rows of a state_dict back."""
+        for name in self.ARRAYS:
+            getattr(self, name)[: len(state[name])] = state[name].numpy()
+        self.final, self.position, self.size = state["final"], state["position"], state["size"]
+
+
+# UPDATES: pure functions of networks, batch and standard normal noise. They return a gradient,
+# named like the network's parameters, and curves; compiled and plain runs share them.
+
+
+def critic_gradient(critic, target_actor, target_critic, batch, noise, gamma):
+    """Mean squared error of Q1 and Q2 to y = r + gamma min(Q1', Q2')(s', pi'(s') + noise)."""
+    observations, actions, rewards, next_observations, terminated = batch
+    next_actions = target_actor(next_observations, noise)
+    next_q = torch.minimum(*target_critic(next_observations, next_actions))
+    y = rewards + (1 - terminated) * gamma * next_q
+
+    def loss(params):
+        q1, q2 = functional_call(critic, params, (observations, actions))
+        qf1_loss, qf2_loss = F.mse_loss(q1, y), F.mse_loss(q2, y)
+        curves = {"qf1_values": q1.mean(), "qf2_values": q2.mean()}
+        curves |= {"qf1_loss": qf1_loss, "qf2_loss": qf2_loss, "qf_loss": (qf1_loss + qf2_loss) / 2}
+        return qf1_loss + qf2_loss, curves
+
+    gradient, (_, curves) = grad_and_value(loss, has_aux=True)(dict(critic.named_parameters()))
+    return gradient, curves
+
+
+def actor_gradient(actor, critic, observations):
+    """The mean of -Q1(s, pi(s)), with a frozen critic."""
+
+    def loss(params):
+        actions = functional_call(actor, params, (observations,))
+        return -critic.q1(torch.cat([observations, actions], 1)).mean()
+
+    gradient, actor_loss = grad_and_value(loss)(dict(actor.named_parameters()))
+    return gradient, {"actor_loss": actor_loss}
+
+
+def descend(optimizer, gradient):
+    """Take one optimizer step; the gradient is in the order of the optimizer's parameters."""
+    parameters = optimizer.param_groups[0]["params"]
+    for parameter, value in zip(parameters, gradient.values(), strict=True):
+        parameter.grad = value
+    optimizer.step()
+
+
+# THE RUN: tests, speed, files; word for word the same in the three scripts.
+
+
+def evaluate(policy, env, episodes):
+    """Play test episodes from fixed initial states -> (N, 2), their returns and lengths."""
+    results = np.zeros((episodes, 2))
+    for episode in range(episodes):
+        observation, _ = env.reset(seed=TEST_SEED + episode)
+        terminated = truncated = False
+        while not (terminated or truncated):
+            observation, reward, terminated, truncated, _ = env.step(policy(observation))
+            results[episode] += reward, 1
+    return results
+
+
+def compiled(function, enabled):
+    """Compile a function when it is first called; leave it as it is where a probe fails."""
+
+    @functools.cache
+    def choose():
+        try:
+            if enabled:
+                torch.compile(torch.neg)(torch.zeros(8))
+                return torch.compile(function, fullgraph=True, dynamic=False)
+        except Exception as error:  # no C++ compiler, no Python headers, ...
+            print("not compiled:", str(error).strip().partition("\n")[0])
+        return function
+
+    return lambda *args: choose()(*args)
+
+
+def use_matmul_precision(precision, device):
+    """Set the precision of float32 products, but "highest" where accuracy is lost; return it."""
+    torch.set_float32_matmul_precision(precision)
+    a, b = torch.randn(2, 256, 256, generator=torch.Generator().manual_seed(0)).to(device)
+    exact = a.double() @ b.double()
+    if torch.norm(a @ b - exact) > 1e-6 * torch.norm(exact):  # TF32; bf16 on a CPU with AMX
+        torch.set_float32_matmul_precision(precision := "highest")
+    return precision
+
+
+def write_file(path, write):
+    """Write a file whole or not at all: a kill or a full disk leaves the previous one."""
+    temporary = path.with_suffix(".tmp")
+    try:
+        with open(temporary, "wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except (OSError, RuntimeError) as error:
+        temporary.unlink(missing_ok=True)
+        fail(f"cannot write {path}: {error}", code=1)
+
+
+def write_json(path, value):
+    """Write a JSON file."""
+    write_file(path, lambda file: file.write(json.dumps(value, indent=2).encode() + b"\n"))
+
+
+def open_run(args, algorithm, precision):
+    """Create or reopen the run's folder; return it and its lock, held until the process ends."""
+    name = run_name(args.env_id, args.exp_name, args.noise, args.noise_rate, args.seed)
+    run_dir, new = Path(args.runs_dir, name), json.loads(json.dumps(asdict(args)))
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+        lock = open(run_dir / ".lock", "w")  # noqa: SIM115
+        fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        fail(f"{run_dir} is in use by another process")
+    except OSError as error:
+        fail(f"--runs-dir: {error}")
+    for path in run_dir.glob("[!.]*") if args.overwrite else ():
+        path.unlink()
+    if (path := run_dir / "config.json").exists():
+        old = json.loads(path.read_text())["args"]
+        free = ("runs_dir", "overwrite", "torch_threads", "compile", "checkpoint_frequency")
+        differ = [f"{k} {old.get(k)}, not {new[k]}" for k in new if old.get(k) != new[k]]
+        if differ := [text for text in differ if text.split()[0] not in free]:
+            fail(f"{run_dir} holds a run with {'; '.join(differ)}; --overwrite replaces it")
+        return run_dir, lock
+    versions = {module.__name__: module.__version__ for module in (torch, gym, mujoco, np)}
+    git = ["git", "-C", Path(__file__).parent, "rev-parse", "--verify", "HEAD"]
+    commit = subprocess.run(git, capture_output=True, text=True).stdout.strip() or None
+    config = {"algorithm": algorithm, "args": new, "matmul_precision": precision}
+    versions["python"] = sys.version.split()[0]
+    write_json(path, config | {"versions": versions, "git_commit": commit})
+    return run_dir, lock
+
+
+def save_checkpoint(run_dir, step, state, generators):
+    """Write all that resuming needs, in one dict."""
+    checkpoint = {name: value.state_dict() for name, value in state.items()}
+    checkpoint |= {"format": 1, "run": run_dir.name, "step": step, "torch": torch.get_rng_state()}
+    checkpoint["generators"] = [generator.bit_generator.state for generator in generators]
+    write_file(run_dir / "checkpoint.pt", lambda file: torch.save(checkpoint, file))
+
+
+def load_checkpoint(run_dir, state, generators):
+    """Restore what save_checkpoint wrote; return the step, or 0 where there is no checkpoint."""
+    if not (path := run_dir / "checkpoint.pt").exists():
+        return 0
+    try:
+        checkpoint = torch.load(path, weights_only=True)
+        if (checkpoint["format"], checkpoint["run"]) != (1, run_dir.name):
+            raise ValueError(f"format {checkpoint['format']} of {checkpoint['run']}")
+        for name, value in state.items():
+            value.load_state_dict(checkpoint[name])
+        for generator, numpy_state in zip(generators, checkpoint["generators"], strict=True):
+            generator.bit_generator.state = numpy_state
+        torch.set_rng_state(checkpoint["torch"])
+    except Exception as error:  # a damaged file may raise anything
+        reason = str(error).strip().partition("\n")[0] or type(error).__name__
+        fail(f"cannot resume from {path} ({reason}); --overwrite starts afresh")
+    return checkpoint["step"]
+
+
+class RunLog:
+    """TensorBoard events for people, eval.csv for programs, progress for whoever waits."""
+
+    def __init__(self, run_dir, args, env):
+        self.run_dir, self.csv, self.args = run_dir, run_dir / "eval.csv", args
+        self.noise, self.returns, self.seconds, self.text = noise_wrappers(env), [], 0.0, ""
+
+    def open(self, step):
+        """Start after `step`: what an interrupted run wrote later than its checkpoint is cut."""
+        self.writer = SummaryWriter(str(self.run_dir), purge_step=step and step + 1)
+        if step:
+            os.truncate(self.csv, self.csv_size)
+        else:
+            self.csv.write_text("step,episode,episodic_return,episodic_length\n")
+            config = {name: str(value) for name, value in asdict(self.args).items()}
+            table = "".join(f"|{name}|{value}|\n" for name, value in config.items())
+            self.writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + table)
+            for summary in hparams(config, {"eval/episodic_return_mean": 0}):
+                self.writer.file_writer.add_summary(summary)
+        total, plain = self.args.total_timesteps, not sys.stdout.isatty()
+        self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=plain)
+        self.first_step, self.start, self.printed = step, time.time(), time.time()
+
+    def scalars(self, step, values):
+        """Log {tag: value} and the speed to TensorBoard; show the progress every ten seconds."""
+        sps = (step - self.first_step) / (time.time() - self.start)
+        for tag, value in (values | {"charts/SPS": sps}).items():
+            self.writer.add_scalar(tag, value, step)
+        self.bar.update(step - self.bar.n)
+        if self.bar.disable and time.time() - self.printed > 10:
+            eta = timedelta(seconds=round((self.args.total_timesteps - step) / sps))
+            print(f"step={step}/{self.args.total_timesteps} sps={sps:.0f} {self.text}eta={eta}")
+            self.printed = time.time()
+
+    def losses(self, step, curves):
+        """Log what an update returns and the realised noise rates; fail if it is not finite."""
+        values = {f"losses/{name}": value.item() for name, value in curves.items()}
+        if not all(map(math.isfinite, values.values())):
+            fail(f"step {step}: training diverged, not every loss is finite: {values}", code=1)
+        for name, wrapper in self.noise.items():
+            values[f"noise/{name}/applied_fraction"] = wrapper.applied_fraction
+        self.scalars(step, values)
+
+    def episode(self, step, episode):
+        """Log a training episode as RecordEpisodeStatistics saw it, before reward noise."""
+        self.returns = [*self.returns[-99:], float(episode["r"])]
+        charts = {"charts/episodic_return": episode["r"], "charts/episodic_length": episode["l"]}
+        self.scalars(step, charts)
+
+    def evaluation(self, step, results):
+        """Log the (N, 2) returns and lengths of the test episodes."""
+        try:
+            with open(self.csv, "a") as file:
+                for i, (episodic_return, length) in enumerate(results.tolist()):
+                    file.write(f"{step},{i},{episodic_return},{length:.0f}\n")
+        except OSError as error:
+            fail(f"cannot write {self.csv}: {error}", code=1)
+        self.mean, length, self.std = *results.mean(0), results[:, 0].std(ddof=len(results) > 1)
+        self.text, self.printed = f"eval_return={self.mean:.1f} ", 0  # 0: print it now
+        self.bar.set_description_str(self.text)
+        values = {"return_mean": self.mean, "return_std": self.std, "length_mean": length}
+        self.scalars(step, {f"eval/episodic_{name}": value for name, value in values.items()})
+
+    def state_dict(self):
+        """What a checkpoint keeps of the log; flushes its files, to be no older than that."""
+        self.writer.flush()
+        seconds = self.seconds + time.time() - self.start
+        return {"returns": self.returns, "seconds": seconds, "csv_size": self.csv.stat().st_size}
+
+    def load_state_dict(self, state):
+        """Restore a state_dict."""
+        vars(self).update(state)
+
+    def finish(self, policy):
+        """Write policy.pt and, last of all, result.json; the checkpoint has served."""
+        total, seconds = self.args.total_timesteps, self.state_dict()["seconds"]
+        result = {"final_return_mean": self.mean, "final_return_std": self.std}
+        result |= {"final_return_n": self.args.eval_episodes, "total_timesteps": total}
+        result |= {"train_return_mean_last_100": np.mean(self.returns) if self.returns else None}
+        result |= {"steps_per_second": total / seconds, "wall_time_seconds": seconds}
+        counts = {name: [w.times_applied, w.opportunities] for name, w in self.noise.items()}
+        fractions = {name: w.applied_fraction for name, w in self.noise.items()}
+        result |= {"noise_applied_fraction": fractions, "noise_applied": counts}
+        self.writer.close()
+        write_file(self.run_dir / "policy.pt", lambda file: torch.save(policy, file))
+        write_json(self.run_dir / "result.json", result)
+        (self.run_dir / "checkpoint.pt").unlink(missing_ok=True)
+
+
+def train(args, stop=lambda: False):
+    """Train one agent; return False if stop(), asked whenever an episode ends, ended it early."""
+    args = check(
+        args,
+        at_least_0="seed eval_frequency learning_starts learning_rate "
+        "exploration_noise policy_noise noise_clip ",
+        at_least_1="total_timesteps eval_episodes checkpoint_frequency torch_threads buffer_size "
+        "batch_size policy_frequency ",
+        at_most_1="gamma tau",
+    )
+    env = make_noisy(make_env(args.env_id), args.noise, args.noise_rate)
+    test_env = make_env(args.env_id)  # never sees noise
+    if not np.isfinite([env.action_space.low, env.action_space.high]).all():
+        fail(f"--env-id {args.env_id}: TD3 needs bounded actions, not {env.action_space}")
+    torch.set_num_threads(args.torch_threads)
+    device = torch.device("cuda" if args.cuda else "cpu")
+    run_dir, lock = open_run(args, "TD3", use_matmul_precision(args.matmul_precision, device))
+    if (run_dir / "result.json").exists():
+        print(f"{run_dir} is finished")
+        return True
+
+    # SETUP: the updates take gradients of explicit parameters, autograd need not follow the rest
+    torch.manual_seed(args.seed)
+    rng = np.random.default_rng(args.seed)
+    env.action_space.seed(args.seed)
+    observation, _ = env.reset(seed=args.seed)
+    actor, critic, target_actor, target_critic = Actor(env), Critic(env), Actor(env), Critic(env)
+    target_actor.load_state_dict(actor.state_dict())
+    target_critic.load_state_dict(critic.state_dict())
+    for network in (actor, critic, target_actor, target_critic):
+        network.requires_grad_(False).to(device)
+    online = [*actor.parameters(), *critic.parameters()]
+    targets = [*target_actor.parameters(), *target_critic.parameters()]
+    critic_optimizer = torch.optim.Adam(critic.parameters(), lr=args.learning_rate, fused=True)
+    actor_optimizer = torch.optim.Adam(actor.parameters(), lr=args.learning_rate, fused=True)
+    buffer, log = ReplayBuffer(args.buffer_size, env), RunLog(run_dir, args, env)
+    of_critic, of_actor = (compiled(u, args.compile) for u in (critic_gradient, actor_gradient))
+
+    # RESUME: between two episodes an environment carries over no more than its generator
+    state = {"actor": actor, "critic": critic, "buffer": buffer, "log": log}
+    state |= {"target_actor": target_actor, "target_critic": target_critic}
+    state |= {"critic_optimizer": critic_optimizer, "actor_optimizer": actor_optimizer}
+    state |= noise_wrappers(env)
+    generators = (rng, env.action_space.np_random, env.unwrapped.np_random)
+    if start := load_checkpoint(run_dir, state, generators):
+        observation, _ = env.reset()
+    saved_step = start
+    log.open(start)
+
+    for global_step in range(start + 1, args.total_timesteps + 1):
+        # ACT
+        if global_step <= args.learning_starts:
+            action = env.action_space.sample()
+        else:
+            noise = args.exploration_noise * torch.randn(env.action_space.shape).to(device)
+            action = actor.policy(observation, noise)
+
+        # STEP
+        next_observation, reward, terminated, truncated, info = env.step(action)
+
+        # STORE: terminated apart from truncated, since a time limit ends no values
+        buffer.add(observation, action, reward, next_observation, terminated, truncated)
+        observation = next_observation
+
+        if global_step > args.learning_starts:
+            # LEARN: critic
+            batch = [tensor.to(device) for tensor in buffer.sample(args.batch_size, rng)]
+            noise = args.policy_noise * torch.randn_like(batch[1])
+            noise = noise.clamp(-args.noise_clip, args.noise_clip)
+            gradient, curves = of_critic(
+                critic, target_actor, target_critic, batch, noise, args.gamma
+            )
+            descend(critic_optimizer, gradient)
+
+            if global_step % args.policy_frequency == 0:
+                # LEARN: actor
+                gradient, loss = of_actor(actor, critic, batch[0])
+                descend(actor_optimizer, gradient)
+                curves |= loss
+
+                # LEARN: targets
+                torch._foreach_lerp_(targets, online, args.tau)
+
+            if global_step % 100 == 0:
+                log.losses(global_step, curves)
+
+        # TEST
+        done = global_step == args.total_timesteps
+        if done or args.eval_frequency and global_step % args.eval_frequency == 0:
+            log.evaluation(global_step, evaluate(actor.policy, test_env, args.eval_episodes))
+
+        if terminated or truncated:
+            log.episode(global_step, info["episode"])
+            stopping = stop()
+            if not done and (stopping or global_step - saved_step >= args.checkpoint_frequency):
+                save_checkpoint(run_dir, global_step, state, generators)
+                if stopping:
+                    return False
+                saved_step = global_step
+            observation, _ = env.reset()
+
+    log.finish(actor.state_dict())
+    return True
+
+
+if __name__ == "__main__":
+    signals = []
+
+    def stop_run(number, frame):
+        """Remember the first signal for the end of the episode; exit at once at the second."""
+        signals.append(number)
+        if len(signals) > 1:
+            os._exit(128 + number)
+
+    signal.signal(signal.SIGTERM, stop_run)
+    signal.signal(signal.SIGINT, stop_run)
+    sys.stdout.reconfigure(line_buffering=True)
+    finished = train(tyro.cli(Args), stop=lambda: bool(signals))
+    raise SystemExit(0 if finished else 128 + signals[0])

@@ -1,0 +1,541 @@
+"""benchmark.sh with real runs on its real engines: xargs, GNU parallel, ssh and Slurm.
+
+The engine tests need the Debian packages parallel, openssh-server, rsync, slurm-wlm and munge. They
+start an sshd and a one-node cluster of their own and stop them again. Without the packages they
+skip; with the environment variable CI they fail.
+"""
+
+import argparse
+import csv
+import json
+import os
+import pty
+import re
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections import Counter
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import tyro
+
+ROOT = Path(__file__).parent.parent
+PATH = f"{os.environ['PATH']}:/usr/sbin:/sbin"
+ENV = {**os.environ, "PYTHON": sys.executable, "PATH": PATH}
+ALGORITHMS = {"sac": 5, "td3": 5, "ppo": 10}  # seeds
+
+# Three short runs: the baseline, one noise, two noises together. SAC that never starts learning
+# is the cheapest real run there is, and it checkpoints like any other.
+SCALE, BOTH = (
+    "RandomUniformScaleReward(0.5, 1.5)",
+    "RandomNormalNoisyReward(1.0)+RandomEarlyTermination(1, 100)",
+)
+GRID = ["custom", "--algos", "sac", "--envs", "Pendulum-v1", "--seeds", "1"]
+GRID += ["--noises", SCALE, BOTH, "--noise-rates", "0.5"]
+CHEAP = "--no-compile --learning-starts 1000000000 --buffer-size 1000 --eval-episodes 1"
+CHEAP = ["--", *CHEAP.split(), "--eval-frequency", "1000", "--checkpoint-frequency", "1000"]
+FOREVER = ["--total-timesteps", "1000000000"]
+
+
+def start(*args, env=ENV, cwd=ROOT, **kwargs):
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | kwargs
+    return subprocess.Popen(["./benchmark.sh", *map(str, args)], env=env, cwd=cwd, **streams)
+
+
+def run(*args, **kwargs):
+    process = start(*args, **kwargs)
+    out, err = process.communicate(timeout=120)
+    return SimpleNamespace(code=process.returncode, out=out, err=err)
+
+
+def dry_run(*args):
+    """Return the grid's lines, each with its text and its options."""
+    result = run(*args, "--dry-run")
+    assert result.code == 0, result.err
+    lines = result.out.splitlines()
+    assert result.err.startswith(f"{len(lines)} runs")
+    parser = argparse.ArgumentParser()
+    parser.add_argument("python", choices=[sys.executable])
+    parser.add_argument("script", choices=[f"{name}_continuous_noisy.py" for name in ALGORITHMS])
+    for option in ("--env-id", "--runs-dir"):
+        parser.add_argument(option, required=True)
+    for option in ("--seed", "--total-timesteps"):
+        parser.add_argument(option, required=True, type=int)
+    parser.add_argument("--noise", nargs="+", default=[])
+    parser.add_argument("--noise-rate", nargs="+", default=[], type=float)
+    return [parser.parse_args(shlex.split(line), argparse.Namespace(text=line)) for line in lines]
+
+
+def folders(*args):
+    """Return the run folders of a grid, by grid.py, which benchmark.sh asks too."""
+    command = [sys.executable, "grid.py", "list", *map(str, args)]
+    out = subprocess.run(command, env=ENV, cwd=ROOT, check=True, capture_output=True, text=True)
+    return [Path(line.split("\t")[0]) for line in out.stdout.splitlines()]
+
+
+def log_of(folder):
+    return folder.parent / "logs" / f"{folder.name}.log"
+
+
+def attempts(folder):
+    """Return the log's lines, one list for each time that the run was started."""
+    parts = re.split(r"^# .*_noisy\.py.*\n", log_of(folder).read_text(), flags=re.MULTILINE)
+    return [part.splitlines() for part in parts[1:]]
+
+
+def wait_for(condition, seconds=60, what=""):
+    deadline = time.monotonic() + seconds
+    while not (value := condition()):
+        assert time.monotonic() < deadline, f"timed out: {what}"
+        time.sleep(0.05)
+    return value
+
+
+def is_training(folder):
+    return log_of(folder).exists() and "step=" in log_of(folder).read_text()
+
+
+def processes(*words):
+    """Return the ids of the training processes with these words on their command line."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            line = path.read_bytes().decode(errors="replace").split("\0")
+        except OSError:
+            continue
+        if line[0] == sys.executable and all(any(w in a for a in line) for w in map(str, words)):
+            found.append(int(path.parent.name))
+    return found
+
+
+# ENGINES
+
+
+def need(*programs):
+    missing = [program for program in programs if not shutil.which(program, path=PATH)]
+    if missing:
+        explain = pytest.fail if os.environ.get("CI") else pytest.skip
+        explain(f"not installed: {', '.join(missing)}")
+
+
+def free_port():
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return s.getsockname()[1]
+
+
+@pytest.fixture(scope="module")
+def sshd(tmp_path_factory):
+    """An sshd of our own on this machine, which ssh reaches as "second"."""
+    need("sshd", "ssh", "ssh-keygen", "rsync", "parallel")
+    folder, port = tmp_path_factory.mktemp("sshd"), free_port()
+    for key in ("host", "user"):
+        subprocess.run(
+            ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", folder / key], check=True
+        )
+    if os.geteuid() == 0:
+        Path("/run/sshd").mkdir(exist_ok=True)
+    (folder / "sshd_config").write_text(
+        f"Port {port}\nListenAddress 127.0.0.1\nHostKey {folder}/host\nStrictModes no\nUsePAM no\n"
+        f"AuthorizedKeysFile {folder}/user.pub\nPidFile none\nPermitRootLogin yes\n"
+    )
+    (folder / "ssh_config").write_text(
+        f"Host second\nHostName 127.0.0.1\nPort {port}\nIdentityFile {folder}/user\nBatchMode yes\n"
+        "StrictHostKeyChecking no\nUserKnownHostsFile /dev/null\nLogLevel ERROR\n"
+    )
+    command = [shutil.which("sshd", path=PATH), "-D", "-e", "-f", folder / "sshd_config"]
+    with open(folder / "log", "w") as log:
+        server = subprocess.Popen(command, stderr=log)
+    ssh = f"ssh -F {folder}/ssh_config"
+    try:
+        hello = [*ssh.split(), "second", "true"]
+        wait_for(lambda: subprocess.run(hello, capture_output=True).returncode == 0, 20, "sshd")
+        yield {**ENV, "PARALLEL_SSH": ssh}
+    finally:
+        server.terminate()
+        server.wait()
+
+
+@pytest.fixture(scope="module")
+def slurm(tmp_path_factory):
+    """A cluster of one node with two cores; arrays have two elements at most."""
+    need("munged", "slurmctld", "slurmd", "sbatch")
+    if os.geteuid() != 0:
+        pytest.skip("a cluster of our own needs root")
+    folder, host = tmp_path_factory.mktemp("slurm"), socket.gethostname().partition(".")[0]
+    (folder / "key").write_bytes(os.urandom(1024))
+    (folder / "key").chmod(0o600)
+    (folder / "slurm.conf").write_text(
+        f"""ClusterName=test
+SlurmctldHost={host}(127.0.0.1)
+NodeName={host} NodeAddr=127.0.0.1 CPUs=2
+PartitionName=main Nodes=ALL Default=YES
+SlurmctldPort={free_port()}
+SlurmdPort={free_port()}
+SlurmUser=root
+SlurmdUser=root
+AuthInfo=socket={folder}/munge.socket,cred_expire=2
+ProctrackType=proctrack/linuxproc
+TaskPlugin=task/none
+SelectType=select/cons_tres
+SelectTypeParameters=CR_CPU
+SlurmdParameters=config_overrides
+SchedulerParameters=batch_sched_delay=0,sched_min_interval=0
+MailProg=/bin/true
+MaxArraySize=2
+MinJobAge=2
+ReturnToService=2
+StateSaveLocation={folder}/state
+SlurmdSpoolDir={folder}/spool
+SlurmctldPidFile={folder}/slurmctld.pid
+SlurmdPidFile={folder}/slurmd.pid
+"""
+    )
+    (folder / "state").mkdir()
+    env = {**ENV, "SLURM_CONF": str(folder / "slurm.conf")}
+    munged = f"munged -F -f --key-file={folder}/key --socket={folder}/munge.socket"
+    munged += f" --pid-file={folder}/munge.pid --seed-file={folder}/seed --log-file={folder}/log"
+    daemons = []
+    try:
+        for command in (munged, "slurmctld -D", "slurmd -D"):
+            with open(folder / f"{command.split()[0]}.log", "w") as log:
+                daemon = subprocess.Popen(command.split(), env=env, stdout=log, stderr=log)
+            daemons.append(daemon)
+            wait_for((folder / "munge.socket").exists, 20, "munged")
+        idle = ["sinfo", "--noheader", "--format=%t"]
+        wait_for(lambda: "idle" in output(idle, env), 60, f"cluster: {folder}")
+        yield env
+    finally:
+        subprocess.run(["scancel", "--user=root"], env=env)
+        wait_for(lambda: not output(["squeue", "--noheader"], env), 60, "scancel")
+        for daemon in reversed(daemons):
+            daemon.terminate()
+            daemon.wait()
+
+
+def output(command, env):
+    return subprocess.run(command, env=env, capture_output=True, text=True).stdout.strip()
+
+
+@pytest.fixture(params=["local", "parallel", "ssh", "slurm"])
+def engine(request):
+    """The options and the environment of one executor that runs two runs at a time."""
+    if request.param == "slurm":
+        return ["--executor", "slurm", "--wait"], request.getfixturevalue("slurm")
+    if request.param == "ssh":
+        hosts = ["--jobs", "1", "--sshlogin", "second,:"]
+        return ["--executor", "parallel", *hosts], request.getfixturevalue("sshd")
+    if request.param == "parallel":
+        need("parallel")
+    return ["--executor", request.param, "--jobs", "2"], ENV
+
+
+def test_a_failing_and_a_killed_run(engine, tmp_path):
+    executor, env = engine
+    grid = [*GRID, "--total-timesteps", "60000", "--runs-dir", tmp_path / "my runs"]
+    fails, killed, good = folders(*grid)
+    fails.parent.mkdir()
+    fails.write_text("a file where the run's folder should be")
+
+    sweep = start(*grid, *executor, *CHEAP, env=env)
+    wait_for(lambda: is_training(killed), what="the first evaluation")
+    os.kill(*processes("--noise", SCALE, tmp_path), signal.SIGKILL)
+    out, err = sweep.communicate(timeout=120)
+    assert sweep.returncode == 1, err
+    assert "3 runs: 1 done, 0 running, 2 failed, 0 to do" in out
+    rows = {line.split("  ")[1]: line for line in out.splitlines() if ".log" in line}
+    assert set(rows) == {"exit 2", "signal 9"}
+    assert str(log_of(fails)) in rows["exit 2"] and "error: --runs-dir" in rows["exit 2"]
+    assert str(log_of(killed)) in rows["signal 9"] and "step=" in rows["signal 9"]
+    assert (good / "result.json").exists() and not (killed / "result.json").exists()
+
+    fails.unlink()
+    finished = (good / "result.json").stat().st_mtime_ns
+    again = run(*grid, *executor, *CHEAP, env=env)
+    assert again.code == 0, again.out + again.err
+    assert "3 runs, 2 to do" in again.err
+    assert [len(attempts(f)) for f in (fails, killed, good)] == [2, 2, 1]
+    assert (good / "result.json").stat().st_mtime_ns == finished
+    assert not attempts(killed)[1][0].startswith("step=1000/"), "not resumed"
+
+    logs = {folder: log_of(folder).read_text() for folder in (fails, killed, good)}
+    assert run(*grid, *executor, *CHEAP, env=env).code == 0
+    assert logs == {folder: log_of(folder).read_text() for folder in logs}
+
+
+def test_ctrl_c(engine, tmp_path):
+    executor, env = engine
+    grid = [*GRID, *FOREVER, "--runs-dir", tmp_path]
+    runs = folders(*grid)
+    sweep = start(*grid, *executor, *CHEAP, env=env)
+    wait_for(lambda: sum(map(is_training, runs)) == 2, what="two runs at a time")
+    sweep.send_signal(signal.SIGINT)
+    out, err = sweep.communicate(timeout=60)
+    assert sweep.returncode == 130, err
+    assert not processes(tmp_path)
+    assert "3 runs: 0 done, 0 running, 0 failed, 3 to do" in out
+    stopped = [folder for folder in runs if log_of(folder).exists()]
+    assert len(stopped) == 2, "another run was started"
+    for folder in stopped:
+        assert (folder / "checkpoint.pt").exists()
+        assert attempts(folder)[0][-1].endswith("exit=143")
+
+
+def test_ctrl_c_on_a_terminal_and_the_progress_line(tmp_path):
+    grid = [*GRID, *FOREVER, "--runs-dir", tmp_path]
+    runs = folders(*grid)[:2]
+    controller, terminal = pty.openpty()
+    sweep = subprocess.Popen(
+        ["setsid", "--ctty", "./benchmark.sh", *map(str, grid), "--jobs", "2", *CHEAP],
+        **{"stdin": terminal, "stdout": terminal, "stderr": terminal, "env": ENV, "cwd": ROOT},
+    )
+    os.close(terminal)
+    shown = b""
+    while not (all(map(is_training, runs)) and b"2 running" in shown):
+        shown += os.read(controller, 1000)
+    os.write(controller, b"\x03")
+    with pytest.raises(OSError):  # how a terminal ends
+        while True:
+            shown += os.read(controller, 1000)
+    assert sweep.wait() == 130
+    assert re.search(rb"\r3 runs: 0 done, 2 running, 0 failed, 1 to do", shown)
+    assert all((folder / "checkpoint.pt").exists() for folder in runs)
+
+
+def test_machines_without_a_shared_folder(sshd, tmp_path):
+    """The run folders travel: an interrupted run can go on elsewhere."""
+    here, there = tmp_path / "here", tmp_path / "there"
+    for folder in (here, there):
+        folder.mkdir()
+        for file in (*ROOT.glob("*.py"), ROOT / "benchmark.sh"):
+            shutil.copy2(file, folder)
+    grid = ["baseline", *GRID[1:7], "--total-timesteps", "150000"]
+    machine = ["--executor", "parallel", "--sshlogin", "second", "--remote-dir", there]
+    folder = here / folders(*grid)[0]
+    sweep = start(*grid, *machine, *CHEAP, env=sshd, cwd=here)
+    wait_for(lambda: is_training(folder), what="the first evaluation")
+    sweep.send_signal(signal.SIGINT)
+    _, err = sweep.communicate(timeout=60)
+    assert sweep.returncode == 130, err
+    assert (folder / "checkpoint.pt").exists(), err
+
+    shutil.rmtree(there / "runs")
+    again = run(*grid, *machine, *CHEAP, env=sshd, cwd=here)
+    assert again.code == 0, again.out + again.err
+    assert not attempts(folder)[1][0].startswith("step=1000/"), "not resumed"
+    assert json.loads((folder / "result.json").read_text())["total_timesteps"] == 150_000
+
+
+def test_a_lost_connection(sshd, tmp_path):
+    grid = ["baseline", *GRID[1:7], *FOREVER, "--runs-dir", tmp_path]
+    (folder,) = folders(*grid)
+    sweep = start(*grid, "--executor", "parallel", "--sshlogin", "second", *CHEAP, env=sshd)
+    wait_for(lambda: is_training(folder), what="the first evaluation")
+    subprocess.run(["pkill", "-KILL", "-f", f"^{sshd['PARALLEL_SSH']} second"], check=True)
+    out, _ = sweep.communicate(timeout=60)
+    assert sweep.returncode == 1
+    assert re.search(rf"lost +{log_of(folder)} +step=", out)
+    wait_for(lambda: not processes(tmp_path), what="the run over there")
+    assert (folder / "checkpoint.pt").exists()
+
+
+def test_an_unreachable_machine(sshd, tmp_path):
+    machine = ["--executor", "parallel", "--sshlogin", "second", "--remote-dir", tmp_path]
+    result = run(*GRID, "--runs-dir", tmp_path, *machine, *CHEAP, env=sshd)
+    assert result.code == 2 and "error: a machine of --sshlogin" in result.err
+    assert not list(tmp_path.glob("*/*.log"))
+
+
+def test_slurm_requeues_before_the_time_limit(slurm, tmp_path):
+    grid = ["baseline", *GRID[1:7], "--total-timesteps", "150000", "--runs-dir", tmp_path]
+    (folder,) = folders(*grid)
+    submitted = run(*grid, "--executor", "slurm", "--slurm-args=--comment=hello", *CHEAP, env=slurm)
+    assert submitted.code == 0, submitted.err
+    (job,) = re.findall(r"scancel (\d+)$", submitted.err.strip())
+    shown = output(["scontrol", "show", "job", job], slurm)
+    assert "Comment=hello" in shown and "Requeue=1" in shown
+    wait_for(lambda: is_training(folder), what="the first evaluation")
+    # What --signal=B:USR1@180 has Slurm do three minutes before the limit.
+    subprocess.run(["scancel", "--batch", "--signal=USR1", job], env=slurm, check=True)
+    wait_for((folder / "result.json").exists, 120, "the second attempt")
+    first, second = attempts(folder)
+    assert first[-1].endswith("exit=143")
+    assert not second[0].startswith("step=1000/"), "not resumed"
+
+
+# THE GRID
+
+
+def test_paper_grid():
+    lines = dry_run("paper")
+    assert len(lines) == len({line.text for line in lines}) == 9100
+    assert len(set(folders("paper"))) == 9100
+    tables = (ROOT / "results" / "paper").glob("*.csv")
+    noises = {row["noise_as_run"] for path in tables for row in csv.DictReader(path.open())}
+    assert len(noises) == 15
+    assert Counter(line.script[:3] for line in lines) == {"sac": 2275, "td3": 2275, "ppo": 4550}
+    assert Counter(line.env_id for line in lines) == {
+        f"{env}-v5": 1820 for env in ("HalfCheetah", "Hopper", "Humanoid", "Pusher", "Walker2d")
+    }
+    noisy = [line for line in lines if line.noise]
+    assert len(noisy) == 9000
+    assert Counter(*zip(*(x.noise for x in noisy), strict=True)) == dict.fromkeys(noises, 600)
+    rates = [0.01, 0.05, 0.1, 0.2, 0.5, 1.0]
+    assert Counter(*zip(*(x.noise_rate for x in noisy), strict=True)) == dict.fromkeys(rates, 1500)
+    for algorithm, seeds in ALGORITHMS.items():
+        of = Counter(line.seed for line in lines if line.script.startswith(algorithm))
+        assert of == {seed: 455 for seed in range(1, seeds + 1)}
+    assert {line.total_timesteps for line in lines} == {1_000_000}
+    assert [line.seed for line in lines] == sorted(line.seed for line in lines)
+    # Seeds differ in their number only, so the first seed stands for all in the next test.
+    for seed in range(2, 11):
+        first = [x.text.replace("--seed 1 ", f"--seed {seed} ") for x in lines if x.seed == 1]
+        assert {line.text for line in lines if line.seed == seed} <= set(first)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_scripts_accept_every_line(algorithm):
+    script = import_module(f"{algorithm}_continuous_noisy")
+    for line in dry_run("paper", "--algos", algorithm, "--seeds", "1"):
+        args = tyro.cli(script.Args, args=shlex.split(line.text)[2:])
+        assert list(args.noise) == line.noise
+        assert [args.env_id, args.seed] == [line.env_id, 1]
+        assert list(args.noise_rate) == line.noise_rate
+
+
+def test_other_presets():
+    best = {(x.script[:3], x.env_id, *x.noise, *x.noise_rate) for x in dry_run("best")}
+    with open(ROOT / "results" / "paper" / "best.csv") as file:
+        for row in csv.DictReader(file):
+            cell = (row["algorithm"].lower(), row["environment"].replace("-v2", "-v5"))
+            best -= {cell, (*cell, row["noise_as_run"], float(row["noise_rate"]))}
+    assert not best
+    assert len(dry_run("best")) == 2 * len(dry_run("baseline")) == 200
+    ablation = dry_run("ablation")
+    assert len(ablation) == 5 * 10 * (1 + 5 + 5)
+    for line in ablation:
+        if line.noise:
+            name, low, high = re.fullmatch(r"(\w+)\((.+), (.+)\)", *line.noise).groups()
+            scale = name == "RandomUniformScaleReward"
+            assert float(low) == pytest.approx(2 - float(high) if scale else -float(high))
+            assert line.noise_rate == ([0.05] if scale else [1.0])
+    assert {(x.script[:3], x.env_id, x.runs_dir) for x in dry_run("demo")} == {
+        ("ppo", "Hopper-v5", "runs/demo")
+    }
+
+
+def test_spellings_and_rate_zero_are_one_run():
+    noises = ["RandomUniformScaleReward(.5, 1.5)", "RandomUniformScaleReward(0.50, high=1.5)"]
+    grid = ["--algos=SAC", "--envs", "Hopper-v5", "Hopper-v5", "--seeds", "3", "3-4"]
+    lines = dry_run("custom", *grid, "--noises", *noises, "--noise-rates", "0.10", "0", ".1")
+    assert [(line.seed, line.noise) for line in lines] == [
+        (seed, noise) for seed in (3, 4) for noise in ([], [SCALE])
+    ]
+
+
+def test_a_line_runs_when_pasted_into_a_shell(tmp_path):
+    grid = ["best", "--algos", "ppo", "--envs", "Hopper-v5", "--seeds", "1"]
+    small = ["--total-timesteps", "2048", "--runs-dir", tmp_path / "my runs"]
+    result = run(*grid, *small, "--dry-run", "--", "--no-compile", "--eval-episodes", "1")
+    subprocess.run(result.out.splitlines()[1], shell=True, check=True, cwd=ROOT)
+    assert (folders(*grid, *small)[1] / "result.json").exists()
+
+
+# REPORTS AND ERRORS
+
+
+def test_status_arithmetic(tmp_path):
+    grid = ["baseline", "--algos", "ppo", "--envs", "Hopper-v5", "--seeds", "1-6"]
+    grid += ["--total-timesteps", "1000", "--runs-dir", tmp_path]
+    done, running, slow, failed, stopped, lost = folders(*grid)
+    (tmp_path / "logs").mkdir()
+    done.mkdir()
+    (done / "result.json").write_text("{}")
+    for folder, text in {
+        done: "step=1000/1000 sps=200 eval_return=1.0\n# now host: exit=0\n",
+        running: "step=100/1000 sps=100 eta=0:00:09\nstep=200/1000 sps=100 eta=0:00:08\n",
+        slow: "step=200/1000 sps=10 eta=0:01:20\n",
+        failed: "step=600/1000 sps=100\nTraceback\n  x\nValueError: broken\n# now host: exit=1\n",
+        stopped: "step=500/1000 sps=100\n# now host: exit=143\n",
+        lost: "step=500/1000 sps=100\n",
+    }.items():
+        log_of(folder).write_text("# now host: python ppo_continuous_noisy.py --seed 1\n" + text)
+    os.utime(log_of(lost), (time.time() - 300,) * 2)
+    result = run("status", *grid)
+    assert result.code == 0
+    # Left: 800 + 800 + 400 + 500 + 500 steps. The speed is the harmonic mean of 200, 100, 10, 100,
+    # 100 and 100: 6 / 0.155 steps per second; two runs at a time.
+    seconds = round(3000 / (6 / 0.155) / 2)
+    assert seconds == 39
+    assert (
+        "6 runs: 1 done, 2 running, 1 failed, 2 to do; 110 steps/s now, about 0:00:39" in result.out
+    )
+    assert re.search(rf"exit 1 +{log_of(failed)} +ValueError: broken\n", result.out)
+    slowest = result.out.partition("slowest")[2].splitlines()[1:]
+    assert [line.split() for line in slowest] == [
+        ["0:01:20", "10/s", "200", str(slow)],
+        ["0:00:08", "100/s", "200", str(running)],
+    ]
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        ("nope", "unknown preset 'nope'; choose one of demo, baseline, best"),
+        ("best --algos dqn", "unknown algorithm 'dqn'; choose from sac, td3, ppo"),
+        ("custom --noises Foo(1) --noise-rates 1", "bad noise 'Foo(1)': unknown name; valid are"),
+        ("paper --noise-rates 1.5", "1.5"),
+        ("custom --noises RandomNormalNoisyReward(1)", "custom needs --noises and --noise-rates"),
+        ("best --envs Ant-v5", "the paper has no best noise for sac on Ant-v5"),
+        ("demo --envs Nope-v5", "--envs Nope-v5: "),
+        ("demo --seeds 2-1", "the grid is empty"),
+        ("demo --seeds x", "--seeds: invalid seeds value: 'x'"),
+        ("demo --algos", "--algos: expected at least one argument"),
+        ("demo --total-timesteps 0", "--total-timesteps must be greater than 0, not 0"),
+        ("demo --executor cloud", "unknown executor 'cloud'; choose local, parallel or slurm"),
+        ("demo --jobs 0", "--jobs must be a number greater than 0, not '0'"),
+        ("demo --jobs", "--jobs needs a value"),
+        ("demo --sshlogin host", "--sshlogin and --remote-dir belong to --executor parallel"),
+        ("demo -- --seed 2", "--seed is part of the grid"),
+        ("best --algos sac -- --nope", "sac_continuous_noisy.py does not accept the arguments"),
+    ],
+)
+def test_bad_input(args, message, tmp_path):
+    first, *words = args.split()
+    result = run(first, "--runs-dir", tmp_path / "runs", *words)
+    assert result.code == 2, result.out + result.err
+    errors = [line for line in result.err.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1 and message in errors[0]
+    assert "--nope" in args or len(result.err.splitlines()) == 1
+    assert not result.out and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("executor", "program"), [("parallel", "parallel"), ("slurm", "sbatch")])
+def test_missing_engine(executor, program, tmp_path):
+    tools, used = tmp_path / "bin", "env bash dirname awk grep wc cut hostname date mkdir tr xargs"
+    tools.mkdir()
+    for tool in used.split():
+        (tools / tool).symlink_to(shutil.which(tool))
+    env = {**ENV, "PATH": str(tools)}
+    result = run("demo", "--runs-dir", tmp_path / "runs", "--executor", executor, env=env)
+    assert result.code == 2
+    assert f"needs {'GNU ' * (program == 'parallel')}{program}" in result.err
+    assert not (tmp_path / "runs").exists()
+
+
+def test_help():
+    shown = run("--help")
+    assert shown.code == 0 and not shown.err
+    examples = re.findall(r"^  \./benchmark\.sh (.*)", shown.out, flags=re.MULTILINE)
+    assert len(examples) >= 5
+    for example in examples:
+        words = shlex.split(example.partition("|")[0])
+        result = run(*words, *(["--dry-run"] if words[0] != "status" else []))
+        assert result.code == 0, result.err

@@ -1,0 +1,1252 @@
+"""Tests of noisy_wrappers: every expectation is derived here from the paper's formulas."""
+
+import copy
+import doctest
+import math
+import pickle
+import re
+import subprocess
+import sys
+import zlib
+
+import gymnasium as gym
+import noisyenv.wrappers as noisyenv
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import FlattenObservation, RecordEpisodeStatistics
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import noisy_wrappers
+from noisy_wrappers import (
+    WRAPPERS,
+    NoiseWrapper,
+    RandomDropoutObservation,
+    RandomEarlyTermination,
+    RandomMixupObservation,
+    RandomNormalNoisyObservation,
+    RandomNormalNoisyReward,
+    RandomUniformNoisyObservation,
+    RandomUniformNoisyReward,
+    RandomUniformScaleObservation,
+    RandomUniformScaleReward,
+    canonical_noises,
+    make_noisy,
+    noise_wrappers,
+    parse_noise,
+    run_name,
+)
+
+# Derandomized: a failure in CI is a failure on every machine.
+hypothesis_settings = settings(deadline=None, derandomize=True, max_examples=150)
+
+# wrapper, arguments, keywords, formula(noise generator, o_t, o_(t-1))
+OBSERVATION_CASES = [
+    (RandomNormalNoisyObservation, (0.3,), {}, lambda g, o, _: o + g.normal(0, 0.3, o.shape)),
+    (
+        RandomNormalNoisyObservation,
+        (0.3,),
+        {"loc": -0.5},
+        lambda g, o, _: o + g.normal(-0.5, 0.3, o.shape),
+    ),
+    (RandomUniformNoisyObservation, (-0.2, 0.7), {}, lambda g, o, _: o + g.uniform(-0.2, 0.7, 3)),
+    (RandomUniformScaleObservation, (0.5, 1.7), {}, lambda g, o, _: o * g.uniform(0.5, 1.7)),
+    (
+        RandomUniformScaleObservation,
+        (0.5, 1.7),
+        {"per_dimension": True},
+        lambda g, o, _: o * g.uniform(0.5, 1.7, o.shape),
+    ),
+    (RandomMixupObservation, (0.3,), {}, lambda g, o, previous: 0.3 * o + 0.7 * previous),
+    (RandomMixupObservation, (0.0,), {}, lambda g, o, previous: previous),
+    (RandomDropoutObservation, (0.3,), {}, lambda g, o, _: (g.random(o.shape) < 0.3) * o),
+]
+REWARD_CASES = [
+    (RandomNormalNoisyReward, (0.3,), {}, lambda g, r: r + g.normal(0, 0.3)),
+    (RandomNormalNoisyReward, (0.3,), {"loc": 2.0}, lambda g, r: r + g.normal(2.0, 0.3)),
+    (RandomUniformNoisyReward, (-0.2, 0.7), {}, lambda g, r: r + g.uniform(-0.2, 0.7)),
+    (RandomUniformScaleReward, (0.5, 1.7), {}, lambda g, r: r * g.uniform(0.5, 1.7)),
+]
+# One configuration per wrapper, and the variants.
+NOISES = [
+    "RandomNormalNoisyObservation(0.3)",
+    "RandomUniformNoisyObservation(-0.2, 0.7)",
+    "RandomUniformScaleObservation(0.5, 1.7)",
+    "RandomUniformScaleObservation(-1.0, 0.0, per_dimension=True)",
+    "RandomMixupObservation(0.3)",
+    "RandomMixupObservation(0.3, recursive=True)",
+    "RandomDropoutObservation(0.3)",
+    "RandomNormalNoisyReward(0.3)",
+    "RandomUniformNoisyReward(-0.2, 0.7)",
+    "RandomUniformScaleReward(0.5, 1.7)",
+    "RandomEarlyTermination(3, 9)",
+    "RandomEarlyTermination(3, 9, truncate=True)",
+    "RandomEarlyTermination(each_step=True)",
+]
+STEP_NOISES = [text for text in NOISES if not text.startswith("RandomEarlyTermination(3")]
+BOX = gym.spaces.Box(-10.0, 10.0, (3,), np.float64)
+
+
+class GenericEnv(gym.Env):
+    """An endless environment of random observations and rewards, with functions to replace."""
+
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+
+    def __init__(self, observation_space=BOX, reset=None, step=None):
+        self.observation_space = observation_space
+        self._reset = reset or (lambda env: (env.draw(), {}))
+        self._step = step or (
+            lambda env, action: (env.draw(), float(env.np_random.normal()), False, False, {})
+        )
+
+    def draw(self):
+        space = self.observation_space
+        return self.np_random.uniform(-5, 5, space.shape).astype(space.dtype)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self._reset(self)
+
+    def step(self, action):
+        return self._step(self, action)
+
+
+def constant_env(value=2.0, shape=(3,)):
+    space = gym.spaces.Box(-np.inf, np.inf, shape, np.float64)
+    return GenericEnv(
+        space,
+        reset=lambda env: (np.full(shape, value), {}),
+        step=lambda env, action: (np.full(shape, value), value, False, False, {}),
+    )
+
+
+def episodes_env(lengths):
+    """An environment whose episodes have the given lengths (None: endless), in turn."""
+
+    def reset(env):
+        env.episode = getattr(env, "episode", -1) + 1
+        env.t = 0
+        return np.zeros(3), {}
+
+    def step(env, action):
+        env.t += 1
+        done = env.t == lengths[env.episode % len(lengths)]
+        return np.zeros(3), 1.0, done, False, {}
+
+    return GenericEnv(reset=reset, step=step)
+
+
+def build(text, env, rate):
+    """Build a wrapper from the notation, without the module's parser."""
+    name, arguments = text.split("(", 1)
+    return eval(f"wrapper(env, rate, {arguments}", {"wrapper": WRAPPERS[name]} | locals())
+
+
+def streams(wrapper, seed, position=0):
+    """The documented seeding: the gate's and the noise's generator."""
+    entropy = [seed, zlib.crc32(wrapper.__name__.encode()), position]
+    return [np.random.default_rng(child) for child in np.random.SeedSequence(entropy).spawn(2)]
+
+
+def rollout(env, seed=None, steps=100, action=0):
+    """What a reset and ``steps`` steps return, with resets where episodes end."""
+    observation, info = env.reset(seed=seed)
+    out = [(observation, None, False, False, info)]
+    for _ in range(steps):
+        out.append(env.step(action))
+        if out[-1][2] or out[-1][3]:
+            observation, info = env.reset()
+            out.append((observation, None, False, False, info))
+    return out
+
+
+def same(first, second):
+    """Two rollouts are equal bit for bit, types included."""
+    return len(first) == len(second) and all(
+        a[0].dtype == b[0].dtype
+        and a[0].shape == b[0].shape
+        and a[0].tobytes() == b[0].tobytes()
+        and type(a[1]) is type(b[1])
+        and a[1:] == b[1:]
+        for a, b in zip(first, second, strict=True)
+    )
+
+
+# The formulas
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("rate", [0.3, 1.0])
+@pytest.mark.parametrize(("wrapper", "args", "kwargs", "formula"), OBSERVATION_CASES)
+def test_observation_golden(wrapper, args, kwargs, formula, rate, dtype):
+    space = gym.spaces.Box(-10, 10, (3,), dtype)
+    bare = rollout(GenericEnv(space), seed=7)
+    noisy = rollout(wrapper(GenericEnv(space), rate, *args, **kwargs), seed=7)
+    gate, noise = streams(wrapper, seed=7)
+    previous = None
+    for t, (clean, got) in enumerate(zip(bare, noisy, strict=True)):
+        observation, expected, info = clean[0], clean[0], {}
+        may_act = wrapper is not RandomMixupObservation or t > 0
+        if may_act and gate.random() < rate:
+            expected = formula(noise, observation.astype(np.float64), previous)
+            info = {"noise": (wrapper.__name__,)}
+        assert got[0].dtype == dtype
+        np.testing.assert_allclose(got[0], expected, rtol=4 * np.finfo(dtype).eps, atol=1e-300)
+        assert got[1:] == (*clean[1:4], info)
+        previous = observation.astype(np.float64)
+
+
+@pytest.mark.parametrize("rate", [0.3, 1.0])
+@pytest.mark.parametrize(("wrapper", "args", "kwargs", "formula"), REWARD_CASES)
+def test_reward_golden(wrapper, args, kwargs, formula, rate):
+    bare = rollout(GenericEnv(), seed=7)
+    noisy = rollout(wrapper(GenericEnv(), rate, *args, **kwargs), seed=7)
+    gate, noise = streams(wrapper, seed=7)
+    assert noisy[0][4] == {}
+    for clean, got in zip(bare[1:], noisy[1:], strict=True):
+        acts = gate.random() < rate
+        assert got[1] == (formula(noise, clean[1]) if acts else clean[1])
+        assert got[4] == ({"noise": (wrapper.__name__,)} if acts else {})
+        assert got[0].tobytes() == clean[0].tobytes()
+
+
+@pytest.mark.parametrize("truncate", [False, True])
+@pytest.mark.parametrize("rate", [0.5, 1.0])
+def test_early_termination_golden(rate, truncate):
+    natural = [4, None, 20, None, 7]  # a chosen episode may end before its drawn step
+    env = RandomEarlyTermination(episodes_env(natural), rate, 3, 9, truncate=truncate)
+    gate, noise = streams(RandomEarlyTermination, seed=5)
+    ended_by_noise = 0
+    for episode in range(100):
+        env.reset(seed=5 if episode == 0 else None)
+        drawn = noise.integers(3, 10)
+        last = drawn if gate.random() < rate else math.inf
+        end = natural[episode % 5] or math.inf
+        for t in range(1, 30):
+            _, _, terminated, truncated, info = env.step(0)
+            assert terminated == (t == end or (t == last and not truncate))
+            assert truncated == (t == last and truncate)
+            assert info == ({"noise": ("RandomEarlyTermination",)} if t == last else {})
+            ended_by_noise += t == last
+            if terminated or truncated:
+                break
+    assert (env.times_applied, env.opportunities) == (ended_by_noise, 100)
+
+
+@pytest.mark.parametrize("truncate", [False, True])
+def test_each_step_golden(truncate):
+    env = RandomEarlyTermination(constant_env(), 0.1, each_step=True, truncate=truncate)
+    gate, _ = streams(RandomEarlyTermination, seed=5)
+    env.reset(seed=5)
+    ends = []
+    for _ in range(200):
+        _, _, terminated, truncated, info = env.step(0)
+        ends.append(gate.random() < 0.1)
+        assert (terminated, truncated) == (ends[-1] and not truncate, ends[-1] and truncate)
+        assert info == ({"noise": ("RandomEarlyTermination",)} if ends[-1] else {})
+        if ends[-1]:
+            env.reset()
+    assert 0 < env.times_applied == sum(ends)
+    assert env.opportunities == 200
+
+
+def test_early_termination_includes_both_ends_and_is_uniform():
+    env = RandomEarlyTermination(constant_env(), 1.0, 2, 6)
+    counts = dict.fromkeys(range(1, 9), 0)
+    for episode in range(2000):
+        env.reset(seed=0 if episode == 0 else None)
+        length = 1
+        while not env.step(0)[2]:
+            length += 1
+        counts[length] += 1
+    assert counts[1] == counts[7] == counts[8] == 0
+    expected = 2000 / 5
+    chi_square = sum((counts[k] - expected) ** 2 / expected for k in range(2, 7))
+    assert chi_square < 18.5  # the 0.1 % point at 4 degrees of freedom
+
+
+@pytest.mark.parametrize("high", [None, 1])
+def test_early_termination_at_the_first_step(high):
+    env = RandomEarlyTermination(constant_env(), 1.0, 1, high)
+    for _ in range(3):
+        env.reset(seed=0)
+        assert env.step(0)[2:] == (True, False, {"noise": ("RandomEarlyTermination",)})
+
+
+def test_termination_at_the_time_limit_is_a_termination():
+    env = RandomEarlyTermination(gym.wrappers.TimeLimit(constant_env(), 5), 1.0, 5)
+    env.reset(seed=0)
+    assert [env.step(0)[2:4] for _ in range(5)][-1] == (True, True)
+
+
+def numbered_env(reuse=False):
+    """Observations 1, 2, 3, ... from the first reset on; with ``reuse`` all in one array."""
+    buffer = np.zeros(3)
+
+    def observe(env):
+        env.count = getattr(env, "count", 0) + 1
+        if not reuse:
+            return np.full(3, float(env.count))
+        buffer[:] = env.count
+        return buffer
+
+    return GenericEnv(
+        reset=lambda env: (observe(env), {}),
+        step=lambda env, action: (observe(env), 0.0, False, False, {}),
+    )
+
+
+@pytest.mark.parametrize("reuse", [False, True])
+@pytest.mark.parametrize(
+    ("factor", "recursive", "episodes"),
+    [
+        (0.5, False, [[1, 1.5, 2.5, 3.5], [5, 5.5, 6.5, 7.5]]),
+        (0.5, True, [[1, 1.5, 2.25, 3.125], [5, 5.5, 6.25, 7.125]]),
+        (0.0, False, [[1, 1, 2, 3], [5, 5, 6, 7]]),
+        (0.0, True, [[1, 1, 1, 1], [5, 5, 5, 5]]),  # the agent sees one observation for ever
+        (1.0, False, [[1, 2, 3, 4], [5, 6, 7, 8]]),
+    ],
+)
+def test_mixup_by_hand(factor, recursive, episodes, reuse):
+    env = RandomMixupObservation(numbered_env(reuse), 1.0, factor, recursive=recursive)
+    for expected in episodes:
+        observation, info = env.reset()
+        seen = [observation[0]]
+        assert info == {}
+        seen += [env.step(0)[0][0] for _ in range(3)]
+        assert seen == expected
+    assert (env.times_applied, env.opportunities) == (6, 6)
+
+
+def test_mixup_remembers_unperturbed_steps_too():
+    env = RandomMixupObservation(numbered_env(), 0.0, 0.5)
+    env.reset()
+    env.step(0)
+    env.step(0)
+    env.noise_rate = 1.0
+    assert env.step(0)[0][0] == 3.5
+
+
+def test_mixup_survives_a_caller_that_writes_into_observations():
+    env = RandomMixupObservation(numbered_env(), 1.0, 0.0)
+    env.reset()[0][:] = 99
+    assert env.step(0)[0][0] == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "mean", "variance"),
+    [
+        ("RandomNormalNoisyObservation(0.5)", 0, 0.5**2),
+        ("RandomNormalNoisyObservation(0.5, loc=1.0)", 1, 0.5**2),
+        ("RandomUniformNoisyObservation(-1.0, 2.0)", 0.5, 3**2 / 12),
+        ("RandomUniformScaleObservation(0.5, 2.0)", 2 * 0.25, 4 * 1.5**2 / 12),
+        ("RandomUniformScaleObservation(0.5, 2.0, per_dimension=True)", 0.5, 4 * 1.5**2 / 12),
+        ("RandomDropoutObservation(0.2)", 2 * -0.8, 4 * 0.2 * 0.8),
+        ("RandomNormalNoisyReward(0.5)", 0, 0.5**2),
+        ("RandomNormalNoisyReward(0.5, loc=1.0)", 1, 0.5**2),
+        ("RandomUniformNoisyReward(-1.0, 2.0)", 0.5, 3**2 / 12),
+        ("RandomUniformScaleReward(0.5, 2.0)", 2 * 0.25, 4 * 1.5**2 / 12),
+    ],
+)
+def test_mean_variance_and_rate(text, mean, variance):
+    """On a constant 2 the change has the formula's moments, at a rate known to 5 %."""
+
+    def measure(rate, steps=40_000):
+        env = build(text, constant_env(2.0, (4,)), rate)
+        env.reset(seed=1)
+        kind = 1 if "Reward" in text else 0
+        change = np.array([env.step(0)[kind] for _ in range(steps)]).reshape(steps, -1) - 2
+        acted = (change != 0).any(axis=1)
+        # Dropout that happens to keep all four elements changes nothing.
+        visible = 1 - 0.2**4 if "Dropout" in text else 1
+        return change, change[acted], acted.mean() / visible
+
+    change, noise, rate = measure(0.3)
+    assert abs(rate - 0.3) < 0.05 * 0.3
+    if "Dropout" not in text:
+        assert noise.mean() == pytest.approx(mean, abs=0.03)
+        assert noise.var() == pytest.approx(variance, rel=0.05)
+    # The moments of all steps: p * mean and p * (variance + mean^2).
+    assert change.mean() == pytest.approx(0.3 * mean, abs=0.012)
+    assert np.square(change).mean() == pytest.approx(0.3 * (variance + mean**2), rel=0.05)
+    for wrong in (0.27, 0.33):  # the bound sees an error of 10 %
+        assert abs(measure(wrong)[2] - 0.3) > 0.05 * 0.3
+
+
+@pytest.mark.parametrize("text", NOISES)
+@pytest.mark.parametrize("rate", [0.2, 0.6])
+def test_applied_fraction_is_the_rate(text, rate):
+    env = build(text, episodes_env([10]), rate)
+    assert math.isnan(env.applied_fraction)
+    steps = rollout(env, seed=3, steps=150_000 if "(3" in text else 40_000)
+    assert env.times_applied == sum("noise" in info for *_, info in steps)
+    resets = sum(reward is None for _, reward, *_ in steps)
+    if "(3" in text:
+        opportunities = resets
+    elif "Reward" in text or "Mixup" in text or "each_step" in text:
+        opportunities = len(steps) - resets
+    else:
+        opportunities = len(steps)
+    assert env.opportunities == opportunities
+    assert env.applied_fraction == env.times_applied / env.opportunities
+    assert env.applied_fraction == pytest.approx(rate, rel=0.05)
+
+
+def ks_distance(a, b):
+    """The two-sample Kolmogorov-Smirnov statistic."""
+    a, b = np.sort(np.ravel(a)), np.sort(np.ravel(b))
+    grid = np.concatenate([a, b])
+    below = [np.searchsorted(sample, grid, side="right") / len(sample) for sample in (a, b)]
+    return np.abs(below[0] - below[1]).max()
+
+
+@pytest.mark.parametrize(
+    ("name", "ours", "theirs", "other"),
+    [
+        ("RandomNormalNoisyObservation", {"scale": 0.5}, {"scale": 0.5}, {"scale": 0.6}),
+        ("RandomUniformNoisyObservation", {"low": -1, "high": 2}, None, {"low": -1, "high": 2.4}),
+        ("RandomUniformScaleObservation", {"low": 0.5, "high": 2}, None, {"low": 0.3, "high": 2}),
+        (
+            "RandomUniformScaleObservation",
+            {"low": 0.5, "high": 2, "per_dimension": True},
+            {"low": 0.5, "high": 2, "size": None},
+            {"low": 0.3, "high": 2},
+        ),
+        ("RandomDropoutObservation", {"keep_prob": 0.9}, {"p": 0.1}, {"p": 0.9}),
+        ("RandomNormalNoisyReward", {"scale": 0.5}, None, {"scale": 0.6}),
+        ("RandomUniformNoisyReward", {"low": -1, "high": 2}, None, {"low": -1, "high": 2.4}),
+        ("RandomUniformScaleReward", {"low": 0.5, "high": 2}, None, {"low": 0.3, "high": 2}),
+    ],
+)
+def test_distribution_of_noisyenv(name, ours, theirs, other):
+    kind, steps = (1, 10_000) if "Reward" in name else (0, 10_000)
+
+    def sample(env):
+        env.reset(seed=0)
+        return np.array([np.ravel(env.step(0)[kind])[0] for _ in range(steps)])
+
+    np.random.seed(0)  # noisyenv draws from the global generator
+    theirs_wrapper = getattr(noisyenv, name)
+    reference = sample(theirs_wrapper(constant_env(), noise_rate=0.7, **(theirs or ours)))
+    distorted = sample(theirs_wrapper(constant_env(), noise_rate=0.7, **other))
+    got = sample(WRAPPERS[name](constant_env(), 0.7, **ours))
+    critical = 1.95 * math.sqrt(2 / steps)  # the 0.1 % point
+    assert ks_distance(got, reference) < critical
+    assert ks_distance(got, distorted) > critical  # and the test has power
+
+
+def test_recursive_mixup_of_noisyenv():
+    """Within the first episode: noisyenv also carries its memory into the next one."""
+    ours = RandomMixupObservation(numbered_env(), 1.0, 0.3, recursive=True)
+    theirs = noisyenv.RandomMixupObservation(numbered_env(), noise_rate=1.0, factor=0.3)
+    assert np.array_equal(ours.reset()[0], theirs.reset()[0])
+    for _ in range(10):
+        np.testing.assert_allclose(ours.step(0)[0], theirs.step(0)[0], rtol=1e-14)
+
+
+# Seeds and streams
+
+
+def pattern(steps):
+    """Which steps were perturbed."""
+    return ["noise" in info for *_, info in steps]
+
+
+@pytest.mark.parametrize("text", NOISES)
+def test_same_seed_same_noise(text):
+    env = build(text, gym.wrappers.TimeLimit(GenericEnv(), 12), 0.5)
+    first = rollout(env, seed=1)
+    assert same(first, rollout(env, seed=1))
+    assert same(first, rollout(build(text, gym.wrappers.TimeLimit(GenericEnv(), 12), 0.5), seed=1))
+    assert pattern(first) != pattern(rollout(env, seed=2))
+
+
+@pytest.mark.parametrize("text", NOISES)
+def test_reset_without_seed_keeps_the_stream(text):
+    env = build(text, episodes_env([12]), 0.5)
+    runs = [pattern(rollout(env, seed)) for seed in (1, None, None)]
+    assert runs[0] != runs[1] != runs[2] != runs[0]
+
+
+@pytest.mark.parametrize("text", NOISES)
+def test_never_seeded_draws_entropy(text):
+    first, second = (rollout(build(text, episodes_env([12]), 0.5), steps=500) for _ in range(2))
+    assert pattern(first) != pattern(second)
+
+
+def test_equal_wrappers_in_a_stack_draw_different_noise():
+    inner = RandomNormalNoisyReward(constant_env(0.0), 1.0, 0.3)
+    middle = gym.wrappers.TimeLimit(inner, 1000)  # positions count noise wrappers only
+    outer = RandomNormalNoisyReward(middle, 1.0, 0.3)
+    outer.reset(seed=7)
+    rewards = [outer.step(0)[1] for _ in range(20)]
+    (_, inner_noise), (_, outer_noise) = (
+        streams(RandomNormalNoisyReward, 7, position) for position in (0, 1)
+    )
+    both = [(inner_noise.normal(0, 0.3), outer_noise.normal(0, 0.3)) for _ in range(20)]
+    assert rewards == [a + b for a, b in both]
+    assert all(a != b for a, b in both)
+
+
+def test_streams_of_different_wrappers_differ():
+    states = set()
+    for seed in range(3):
+        for position in range(3):
+            env = constant_env()
+            for _ in range(position):
+                env = RandomNormalNoisyReward(env, 0.5, 0.1)
+            for text in ("RandomUniformNoisyReward(0, 1)", "RandomNormalNoisyReward(1)"):
+                noisy = build(text, env, 0.5)
+                noisy.reset(seed=seed)
+                state = noisy.state_dict()
+                states |= {str(state["gate"]), str(state["noise"])}
+    assert len(states) == 3 * 3 * 2 * 2
+
+
+@pytest.mark.parametrize("text", NOISES)
+def test_initial_states_are_those_of_the_bare_environment(text):
+    def initial_states(env):
+        states = []
+        for episode in range(4):
+            env.reset(seed=11 if episode == 0 else None)
+            data = env.unwrapped.data
+            states.append((data.qpos.tobytes(), data.qvel.tobytes()))
+            for _ in range(2):
+                env.step(np.zeros(1))
+        return states
+
+    bare = initial_states(gym.make("InvertedPendulum-v5"))
+    assert len(set(bare)) == 4
+    assert initial_states(build(text, gym.make("InvertedPendulum-v5"), 1.0)) == bare
+    assert initial_states(build(text, gym.make("InvertedPendulum-v5"), 0.3)) == bare
+
+
+@pytest.mark.parametrize("text", NOISES)
+def test_global_generator_is_untouched(text):
+    before = np.random.get_state()[1].tobytes()
+    rollout(build(text, GenericEnv(), 1.0), seed=0)
+    assert np.random.get_state()[1].tobytes() == before
+
+
+@pytest.mark.parametrize("text", STEP_NOISES)
+def test_a_lower_rate_perturbs_a_subset_of_the_steps(text):
+    def perturbed(rate):
+        env = build(text, constant_env(), rate)
+        steps = [env.reset(seed=4)[1]] + [env.step(0)[4] for _ in range(500)]
+        return {t for t, info in enumerate(steps) if "noise" in info}
+
+    sets = [perturbed(rate) for rate in (0, 0.1, 0.2, 0.7, 1)]
+    assert all(low < high for low, high in zip(sets, sets[1:], strict=False))
+
+
+def test_a_lower_rate_ends_a_subset_of_the_episodes_at_the_same_steps():
+    def ends(rate):
+        env = RandomEarlyTermination(episodes_env([60]), rate, 1, 50)
+        found = set()
+        for episode in range(200):
+            env.reset(seed=4 if episode == 0 else None)
+            for t in range(1, 61):
+                _, _, terminated, _, info = env.step(0)
+                if "noise" in info:
+                    found.add((episode, t))
+                if terminated:
+                    break
+        return found
+
+    sets = [ends(rate) for rate in (0, 0.1, 0.2, 0.7, 1)]
+    assert all(low < high for low, high in zip(sets, sets[1:], strict=False))
+    assert len(sets[-1]) == 200
+
+
+class Constant:
+    """A generator whose uniforms are all one value."""
+
+    def __init__(self, value):
+        self.value = value
+
+    def random(self):
+        return self.value
+
+
+@pytest.mark.parametrize("text", STEP_NOISES)
+def test_the_gate_at_the_ends_of_the_unit_interval(text):
+    """Rate 0 never acts and rate 1 always, also on the smallest and the largest uniform."""
+    for rate, uniform in [(0, 0.0), (1, np.nextafter(1.0, 0.0))]:
+        env = build(text, constant_env(), rate)
+        env.reset(seed=0)
+        env._gate = Constant(uniform)
+        assert ("noise" in env.step(0)[4]) == (rate == 1)
+
+
+# What must not change
+
+
+@pytest.mark.parametrize("text", NOISES)
+@pytest.mark.parametrize("env_id", ["Pendulum-v1", "CartPole-v1", "InvertedPendulum-v5"])
+def test_rate_zero_is_the_bare_environment(text, env_id):
+    env = gym.make(env_id)
+    env.action_space.seed(0)
+    action = env.action_space.sample()
+    bare = rollout(env, seed=3, steps=50, action=action)
+    assert same(rollout(build(text, gym.make(env_id), 0.0), 3, 50, action), bare)
+
+
+@pytest.mark.parametrize("text", NOISES)
+def test_unperturbed_data_are_the_very_same_objects(text):
+    data = (np.ones(3), 1.5, False, False, {"key": 1})
+    env = GenericEnv(reset=lambda env: (data[0], data[4]), step=lambda env, action: data)
+    env = build(text, env, 0.0)
+    observation, info = env.reset(seed=0)
+    assert observation is data[0] and info is data[4]
+    assert all(got is given for got, given in zip(env.step(0), data, strict=True))
+
+
+@pytest.mark.parametrize("text", NOISES)
+def test_data_of_the_environment_are_never_mutated(text):
+    owned = np.arange(1.0, 4.0)
+    owned.flags.writeable = False
+    info = {"key": "value"}
+    reward = np.array(1.5)
+    reward.flags.writeable = False
+    env = GenericEnv(
+        reset=lambda env: (owned, info),
+        step=lambda env, action: (owned, reward, False, False, info),
+    )
+    env = build(text, env, 1.0)
+    for step in rollout(env, seed=0, steps=20):
+        name = type(env).__name__
+        assert step[4] in ({"key": "value"}, {"key": "value", "noise": (name,)})  # no pile-up
+    assert info == {"key": "value"}
+    assert env.times_applied > 0
+
+
+def test_info_names_the_wrappers_innermost_first():
+    env = RandomNormalNoisyObservation(constant_env(), 1.0, 0.1)
+    env = RandomEarlyTermination(env, 1.0, 2)
+    env = RandomUniformScaleReward(env, 1.0, 0.5, 1.5)
+    assert env.reset(seed=0)[1] == {"noise": ("RandomNormalNoisyObservation",)}
+    both = ("RandomNormalNoisyObservation", "RandomUniformScaleReward")
+    assert env.step(0)[4] == {"noise": both}
+    assert env.step(0)[4]["noise"] == (both[0], "RandomEarlyTermination", both[1])
+
+
+@pytest.mark.parametrize(("wrapper", "args", "kwargs", "formula"), REWARD_CASES)
+@pytest.mark.parametrize(
+    ("reward", "kind"),
+    [(1.5, float), (np.float64(1.5), np.float64), (np.float32(1.5), np.float32), (2, float)],
+)
+def test_reward_type(wrapper, args, kwargs, formula, reward, kind):
+    env = GenericEnv(step=lambda env, action: (np.zeros(3), reward, False, False, {}))
+    env = wrapper(env, 1.0, *args, **kwargs)
+    env.reset(seed=0)
+    got = env.step(0)[1]
+    assert type(got) is kind
+    assert got == pytest.approx(formula(streams(wrapper, 0)[1], float(reward)), rel=1e-6)
+
+
+# Spaces
+
+
+def spaces(draw):
+    """A Box of any numeric dtype and shape, partly unbounded if of floats."""
+    dtype = np.dtype(draw(st.sampled_from(["f2", "f4", "f8", "u1", "i1", "i2", "i4", "i8", "u8"])))
+    shape = draw(st.sampled_from([(), (1,), (3,), (2, 3), (2, 1, 2)]))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    low = rng.uniform(0 if dtype.kind == "u" else -100, 50, shape).astype(dtype)
+    high = (low + rng.uniform(0, 50, shape)).astype(dtype)
+    if dtype.kind == "f" and draw(st.booleans()):
+        low = np.where(rng.random(shape) < 0.5, -np.inf, low).astype(dtype)
+        high = np.where(rng.random(shape) < 0.5, np.inf, high).astype(dtype)
+    return gym.spaces.Box(low, np.maximum(low, high), dtype=dtype)
+
+
+numbers = st.floats(-100, 100)
+probabilities = st.floats(0, 1)
+intervals = st.tuples(numbers, numbers).map(sorted)
+
+
+@st.composite
+def observation_wrappers(draw):
+    """A function that wraps an environment in some observation noise."""
+    wrapper = draw(st.sampled_from([case[0] for case in OBSERVATION_CASES]))
+    kwargs = {}
+    if wrapper is RandomNormalNoisyObservation:
+        args = (draw(st.floats(0, 50)),)
+        kwargs = {"loc": draw(numbers)}
+    elif wrapper in (RandomMixupObservation, RandomDropoutObservation):
+        args = (draw(probabilities),)
+        if wrapper is RandomMixupObservation:
+            kwargs = {"recursive": draw(st.booleans())}
+    else:
+        args = draw(intervals)
+        if wrapper is RandomUniformScaleObservation:
+            kwargs = {"per_dimension": draw(st.booleans())}
+    rate = draw(probabilities)
+    return lambda env: wrapper(env, rate, *args, **kwargs)
+
+
+@pytest.mark.filterwarnings("ignore:overflow encountered in cast")  # float16 times 10^4
+@hypothesis_settings
+@given(st.data())
+def test_observations_stay_in_the_space(data):
+    space = spaces(data.draw)
+    wrap = data.draw(observation_wrappers())
+    low = np.clip(space.low.astype(float), -100, 100)
+    high = np.clip(space.high.astype(float), -100, 100)
+    rng = np.random.default_rng(0)
+    given_out = []
+
+    def observe(env):
+        values = (low, high, rng.uniform(low, high))[len(given_out) % 3]
+        observation = np.array(values, space.dtype)
+        given_out.append((observation, observation.copy()))
+        return observation
+
+    env = GenericEnv(
+        space,
+        reset=lambda env: (observe(env), {}),
+        step=lambda env, action: (observe(env), 0.0, False, False, {}),
+    )
+    noisy = wrap(wrap(env))
+    for step in rollout(noisy, seed=0, steps=12):
+        observation = step[0]
+        assert isinstance(observation, np.ndarray)
+        assert (observation.dtype, observation.shape) == (space.dtype, space.shape)
+        assert observation in noisy.observation_space
+        if "noise" not in step[4]:
+            assert observation in space
+    assert all(np.array_equal(observation, kept) for observation, kept in given_out)
+    assert np.all(noisy.observation_space.low <= space.low)
+    assert np.all(noisy.observation_space.high >= space.high)
+
+
+def test_rounding_keeps_a_mixture_in_the_space():
+    """0.1 * x + 0.9 * x is not x for every double."""
+    top = np.random.default_rng(0).uniform(1, 2, 1000)
+    assert np.any(0.1 * top + 0.9 * top > top)
+    env = GenericEnv(
+        gym.spaces.Box(-top, top, dtype=np.float64),
+        reset=lambda env: (top.copy(), {}),
+        step=lambda env, action: (top.copy(), 0.0, False, False, {}),
+    )
+    env = RandomMixupObservation(env, 1.0, 0.1)
+    assert all(step[0] in env.observation_space for step in rollout(env, seed=0, steps=3))
+
+
+@pytest.mark.parametrize(
+    ("text", "low", "high"),
+    [
+        ("RandomNormalNoisyObservation(0.1)", [-np.inf] * 3, [np.inf] * 3),
+        ("RandomUniformNoisyObservation(-0.5, 1.0)", [-1.5, 1.5, -np.inf], [3, 4, np.inf]),
+        ("RandomUniformNoisyObservation(0.5, 1.0)", [-1, 2, -np.inf], [3, 4, np.inf]),
+        ("RandomUniformScaleObservation(0.5, 2.0)", [-2, 1, -np.inf], [4, 6, np.inf]),
+        ("RandomUniformScaleObservation(-1.0, 0.0)", [-2, -3, -np.inf], [2, 3, np.inf]),
+        ("RandomUniformScaleObservation(0.0, 0.0)", [-1, 0, -np.inf], [2, 3, np.inf]),
+        ("RandomMixupObservation(0.5)", [-1, 2, -np.inf], [2, 3, np.inf]),
+        ("RandomDropoutObservation(0.5)", [-1, 0, -np.inf], [2, 3, np.inf]),
+    ],
+)
+def test_widened_space(text, low, high):
+    space = gym.spaces.Box(
+        np.array([-1, 2, -np.inf], np.float32), np.array([2, 3, np.inf], np.float32)
+    )
+    widened = build(text, GenericEnv(space), 0.1).observation_space
+    assert widened.dtype == np.float32
+    np.testing.assert_array_equal(widened.low, low)
+    np.testing.assert_array_equal(widened.high, high)
+
+
+def test_integer_observations_are_rounded_and_clipped():
+    values = np.array([0, 3, 100, 255], np.uint8)
+    space = gym.spaces.Box(0, 255, (4,), np.uint8)
+    env = GenericEnv(space, reset=lambda env: (values, {}))
+    env = RandomNormalNoisyObservation(env, 1.0, 40.0)
+    _, noise = streams(RandomNormalNoisyObservation, 2)
+    env.reset(seed=2)
+    noise.normal(0, 40, 4)
+    got = np.array([env.reset()[0] for _ in range(50)])
+    expected = np.clip(np.rint(values + noise.normal(0, 40, (50, 4))), 0, 255)
+    assert got.dtype == np.uint8
+    np.testing.assert_array_equal(got, expected)
+    assert 0 in got[:, 1] and 255 in got[:, 2:] and len(np.unique(got)) > 50
+
+
+@pytest.mark.parametrize("dtype", [np.int64, np.uint64])
+def test_wide_integers_do_not_overflow(dtype):
+    limits = np.iinfo(dtype)
+    space = gym.spaces.Box(limits.min, limits.max - 1, (2,), dtype)
+    values = np.array([limits.min, limits.max - 1], dtype)
+    env = GenericEnv(space, reset=lambda env: (values, {}))
+    env = RandomUniformScaleObservation(env, 1.0, 1.5, 1.5)
+    got = env.reset(seed=0)[0]
+    assert got[0] == limits.min
+    assert got[1] == pytest.approx(limits.max, rel=1e-9) and got[1] > 0
+    assert got in env.observation_space
+
+
+@pytest.mark.filterwarnings("ignore:.*WARN")
+@pytest.mark.parametrize("text", NOISES)
+@pytest.mark.parametrize(
+    "env",
+    [
+        lambda: gym.make("CartPole-v1"),
+        lambda: gym.make("Pendulum-v1"),
+        lambda: gym.make("InvertedPendulum-v5"),
+        lambda: GenericEnv(gym.spaces.Box(-6, 5, (2, 3), np.int8)),
+        lambda: GenericEnv(gym.spaces.Box(-5, 5, (), np.float32)),
+    ],
+    ids=["CartPole", "Pendulum", "InvertedPendulum", "int8", "scalar"],
+)
+def test_check_env(text, env):
+    check_env(build(text, env(), 1.0), skip_render_check=True)
+    check_env(build(text, env(), 0.3), skip_render_check=True)
+
+
+UNSUITABLE_SPACES = [
+    gym.spaces.Dict(x=BOX),
+    gym.spaces.Tuple((BOX, BOX)),
+    gym.spaces.Discrete(3),
+    gym.spaces.MultiBinary(3),
+    gym.spaces.MultiDiscrete([2, 3]),
+]
+
+
+@pytest.mark.parametrize("space", UNSUITABLE_SPACES, ids=lambda space: type(space).__name__)
+@pytest.mark.parametrize("text", NOISES)
+def test_spaces_other_than_box(text, space):
+    env = GenericEnv(space)
+    if not text.split("(")[0].endswith("Observation"):
+        build(text, env, 0.1)
+        return
+    with pytest.raises(ValueError, match="FlattenObservation") as error:
+        build(text, env, 0.1)
+    assert type(space).__name__ in str(error.value) and "\n" not in str(error.value)
+    build(text, FlattenObservation(env), 0.1)
+
+
+# Parameters
+
+
+BAD_NUMBERS = [math.nan, math.inf, -math.inf, True, "0.5", None, [0.5], 1j, np.array([0.5, 0.5])]
+BAD_STEPS = [0, -1, 2**63, 1.0, 2.5, math.nan, math.inf, True, "3", np.float64(2.0)]
+BAD_FLAGS = [0, 1, None, "yes", np.True_]
+
+
+def bad_parameters():
+    for name in WRAPPERS:
+        args = {"RandomEarlyTermination": (3,)}.get(name, (0.5,))
+        if "Uniform" in name:
+            args = (0.5, 1.0)
+            for bad in BAD_NUMBERS:
+                yield name, 0.1, (bad, 1.0), {}, "low", bad
+                yield name, 0.1, (0.5, bad), {}, "high", bad
+            yield name, 0.1, (1.0, 0.5), {}, "low", 1.0
+        for bad in [*BAD_NUMBERS, -0.001, 1.001, -1, 2]:
+            yield name, bad, args, {}, "noise_rate", bad
+            if "Mixup" in name or "Dropout" in name:
+                parameter = "factor" if "Mixup" in name else "keep_prob"
+                yield name, 0.1, (bad,), {}, parameter, bad
+        if "Normal" in name:
+            for bad in [*BAD_NUMBERS, -0.001, -1, 10**400]:
+                yield name, 0.1, (bad,), {}, "scale", bad
+            for bad in BAD_NUMBERS:
+                yield name, 0.1, (0.5,), {"loc": bad}, "loc", bad
+    for bad in BAD_STEPS:
+        yield "RandomEarlyTermination", 0.1, (bad,), {}, "low", bad
+        yield "RandomEarlyTermination", 0.1, (3, bad), {}, "high", bad
+    yield "RandomEarlyTermination", 0.1, (), {}, "low", None
+    yield "RandomEarlyTermination", 0.1, (None, 5), {}, "low", None
+    yield "RandomEarlyTermination", 0.1, (5, 4), {}, "low", 5
+    yield "RandomEarlyTermination", 0.1, (5,), {"each_step": True}, "low", 5
+    yield "RandomEarlyTermination", 0.1, (None, 5), {"each_step": True}, "high", 5
+    for bad in BAD_FLAGS:
+        yield "RandomEarlyTermination", 0.1, (5,), {"truncate": bad}, "truncate", bad
+        yield "RandomEarlyTermination", 0.1, (5,), {"each_step": bad}, "each_step", bad
+        yield "RandomMixupObservation", 0.1, (0.5,), {"recursive": bad}, "recursive", bad
+        keywords = {"per_dimension": bad}
+        yield "RandomUniformScaleObservation", 0.1, (0, 1), keywords, "per_dimension", bad
+
+
+def test_bad_parameters():
+    cases = list(bad_parameters())
+    assert len(cases) > 250
+    for name, rate, args, kwargs, parameter, value in cases:
+        with pytest.raises(ValueError) as error:
+            WRAPPERS[name](constant_env(), rate, *args, **kwargs)
+        message = str(error.value)
+        assert re.search(rf"\b{parameter}\b", message), (name, args, kwargs, message)
+        assert repr(value) in message, (name, args, kwargs, message)
+
+
+@pytest.mark.parametrize("text", NOISES)
+def test_noise_rate_is_writable_and_checked(text):
+    env = build(text, constant_env(), 0)
+    for rate in (1, 0.0, np.float32(0.5), 1.0):
+        env.noise_rate = rate
+        assert env.noise_rate == rate and type(env.noise_rate) is float
+    for bad in (-0.1, 1.1, math.nan, True, "1", None):
+        with pytest.raises(ValueError, match="noise_rate"):
+            env.noise_rate = bad
+        assert env.noise_rate == 1.0
+    env.reset(seed=0)
+    for _ in range(9):
+        env.step(0)
+    assert env.applied_fraction == 1.0
+
+
+def test_limits_of_the_parameters_are_allowed():
+    env = constant_env()
+    RandomNormalNoisyObservation(env, 0, 0)
+    RandomNormalNoisyReward(RandomNormalNoisyReward(env, 1, -0.0), 1, 0).reset(seed=0)
+    RandomUniformNoisyReward(env, 1, 0.5, 0.5)
+    RandomMixupObservation(env, np.float64(0.5), 1)
+    RandomDropoutObservation(env, 1, 0)
+    RandomEarlyTermination(env, 1, np.int64(1), np.int32(1))
+    quiet = RandomNormalNoisyReward(env, 1, -0.0)  # Generator.normal refuses -0.0
+    quiet.reset(seed=0)
+    assert quiet.step(0)[1] == 2.0
+
+
+# Copies, specs, checkpoints
+
+
+@pytest.mark.parametrize("text", NOISES)
+def test_spec_round_trip(text):
+    env = RandomNormalNoisyReward(build(text, gym.make("CartPole-v1"), 0.25), np.float64(0.5), 1)
+    for spec in (env.spec, gym.envs.registration.EnvSpec.from_json(env.spec.to_json())):
+        made = spec.make()
+        assert str(made) == str(env)
+        assert made.spec == env.spec
+        assert made.env.noise_rate == 0.25
+        assert vars(made.env).keys() == vars(env.env).keys()
+        for name in ("low", "high", "scale", "factor", "keep_prob", "recursive", "truncate"):
+            assert getattr(made.env, name, None) == getattr(env.env, name, None)
+        assert same(rollout(made, seed=5), rollout(env, seed=5))
+
+
+@pytest.mark.parametrize("text", NOISES)
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_copies_continue_alike(text, duplicate):
+    env = build(text, gym.make("CartPole-v1"), 0.5)
+    env.reset(seed=2)
+    env.step(0)
+    twin = duplicate(env)
+    assert same([env.step(0), *rollout(env)], [twin.step(0), *rollout(twin)])
+    assert (twin.times_applied, twin.opportunities) == (env.times_applied, env.opportunities)
+
+
+@pytest.mark.parametrize("text", NOISES)
+def test_state_dict_continues_the_streams(text, tmp_path):
+    env = build(text, constant_env(), 0.5)
+    rollout(env, seed=6)
+    torch.save(env.state_dict(), tmp_path / "state.pt")
+    expected = rollout(env)
+    other = build(text, constant_env(), 0.5)
+    rollout(other, seed=99, steps=7)
+    other.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
+    assert same(rollout(other), expected)
+    assert other.state_dict() == env.state_dict()
+
+
+def test_state_dict_is_a_snapshot():
+    env = RandomNormalNoisyReward(constant_env(), 1.0, 1.0)
+    env.reset(seed=0)
+    before = env.state_dict()
+    kept = copy.deepcopy(before)
+    env.step(0)
+    assert before == kept != env.state_dict()
+
+
+# The notation
+
+
+@pytest.mark.parametrize("text", NOISES)
+def test_notation_round_trips(text):
+    noise = parse_noise(text)
+    assert str(noise) == text
+    assert parse_noise(str(noise)) == noise
+    assert len({noise, parse_noise(text)}) == 1
+    wrapper = noise(constant_env(), 0.5)
+    assert str(wrapper).startswith(f"<{text.split('(')[0]}<")
+    assert rollout(wrapper, 0)[-1][1:] == rollout(build(text, constant_env(), 0.5), 0)[-1][1:]
+
+
+@pytest.mark.parametrize(
+    ("canonical", "spellings"),
+    [
+        (
+            "RandomUniformScaleReward(0.5, 1.5)",
+            ["RandomUniformScaleReward(.5,1.50)", " RandomUniformScaleReward( 0.50, high=15e-1 ) "]
+            + ["RandomUniformScaleReward(high=1.5, low=5e-1)"],
+        ),
+        (
+            "RandomNormalNoisyReward(1.0)",
+            ["RandomNormalNoisyReward(1)", "RandomNormalNoisyReward(+1)"],
+        ),
+        ("RandomNormalNoisyReward(0.001)", ["RandomNormalNoisyReward(1e-3, loc=-0.0)"]),
+        ("RandomNormalNoisyReward(0.001, loc=2.0)", ["RandomNormalNoisyReward(loc=2,scale=.001)"]),
+        ("RandomUniformNoisyReward(-0.001, 0.001)", ["RandomUniformNoisyReward(-.001, .001)"]),
+        ("RandomUniformNoisyReward(0.0, 0.5)", ["RandomUniformNoisyReward(-0.0, .5)"]),
+        ("RandomEarlyTermination(50)", ["RandomEarlyTermination(50, 50)"]),
+        ("RandomEarlyTermination(50)", ["RandomEarlyTermination(high=50, low=50)"]),
+        ("RandomEarlyTermination(50)", ["RandomEarlyTermination(50, None, truncate=False)"]),
+        ("RandomEarlyTermination(1, 100)", ["RandomEarlyTermination(1,100,each_step=False)"]),
+        (
+            "RandomEarlyTermination(each_step=True, truncate=True)",
+            ["RandomEarlyTermination(truncate=True, each_step=True)"],
+        ),
+        ("RandomMixupObservation(0.0)", ["RandomMixupObservation(0, recursive=False)"]),
+        (
+            "RandomMixupObservation(0.0, recursive=True)",
+            ["RandomMixupObservation(recursive=True, factor=0)"],
+        ),
+        (
+            "RandomUniformScaleObservation(0.8, 1.2)",
+            ["RandomUniformScaleObservation(0.8, 1.2, per_dimension=False)"],
+        ),
+    ],
+)
+def test_canonical_spelling(canonical, spellings):
+    for text in spellings:
+        assert str(parse_noise(text)) == canonical
+        assert parse_noise(text) == parse_noise(canonical)
+        assert run_name("E", "x", [text], [0.1], 1) == run_name("E", "x", [canonical], [0.10], 1)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "Baseline",
+        "RandomNormalNoisyReward",
+        "RandomNormalNoisyReward()",
+        "RandomNormalNoisyReward(1, 2)",
+        "RandomNormalNoisyReward(-1)",
+        "RandomNormalNoisyReward(1",
+        "RandomNormalNoisyReward(1, sigma=2)",
+        "RandomNormalNoisyReward(1, noise_rate=0.5)",
+        "RandomNormalNoisyReward(1, env=0)",
+        "RandomNormalNoisyReward('1')",
+        "RandomNormalNoisyReward(True)",
+        "RandomNormalNoisyReward(2 * 3)",
+        "RandomNormalNoisyReward(1e999)",
+        "RandomNormalNoisyReward(x)",
+        "RandomNormalNoisyReward(*[1])",
+        "RandomNormalNoisyReward(1, **{'loc': 2})",
+        "RandomNormalNoisyReward(1, loc=1, loc=2)",
+        "RandomNormalNoisyReward(1)\nRandomNormalNoisyReward(1)",
+        "RandomNormalNoisyReward({[]: 1})",
+        "RandomNormalNoisyReward(1)(2)",
+        "noisy_wrappers.RandomNormalNoisyReward(1)",
+        "NoiseWrapper(1)",
+        "dict()",
+        "RandomUniformScaleReward(0.5)",
+        "RandomUniformScaleReward(1.5, 0.5)",
+        "RandomEarlyTermination()",
+        "RandomEarlyTermination(0)",
+        "RandomEarlyTermination(5.0)",
+        "RandomEarlyTermination(5, 1)",
+        "RandomEarlyTermination(5, each_step=True)",
+        "RandomMixupObservation(2)",
+        "RandomMixupObservation(0, True)",
+        "__import__('os').system('true')",
+        "RandomNormalNoisyReward(__import__('os').getpid())",
+        "RandomNormalNoisyReward(\x00)",
+        "(" * 500,
+    ],
+)
+def test_bad_notation(text):
+    with pytest.raises(ValueError) as error:
+        parse_noise(text)
+    message = str(error.value)
+    assert "\n" not in message and repr(text) in message
+    assert all(f"{name}(" in message for name in WRAPPERS)
+    assert "RandomMixupObservation(factor, *, recursive=False)" in message
+    assert "RandomUniformScaleReward(low, high)" in message
+
+
+def test_the_registry_is_complete():
+    assert list(WRAPPERS) == [
+        "RandomNormalNoisyObservation",
+        "RandomUniformNoisyObservation",
+        "RandomUniformScaleObservation",
+        "RandomMixupObservation",
+        "RandomDropoutObservation",
+        "RandomNormalNoisyReward",
+        "RandomUniformNoisyReward",
+        "RandomUniformScaleReward",
+        "RandomEarlyTermination",
+    ]
+    assert all(issubclass(wrapper, NoiseWrapper) for wrapper in WRAPPERS.values())
+    assert {text.split("(")[0] for text in NOISES} == set(WRAPPERS)
+
+
+A, B, C = (
+    "RandomNormalNoisyReward(1)",
+    "RandomDropoutObservation(.5)",
+    "RandomEarlyTermination(9,9)",
+)
+
+
+def test_canonical_noises():
+    assert canonical_noises([], []) == ([], [])
+    assert canonical_noises([A], [0.5]) == (["RandomNormalNoisyReward(1.0)"], [0.5])
+    names = ["RandomEarlyTermination(9)", "RandomNormalNoisyReward(1.0)"]
+    assert canonical_noises([A, C], [0.5]) == (names, [0.5, 0.5])  # dynamics noise comes first
+    assert canonical_noises([A, B, C], [0.5, 0, 1]) == (names, [1.0, 0.5])
+    assert canonical_noises([A, B], [0]) == ([], [])
+    again = canonical_noises([B, A, C], [0.1, 0.2, 0.3])
+    assert canonical_noises(*again) == again
+    for rate in again[1]:
+        assert type(rate) is float
+
+
+@pytest.mark.parametrize(
+    ("noises", "rates"),
+    [
+        ([], [0.1]),
+        ([A], []),
+        ([A], [0.1, 0.2]),
+        ([A, B], []),
+        ([A, B, C], [0.1, 0.2]),
+        ([A], [1.1]),
+        ([A], [-0.1]),
+        ([A], [math.nan]),
+        ([A, B], [0.1, 2]),
+        (["Nothing(1)"], [0.0]),
+    ],
+)
+def test_bad_noises_and_rates(noises, rates):
+    for function in (
+        lambda: canonical_noises(noises, rates),
+        lambda: make_noisy(constant_env(), noises, rates),
+        lambda: run_name("E", "x", noises, rates, 1),
+    ):
+        with pytest.raises(ValueError) as error:
+            function()
+        assert "\n" not in str(error.value)
+
+
+def layers(env):
+    names = []
+    while isinstance(env, gym.Wrapper):
+        names.append(type(env).__name__)
+        env = env.env
+    return names[::-1]
+
+
+def test_make_noisy_order():
+    statistics = "RecordEpisodeStatistics"
+    reward, dropout, end = (text.split("(")[0] for text in (A, B, C))
+    assert layers(make_noisy(constant_env(), [], [])) == [statistics]
+    assert layers(make_noisy(constant_env(), [A], [0])) == [statistics]
+    assert layers(make_noisy(constant_env(), [A, B], [0.5])) == [statistics, reward, dropout]
+    for noises in ([A, B, C], [A, C, B], [C, A, B]):
+        env = make_noisy(constant_env(), noises, [0.5])
+        assert layers(env) == [end, statistics, reward, dropout]
+    env = make_noisy(constant_env(), [B, A, C], [0.1, 0.2, 0.3])
+    assert layers(env) == [end, statistics, dropout, reward]
+    rates = {name: wrapper.noise_rate for name, wrapper in noise_wrappers(env).items()}
+    assert rates == {end: 0.3, dropout: 0.1, reward: 0.2}
+    assert list(rates) == [end, dropout, reward]
+
+
+def test_noise_wrappers_numbers_repeats():
+    env = make_noisy(constant_env(), [A, B, A, A], [0.1, 0.2, 0.3, 0.4])
+    found = noise_wrappers(RecordEpisodeStatistics(env))
+    name = "RandomNormalNoisyReward"
+    assert list(found) == [name, "RandomDropoutObservation", f"{name}_2", f"{name}_3"]
+    assert [wrapper.noise_rate for wrapper in found.values()] == [0.1, 0.2, 0.3, 0.4]
+    assert noise_wrappers(constant_env()) == {}
+
+
+def test_statistics_see_the_true_return_and_length():
+    noises = ["RandomUniformScaleReward(0, 0)", "RandomNormalNoisyReward(5)", C]
+    env = make_noisy(GenericEnv(), noises, [1.0])
+    rewards = [step[1] for step in rollout(GenericEnv(), seed=8, steps=9)[1:]]
+    env.reset(seed=8)
+    steps = [env.step(0) for _ in range(9)]
+    assert [step[2] for step in steps] == [False] * 8 + [True]
+    assert steps[-1][4]["episode"]["r"] == pytest.approx(sum(rewards))
+    assert steps[-1][4]["episode"]["l"] == 9
+    assert sum(step[1] for step in steps) != pytest.approx(sum(rewards))
+
+
+def test_combined_noise_is_the_composition_of_the_formulas():
+    noises = ["RandomUniformScaleReward(0.5, 1.5)", "RandomNormalNoisyReward(2)"]
+    env = make_noisy(GenericEnv(), noises, [1.0])
+    clean = [step[1] for step in rollout(GenericEnv(), seed=3)[1:]]
+    noisy = [step[1] for step in rollout(env, seed=3)[1:]]
+    _, scale = streams(RandomUniformScaleReward, 3, 0)
+    _, shift = streams(RandomNormalNoisyReward, 3, 1)
+    assert noisy == [r * scale.uniform(0.5, 1.5) + shift.normal(0, 2) for r in clean]
+
+
+# Names of runs
+
+
+def test_run_names():
+    assert run_name("Hopper-v5", "sac", [], [], 1) == "Hopper-v5__sac__baseline__1"
+    assert run_name("Hopper-v5", "sac", [A], [0], 1) == "Hopper-v5__sac__baseline__1"
+    assert run_name("ALE/Pong-v5", "my exp", [], [], 2) == "ALE-Pong-v5__my--exp__baseline__2"
+    assert run_name("module:Env-v0", "x", [], [], 2) != run_name("module/Env-v0", "x", [], [], 2)
+    noises = ["RandomMixupObservation(0, recursive=True)", "RandomUniformNoisyReward(-.5, 1)", C]
+    assert run_name("E", "x", noises, [1, 0.05, 0.2], 3) == (
+        "E__x__RandomEarlyTermination_9_p0.2"
+        "+RandomMixupObservation_0.0_recursive=True_p1.0"
+        "+RandomUniformNoisyReward_-0.5_1.0_p0.05__3"
+    )
+
+
+@st.composite
+def configurations(draw):
+    """Noises and rates from few values, so that equal ones come up."""
+    few = st.sampled_from([0.0, -0.0, 0.05, 0.5, 1.0, 1e-7, 12.0, 1e16])
+    noises = []
+    for _ in range(draw(st.integers(0, 2))):
+        name = draw(st.sampled_from(list(WRAPPERS)))
+        if name == "RandomEarlyTermination":
+            steps = sorted(draw(st.lists(st.sampled_from([1, 2, 12]), min_size=1, max_size=2)))
+            arguments = [str(k) for k in steps] if draw(st.booleans()) else ["each_step=True"]
+            arguments += draw(st.sampled_from([[], ["truncate=True"], ["truncate=False"]]))
+        elif "Uniform" in name:
+            arguments = [str(x) for x in sorted(draw(st.tuples(few, few)))]
+        else:
+            most = 1 if "Mixup" in name or "Dropout" in name else 1e16
+            arguments = [str(min(draw(few), most))]
+            if "Normal" in name and draw(st.booleans()):
+                arguments.append(f"loc={draw(few)}")
+        noises.append(f"{name}({', '.join(arguments)})")
+    rates = [draw(st.sampled_from([0.0, 0.05, 0.5, 1.0])) for _ in noises]
+    return noises, rates
+
+
+@settings(hypothesis_settings, max_examples=400)
+@given(configurations(), configurations())
+def test_names_are_equal_exactly_if_the_configurations_are(one, two):
+    names = [run_name("Hopper-v5", "sac", *configuration, 1) for configuration in (one, two)]
+    assert (names[0] == names[1]) == (canonical_noises(*one) == canonical_noises(*two))
+    assert all(re.fullmatch(r"[A-Za-z0-9._=+-]+", name) for name in names)
+    assert run_name("Hopper-v5", "sac", *canonical_noises(*one), 1) == names[0]
+
+
+# The module
+
+
+def test_doctests():
+    results = doctest.testmod(noisy_wrappers)
+    assert results.failed == 0
+    assert results.attempted > 20
+
+
+def test_every_public_wrapper_has_a_doctest():
+    for wrapper in WRAPPERS.values():
+        assert ">>>" in wrapper.__doc__ and "(section 3." in wrapper.__doc__
+
+
+def test_import_needs_no_torch():
+    code = "import sys, noisy_wrappers; sys.exit('torch' in sys.modules)"
+    root = noisy_wrappers.__file__.rpartition("/")[0]
+    assert subprocess.run([sys.executable, "-c", code], cwd=root).returncode == 0
