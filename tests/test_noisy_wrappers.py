@@ -218,21 +218,21 @@ def test_early_termination_golden(rate, truncate):
     natural = [4, None, 20, None, 7]  # a chosen episode may end before its drawn step
     env = RandomEarlyTermination(episodes_env(natural), rate, 3, 9, truncate=truncate)
     gate, noise = streams(RandomEarlyTermination, seed=5)
-    ended_by_noise = 0
+    chosen = 0
     for episode in range(100):
         env.reset(seed=5 if episode == 0 else None)
         drawn = noise.integers(3, 10)
         last = drawn if gate.random() < rate else math.inf
+        chosen += last < math.inf
         end = natural[episode % 5] or math.inf
         for t in range(1, 30):
             _, _, terminated, truncated, info = env.step(0)
             assert terminated == (t == end or (t == last and not truncate))
             assert truncated == (t == last and truncate)
             assert info == ({"noise": ("RandomEarlyTermination",)} if t == last else {})
-            ended_by_noise += t == last
             if terminated or truncated:
                 break
-    assert (env.times_applied, env.opportunities) == (ended_by_noise, 100)
+    assert (env.times_applied, env.opportunities) == (chosen, 100)
 
 
 @pytest.mark.parametrize("truncate", [False, True])
@@ -381,7 +381,9 @@ def test_applied_fraction_is_the_rate(text, rate):
     env = build(text, episodes_env([10]), rate)
     assert math.isnan(env.applied_fraction)
     steps = rollout(env, seed=3, steps=150_000 if "(3" in text else 40_000)
-    assert env.times_applied == sum("noise" in info for *_, info in steps)
+    seen = sum("noise" in info for *_, info in steps)
+    unfinished = 1 if "(3" in text else 0  # the last episode may be chosen and not at its end yet
+    assert seen <= env.times_applied <= seen + unfinished
     resets = sum(reward is None for _, reward, *_ in steps)
     if "(3" in text:
         opportunities = resets
