@@ -215,7 +215,8 @@ def heatmap_figure(study, summary):
     rows = summary[summary["improvement_percent"].notna()]
     grid = rows.pivot_table(index="noise", columns="noise_rate", values="improvement_percent")
     grid = grid[sorted(grid.columns, key=lambda rate: [float(r) for r in rate.split(" + ")])]
-    fig = Figure(figsize=(4.5 + 0.7 * grid.shape[1], 1.5 + 0.32 * len(grid)), layout="constrained")
+    width = 1.9 + 0.075 * max(map(len, grid.index)) + 0.7 * grid.shape[1]
+    fig = Figure(figsize=(width, 1.5 + 0.32 * len(grid)), layout="constrained")
     ax = fig.subplots()
     image = ax.imshow(grid, cmap="cividis", vmin=-100, vmax=100, aspect="auto")
     for (i, j), value in np.ndenumerate(grid.to_numpy()):
@@ -241,7 +242,9 @@ def interval_figure(study, statistics):
     scope = "all" if "all" in set(statistics["environment"]) else statistics["environment"].iloc[0]
     rows = statistics[statistics["environment"] == scope]
     rows = rows.sort_values("improvement_iqm_percent", kind="stable").tail(TOP)
-    fig = Figure(figsize=(9.5, 1.2 + 0.32 * len(rows)), layout="constrained")
+    labels = [f"{r.noise}, p = {r.noise_rate} (n = {r.n})" for r in rows.itertuples()]
+    width = 5.5 + 0.07 * max(map(len, labels))
+    fig = Figure(figsize=(width, 1.2 + 0.32 * len(rows)), layout="constrained")
     left, right = axes = fig.subplots(1, 2, sharey=True, width_ratios=[3, 2])
     place = np.arange(len(rows))
     for ax, title, neutral in zip(
@@ -252,9 +255,7 @@ def interval_figure(study, statistics):
         ax.plot(middle, place, "|", color="black", markersize=11, markeredgewidth=2)
         ax.axvline(neutral, color="black", linewidth=0.8, linestyle="--")
         ax.set_ylim(-0.6, len(rows) - 0.4)
-    left.set_yticks(
-        place, [f"{r.noise}, p = {r.noise_rate} (n = {r.n})" for r in rows.itertuples()]
-    )
+    left.set_yticks(place, labels)
     left.set_xlabel("improvement over the baseline, IQM (%)")
     right.set_xlabel("probability of improvement")
     right.set_xlim(-0.02, 1.02)
@@ -354,9 +355,11 @@ for (const table of document.querySelectorAll("table")) {
     const numeric = full.length > 0 && full.every(row => /^-?[0-9]/.test(text(row)));
     if (numeric) for (const row of body.rows) row.cells[column].className = "number";
     head.firstChild.addEventListener("click", () => {
-      const sign = head.getAttribute("aria-sort") === "descending" ? 1 : -1;
+      const [first, second] = numeric ? ["descending", "ascending"] : ["ascending", "descending"];
+      const state = head.getAttribute("aria-sort") === first ? second : first;
       heads.forEach(other => other.removeAttribute("aria-sort"));
-      head.setAttribute("aria-sort", sign > 0 ? "ascending" : "descending");
+      head.setAttribute("aria-sort", state);
+      const sign = state === "ascending" ? 1 : -1;
       const compare = (a, b) => sign * (numeric ? number(text(a)) - number(text(b))
         : text(a).localeCompare(text(b)));
       const empty = [...body.rows].filter(row => text(row) === "\u2013");

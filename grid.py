@@ -288,11 +288,11 @@ def main(argv):
     check(args)
     runs = grid(args)
     if args.view == "list":
-        if args.extra:
+        done = [(run.folder / "result.json").exists() for run in runs]
+        if args.extra and not all(done):
             check_extra(runs)
-        for run in runs:
-            state = "done" if (run.folder / "result.json").exists() else "todo"
-            print(run.folder, state, shlex.join(run.command), sep="\t")
+        for run, is_done in zip(runs, done, strict=True):
+            print(run.folder, "done" if is_done else "todo", shlex.join(run.command), sep="\t")
         return 0
     while args.view == "watch":
         width, now = shutil.get_terminal_size().columns - 1, time.time()

@@ -274,7 +274,8 @@ def test_pusher_is_also_left_out_of_an_aggregate(tmp_path):
     rest = row(table, environment="all but Pusher", noise=SCALE, noise_rate="0.05")
     every = row(table, environment="all", noise=SCALE, noise_rate="0.05")
     assert (every["environments"], rest["environments"], rest["n"]) == (3, 2, 3)
-    assert rest["p"] == pytest.approx(2 * (2 / 70 / 20)) != every["p"]  # U = 15 + 9 of 16 + 9
+    # Hopper's 130 ties 130: U = 15.5 of 16, taken as 15; with Walker2d's 9 of 9, 3 orders reach 24
+    assert rest["p"] == pytest.approx(2 * 3 / (70 * 20)) != every["p"]
 
 
 def test_several_noises_are_one_configuration(tmp_path):
@@ -340,20 +341,25 @@ def test_a_missing_run_is_not_a_score():
     assert analyze.mann_whitney(padded, Y) == analyze.mann_whitney(X, Y)
 
 
-def covered(n, method, trials=500):
+def covered(n, intervals, trials=500):
     """Percent of samples of n seeds whose interval holds the true IQM: the worst distribution."""
     worst = 100.0
     for seed, draw in enumerate(DISTRIBUTIONS.values()):
         rng = np.random.default_rng(seed)
         truth = analyze.iqm(draw(rng, 400_000))
-        intervals = np.array([method(sample) for sample in draw(rng, (trials, n))])
-        inside = (intervals[:, 0] <= truth) & (truth <= intervals[:, 1])
-        worst = min(worst, 100 * inside.mean())
+        low, high = intervals(draw(rng, (trials, n)))
+        worst = min(worst, 100 * np.mean((low <= truth) & (truth <= high)))
     return worst
 
 
-def ours(sample):
-    return analyze.bootstrap_iqm(sample[:, None])[1:]
+def ours(samples):
+    return np.array([analyze.bootstrap_iqm(sample[:, None])[1:] for sample in samples]).T
+
+
+def scipys(samples, method):
+    settings = {"n_resamples": 999, "method": method, "axis": -1, "rng": np.random.default_rng(0)}
+    done = stats.bootstrap((samples,), lambda x, axis: stats.trim_mean(x, 0.25, axis), **settings)
+    return done.confidence_interval
 
 
 @pytest.mark.parametrize("n", [3, 5, 10])
@@ -363,17 +369,10 @@ def test_coverage(n):
     assert measured >= {3: 90, 5: 92, 10: 92}[n]
 
 
-def test_coverage_of_the_alternatives_at_five_seeds_is_farther_from_95():
-    def scipys(method):
-        def interval(sample):
-            settings = {"n_resamples": 999, "method": method, "rng": np.random.default_rng(0)}
-            return stats.bootstrap((sample,), analyze.iqm, **settings).confidence_interval
-
-        return interval
-
-    chosen = covered(5, ours, trials=200)
-    for method in ("percentile", "basic", "BCa"):
-        assert covered(5, scipys(method), trials=200) < min(chosen, 93)
+@pytest.mark.parametrize("method", ["percentile", "basic", "BCa"])
+def test_coverage_of_the_alternatives_at_five_seeds_is_lower(method):
+    measured = covered(5, lambda samples: scipys(samples, method))
+    assert measured < 93 < covered(5, ours)
 
 
 def test_coverage_of_the_improvement_over_environments():
@@ -746,16 +745,26 @@ def browser():
 
 
 def in_browser(page, script, width, tmp_path):
-    """Open `page` at `width`, run `script` in it and return the JSON of what it evaluates to."""
-    script = f"""<pre id="answer"></pre><script>document.getElementById("answer").textContent =
-        JSON.stringify((() => {{ {script} }})())</script></body>"""
-    copy = tmp_path / "copy.html"
-    copy.write_text(page.read_text().replace("</body>", script))
+    """Open `page` in a frame of `width` (a window is never narrower than 500), return `script`'s."""
+    wrapper = f"""<iframe style="width: {width}px; height: 800px; border: 0"></iframe>
+        <pre id="answer"></pre><script>
+        const frame = document.querySelector("iframe");
+        frame.srcdoc = {json.dumps(page.read_text()).replace("</", "<\\/")};
+        frame.onload = () => {{ document.getElementById("answer").textContent =
+            JSON.stringify(frame.contentWindow.eval({json.dumps(f"(() => {{ {script} }})()")})) }};
+        </script>"""
+    copy = tmp_path / "wrapper.html"
+    copy.write_text(f'<!DOCTYPE html><meta charset="utf-8">{wrapper}')
     flags = """--headless --no-sandbox --disable-gpu --disable-quic --no-first-run
         --disable-background-networking --disable-component-update --disable-sync --dump-dom"""
     with tempfile.TemporaryDirectory() as profile:
-        command = [browser(), *flags.split(), f"--user-data-dir={profile}"]
-        command += [f"--window-size={width},900", copy.as_uri()]
+        command = [
+            browser(),
+            *flags.split(),
+            f"--user-data-dir={profile}",
+            "--window-size=1400,900",
+        ]
+        command += ["--virtual-time-budget=10000", copy.as_uri()]
         dom = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
     return json.loads(re.search(r'<pre id="answer">(.*?)</pre>', dom, re.DOTALL)[1])
 
@@ -773,7 +782,7 @@ def test_report_sorts_in_a_browser(sweep, tmp_path):
     (_, first), (_, second), (state, improvements), (_, noises) = answer
     means = [float(text.split(" ")[0]) for text in (*first, *second)]
     values = [-80, -55, -40, -25, 25, 115, 115, 145]
-    assert means == [*reversed(values), *values] or means == [*values, *reversed(values)]
+    assert means == [*reversed(values), *values]  # numbers: the highest first
     assert improvements[-2:] == ["\u2013", "\u2013"]  # the baselines' dashes come last
     numbers = [float(text) for text in improvements[:-2]]
     assert numbers == sorted(numbers, reverse=state == "descending")

@@ -1,0 +1,31 @@
+# `make demo` and `make test` need Python 3.11 or newer and nothing else: they make .venv first.
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: demo test lint clean
+
+demo: $(BIN)/.run
+	./benchmark.sh demo
+
+test: $(BIN)/.dev
+	$(BIN)/python -m pytest
+
+lint: $(BIN)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	bash -n benchmark.sh .ci/run
+	$(BIN)/shellcheck benchmark.sh .ci/run
+
+clean:
+	rm -rf .venv runs/demo
+
+$(BIN)/python:
+	$(PYTHON) -m venv .venv
+
+$(BIN)/.run: requirements.txt | $(BIN)/python
+	$(BIN)/pip install --quiet --requirement $<
+	touch $@
+
+$(BIN)/.dev: requirements-dev.txt requirements.txt | $(BIN)/python
+	$(BIN)/pip install --quiet --requirement $<
+	touch $@ $(BIN)/.run
