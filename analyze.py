@@ -79,7 +79,7 @@ def read_config(folder):
         "episodes": int(args["eval_episodes"]),
         "total": int(args["total_timesteps"]),
         "settings": json.dumps(settings, sort_keys=True),
-        "versions": config.get("versions", {}),
+        "versions": config["versions"] | {"matmul precision": config.get("matmul_precision")},
     }
 
 
@@ -228,11 +228,11 @@ def make_studies(runs):
                 notes.append(f"{algorithm}: no finished baseline on {env}, so no improvement there")
         base = group["base"].iloc[0]
         studies.append(Study(algorithm, base, envs, seeds, grid, returns))
-    for library in sorted(set().union(*finished["versions"])):
-        counts = finished["versions"].map(lambda v, k=library: str(v.get(k))).value_counts()
+    for name in sorted(set().union(*finished["versions"])):
+        counts = finished["versions"].map(lambda v, k=name: str(v.get(k))).value_counts()
         if len(counts) > 1:
             found = ", ".join(f"{v} ({n} runs)" for v, n in sorted(counts.items()))
-            notes.append(f"runs with different versions of {library} share rows: {found}")
+            notes.append(f"runs with different {name} share rows: {found}")
     return studies, notes
 
 
@@ -295,9 +295,9 @@ def bootstrap_iqm(scores, baseline=None, resamples=RESAMPLES):
     return estimate, estimate - half, estimate + half
 
 
-def win_rate(x, y):
-    """Mann-Whitney's U over (n m): the share of pairs with x > y, a tie counting half."""
-    return np.mean((x[:, None] > y) + 0.5 * (x[:, None] == y))
+def wins(x, y):
+    """Mann-Whitney's U: the number of pairs with x > y, a tie counting half. x (n), y (m)."""
+    return (x[:, None] > y).sum() + 0.5 * (x[:, None] == y).sum()
 
 
 def newcombe_interval(p, n, m):
@@ -312,9 +312,7 @@ def newcombe_interval(p, n, m):
         variance = t * (1 - t) * (1 + k * (1 - t) / (2 - t) + k * t / (1 + t)) / (n * m)
         return (p - t) ** 2 - z**2 * variance
 
-    inside = np.clip(
-        p, 1e-9, 1 - 1e-9
-    )  # gap(p) < 0 between the two limits, but gap(0) = gap(1) = 0
+    inside = np.clip(p, 1e-9, 1 - 1e-9)  # at 0 and 1 the gap is zero without being a limit
     low = brentq(gap, 0, inside) if p > 0 else 0.0
     high = brentq(gap, inside, 1) if p < 1 else 1.0
     return low, high
@@ -327,7 +325,7 @@ def probability_of_improvement(x, y):
     Donner, 2008). x (seeds x envs), y (seeds x envs) -> p, low, high.
     """
     x, y = columns(x), columns(y)
-    rates = np.array([win_rate(a, b) for a, b in zip(x, y, strict=True)])
+    rates = np.array([wins(a, b) / (len(a) * len(b)) for a, b in zip(x, y, strict=True)])
     if min(map(len, x + y)) < MIN_SEEDS:
         return rates.mean(), np.nan, np.nan
     limits = [newcombe_interval(p, len(a), len(b)) for p, a, b in zip(rates, x, y, strict=True)]
@@ -355,7 +353,7 @@ def mann_whitney(x, y):
     """
     pairs = list(zip(columns(x), columns(y), strict=True))
     sizes = [(len(a), len(b)) for a, b in pairs]
-    u = sum(win_rate(a, b) * len(a) * len(b) for a, b in pairs)
+    u = sum(wins(a, b) for a, b in pairs)
     null = reduce(np.convolve, [mann_whitney_null(n, m) for n, m in sizes])
     below, above = null[: int(np.ceil(u)) + 1].sum(), null[int(np.floor(u)) :].sum()
     smallest = 2 / prod(comb(n + m, n) for n, m in sizes)
@@ -394,9 +392,9 @@ COLUMNS = {
         settings versions steps returns""",
     "summary": """algorithm environment noise noise_rate n mean std n_baseline baseline_mean
         baseline_std improvement_percent std_change_percent steps_to_baseline""",
-    "best": """algorithm environment noise noise_rate n_baseline n baseline_mean baseline_std
-        noisy_mean noisy_std improvement_percent chosen_from leave_one_seed_out_mean
-        leave_one_seed_out_percent""",
+    "best": """algorithm environment noise noise_rate baseline_mean baseline_std noisy_mean
+        noisy_std improvement_percent leave_one_seed_out_percent n n_baseline chosen_from
+        leave_one_seed_out_mean""",
     "consistency": """algorithm noise noise_rate percent_of_environments
         average_improvement_percent std_improvement_percent environments n fails_at_every_rate""",
     "early_performance": "algorithm environment noise steps_millions noise_rate mean std n",
@@ -431,10 +429,8 @@ def summary_rows(study):
 
 def best_rows(study, summary):
     """Yield the best noise per environment, with the leave-one-seed-out value of choosing it."""
-    ours = summary[
-        (summary["algorithm"] == study.algorithm) & summary["improvement_percent"].notna()
-    ]
-    for env, group in ours.groupby("environment"):
+    noisy = summary[summary["improvement_percent"].notna()]
+    for env, group in noisy[noisy["algorithm"] == study.algorithm].groupby("environment"):
         best = group.loc[group["mean"].idxmax()]
         e = study.environments.index(env)
         finals = np.stack([study.final(c)[:, e] for c in study.returns if c != BASELINE])
@@ -484,14 +480,10 @@ def early_rows(study):
         configs = [config for config in study.returns if config[0] in ("", noise)]
         for i, config in product(places[places >= 0], configs):
             mean, std, n = mean_std(study.returns[config][i, :, e])
+            row = dict(zip(KEYS, (study.algorithm, env, noise, config[1]), strict=True))
+            row |= {"steps_millions": study.steps[i] / 1e6, "mean": mean, "std": std, "n": n}
             if n:
-                row = dict(zip(KEYS, (study.algorithm, env, noise, config[1]), strict=True))
-                yield row | {
-                    "steps_millions": study.steps[i] / 1e6,
-                    "mean": mean,
-                    "std": std,
-                    "n": n,
-                }
+                yield row
 
 
 def statistics_rows(study):
@@ -599,17 +591,8 @@ def compare_table(ours, listed, paper, mean, std, number):
     variance = table[std] ** 2 / table[number] + table[f"paper_{std}"] ** 2 / paper_n
     difference = table[mean] - table[f"paper_{mean}"]
     table["difference_se"] = difference / np.sqrt(variance.where(variance > 0))
-    shown = [
-        *keys,
-        "listed_by",
-        number,
-        mean,
-        std,
-        f"paper_{mean}",
-        f"paper_{std}",
-        "difference_se",
-    ]
-    return table.sort_values(keys, kind="stable")[shown]
+    names = [*keys, "listed_by", number, mean, std, f"paper_{mean}", f"paper_{std}"]
+    return table.sort_values(keys, kind="stable")[[*names, "difference_se"]]
 
 
 def compare_tables(folder, summary, best, consistency, good, bad, early):
@@ -693,11 +676,9 @@ def make_tables(studies, compare=None):
         "early_performance": (early, CAPTIONS["early_performance"]),
     }
     for base in sorted({study.base for study in studies}):
-        labels = [study.algorithm for study in studies if study.base == base]
-        tables[f"summary_{base}"] = (
-            summary[summary["algorithm"].isin(labels)],
-            CAPTIONS["summary"],
-        )
+        same = [study.algorithm for study in studies if study.base == base]
+        table = summary[summary["algorithm"].isin(same)]
+        tables[f"summary_{base}"] = (table, CAPTIONS["summary"])
     if compare:
         lengths = ", ".join(f"{study.algorithm} {study.steps[-1]:,} steps" for study in studies)
         for name, table in compare_tables(compare, summary, best, consistency, good, bad, early):
@@ -705,12 +686,18 @@ def make_tables(studies, compare=None):
     return tables
 
 
+def fail(message):
+    """End with one line on stderr and status 2, as the training scripts do for bad input."""
+    print(f"error: {message}", file=sys.stderr)
+    sys.exit(2)
+
+
 def main(args):
     """Read the runs, write tables, figures and report, and print the main table."""
     if not args.runs_dir.is_dir():
-        sys.exit(f"error: no folder {args.runs_dir}")
+        fail(f"no folder {args.runs_dir}")
     if args.compare and not any(args.compare.glob("*.csv")):
-        sys.exit(f"error: no csv files in {args.compare}")
+        fail(f"no csv files in {args.compare}")
     runs = read_runs(args.runs_dir)
     studies, notes = make_studies(runs)
     missing = pd.concat([runs[runs["status"] != "finished"], missing_runs(runs)])
@@ -720,7 +707,7 @@ def main(args):
     problems = f"{len(missing)} runs do not count: {problems}." if problems else ""
     if not studies:
         print(text_table("missing", missing))
-        sys.exit(f"error: no finished run in {args.runs_dir}")
+        fail(f"no finished run in {args.runs_dir}")
     tables = make_tables(studies, args.compare)
     tables["missing"] = (missing, CAPTIONS["missing"])
     args.out.mkdir(parents=True, exist_ok=True)
@@ -738,8 +725,8 @@ def main(args):
     )
     overview = f"{(runs['status'] == 'finished').sum()} finished runs. {overview}."
     write_report(args.out, tables, drawn, overview, problems, notes)
-    print(f"{overview}\n\n{text_table('best', tables['best'][0])}\n\n{tables['best'][1]}")
-    for note in notes:
+    print(f"{overview}\n\n{text_table('best', tables['best'][0])}\n\n{tables['best'][1]}\n")
+    for note in family_notes(tables["statistics"][0]) + notes:
         print(f"note: {note}")
     if problems:
         print(f"\nWARNING: {problems}\n{text_table('missing', missing.head(20))}")

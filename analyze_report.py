@@ -33,9 +33,8 @@ MERGED = {
     "improvement (IQM) %": ("improvement_iqm_percent", "improvement_low", "improvement_high"),
     "P(improvement)": ("probability_of_improvement", "probability_low", "probability_high"),
 }
-MERGED |= {
-    f"paper: {name}": tuple(f"paper_{c}" for c in MERGED[name]) for name in list(MERGED)[2:4]
-}
+for _name in ("mean", "average improvement %"):
+    MERGED[f"paper: {_name}"] = tuple(f"paper_{column}" for column in MERGED[_name])
 
 
 def cell(name, value):
@@ -130,9 +129,8 @@ def panels(environments, labels):
     columns = max(1, min(4, int(across * 42 / max(map(len, labels)))))
     legend = 0.2 + 0.2 * -(-len(labels) // columns)
     width, height = 1.2 + 3 * across, 2.5 * down + legend
-    fig = Figure(
-        figsize=(width, height)
-    )  # placed by hand: matplotlib's layouts take as long as drawing
+    fig = Figure(figsize=(width, height))
+    # Placed by hand: matplotlib's automatic layouts take as long as the drawing itself.
     bottom, top = (legend + 0.45) / height, 1 - 0.3 / height
     fig.subplots_adjust(0.9 / width, bottom, 1 - 0.15 / width, top, wspace=0.25, hspace=0.45)
     axes = fig.subplots(down, across, squeeze=False).ravel()
@@ -182,19 +180,16 @@ def ablation_figure(study, summary, noises):
     """Draw bars of the final return: a wrapper's parameters side by side, grouped by noise rate."""
     groups = [summary[summary["noise"] == noise] for noise in ["", *noises]]
     rates = sorted({rate for group in groups[1:] for rate in group["noise_rate"]}, key=float)
-    names = ["no noise", *noises]
-    labels = [
-        f"{a} ({count(g['n']) if len(g) else 'n = 0'})" for a, g in zip(names, groups, strict=True)
-    ]
+    counts = [count(group["n"]) if len(group) else "n = 0" for group in groups]
+    labels = [f"{a} ({n})" for a, n in zip(["no noise", *noises], counts, strict=True)]
     fig, axes, add_legend = panels(study.environments, labels)
     width = 0.8 / len(noises)
-    for (ax, env), (i, group) in product(
-        zip(axes, study.environments, strict=True), enumerate(groups)
-    ):
+    cells = zip(axes, study.environments, strict=True)
+    for (ax, env), (i, group) in product(cells, enumerate(groups)):
         rows = group[group["environment"] == env].set_index("noise_rate")
         rows = rows.reindex(rates if i else ["0.00"])
         place = np.arange(len(rates)) + width * (i - 1 - (len(noises) - 1) / 2) if i else -1
-        look = {"color": str(0.8 - 0.6 * (i - 1) / (len(noises) - 1)) if i else "white"}
+        look = {"color": str(0.85 - 0.4 * (i - 1) / (len(noises) - 1)) if i else "white"}
         look |= {"hatch": ["", "", "//", "..", "xx"][i % 5], "edgecolor": "black", "linewidth": 0.6}
         spread = {"yerr": rows["std"].fillna(0), "capsize": 2, "error_kw": {"elinewidth": 0.8}}
         ax.bar(place, rows["mean"], width if i else 0.6, label=env, **look, **spread)
@@ -229,11 +224,9 @@ def heatmap_figure(study, summary):
     ax.set_title(f"{study.algorithm} ({count(rows['n'])} seeds)")
     fig.colorbar(image, ax=ax, extend="both", label="improvement over the baseline (%)")
     caption = (
-        f"{study.algorithm}: improvement of the final mean return over the baseline in percent, "
+        f"{study.algorithm}: improvement of the final mean return over the baseline, mean over "
     )
-    caption += (
-        f"mean over {len(set(rows['environment']))} environments; colors end at \u00b1 100 %."
-    )
+    caption += f"{len(set(rows['environment']))} environments; the colors end at \u00b1 100 %."
     return f"heatmap_{slug(study.algorithm)}", fig, caption
 
 
@@ -241,15 +234,15 @@ def interval_figure(study, statistics):
     """Draw the configurations with the highest IQM of the improvement, with their intervals."""
     scope = "all" if "all" in set(statistics["environment"]) else statistics["environment"].iloc[0]
     rows = statistics[statistics["environment"] == scope]
+    rows = rows[rows["environments"] == rows["environments"].max()]  # the same ones for all
     rows = rows.sort_values("improvement_iqm_percent", kind="stable").tail(TOP)
     labels = [f"{r.noise}, p = {r.noise_rate} (n = {r.n})" for r in rows.itertuples()]
     width = 5.5 + 0.07 * max(map(len, labels))
     fig = Figure(figsize=(width, 1.2 + 0.32 * len(rows)), layout="constrained")
     left, right = axes = fig.subplots(1, 2, sharey=True, width_ratios=[3, 2])
     place = np.arange(len(rows))
-    for ax, title, neutral in zip(
-        axes, ("improvement (IQM) %", "P(improvement)"), (0, 0.5), strict=True
-    ):
+    titles = ("improvement (IQM) %", "P(improvement)")
+    for ax, title, neutral in zip(axes, titles, (0, 0.5), strict=True):
         middle, low, high = rows[list(MERGED[title])].astype(float).to_numpy().T
         ax.hlines(place, low, high, color="0.6", linewidth=5)
         ax.plot(middle, place, "|", color="black", markersize=11, markeredgewidth=2)
@@ -260,19 +253,17 @@ def interval_figure(study, statistics):
     right.set_xlabel("probability of improvement")
     right.set_xlim(-0.02, 1.02)
     where = "all environments" if scope == "all" else scope
-    caption = (
-        f"{study.algorithm}, {where}: the {len(rows)} configurations with the highest IQM of the "
-    )
+    caption = f"{study.algorithm}, {where}: the {len(rows)} configurations that improve most, with "
     caption += (
-        "improvement, with 95 % intervals (none for n < 3); dashed: no improvement. They are "
+        "95 % intervals (none for n < 3); dashed: no improvement. They are chosen on the seeds "
     )
-    caption += "chosen on the seeds that are shown, so they look better than they are."
+    caption += "that are shown, so they look better than they are."
     return f"intervals_{slug(study.algorithm)}", fig, caption
 
 
 def write_figure(out, name, fig):
     """Write {name}.png and .pdf without dates, so that equal figures are equal files."""
-    fig.savefig(out / f"{name}.png", dpi=110, metadata={"Software": None})
+    fig.savefig(out / f"{name}.png", dpi=100, metadata={"Software": None})
     fig.set_layout_engine("none")  # the layout is done
     fig.savefig(out / f"{name}.pdf", metadata={"CreationDate": None})
 
@@ -289,7 +280,7 @@ PAGE = """<!DOCTYPE html>
 :root { color-scheme: light; }
 * { box-sizing: border-box; }
 body { font: 16px/1.5 system-ui, sans-serif; color: #1a1a1a; background: #fff;
-  max-width: 76rem; margin: 0 auto; padding: 1rem; overflow-wrap: anywhere; }
+  max-width: 84rem; margin: 0 auto; padding: 1rem; overflow-wrap: anywhere; }
 h1 { font-size: 1.6rem; line-height: 1.2; } h2 { font-size: 1.25rem; margin-top: 2.5rem; }
 nav a { display: inline-block; margin-right: 1rem; } a { color: #0b4f9c; }
 .alert { border: 2px solid #a11; border-left-width: 10px; padding: .5rem 1rem; }
@@ -323,10 +314,7 @@ They are in none of the tables and figures: <a href="#missing">see the list</a>.
 <nav>
 {% for section in sections %}<a href="#{{ section.id }}">{{ section.title }}</a>{% endfor %}
 </nav>
-{% for section in sections %}
-<section id="{{ section.id }}">
-<h2>{{ section.title }}</h2>
-{% for table in section.tables %}
+{% macro show(table) %}
 {% if table.rows|length > 40 %}<details><summary>{{ table.rows|length }} rows: {{ table.name }}
 </summary>{% endif %}
 <p class="caption">{{ table.caption }}</p>
@@ -337,11 +325,16 @@ They are in none of the tables and figures: <a href="#missing">see the list</a>.
 {%- for value in row %}<td>{{ value }}</td>{% endfor %}</tr>
 {% endfor %}</tbody></table></div>{% else %}<p>None.</p>{% endif %}
 {% if table.rows|length > 40 %}</details>{% endif %}
-{% endfor %}
+{% endmacro %}
+{% for section in sections %}
+<section id="{{ section.id }}">
+<h2>{{ section.title }}</h2>
+{% for table in section.tables[:1] %}{{ show(table) }}{% endfor %}
 {% for figure in section.figures %}
 <figure><div><img src="data:image/png;base64,{{ figure.png }}" alt="{{ figure.caption }}"></div>
 <figcaption>{{ figure.caption }}</figcaption></figure>
 {% endfor %}
+{% for table in section.tables[1:] %}{{ show(table) }}{% endfor %}
 </section>
 {% endfor %}
 <script>

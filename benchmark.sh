@@ -26,7 +26,8 @@ Executor options
   --executor local      (default) runs side by side on this machine
   --executor parallel   GNU parallel, on this machine or over ssh
   --executor slurm      job arrays; submits and returns
-  --jobs N              runs at a time on each machine (default: the number of its cores)
+  --jobs N              runs at a time: on each machine (default: the number of its cores), or of
+                        each job array (default: as many as the cluster has room for)
   --sshlogin LIST       machines in GNU parallel's notation: "hostA,hostB", "4/user@host", ":"
   --remote-dir DIR      where the project lies on machines that do not share this folder: run
                         folders are then sent and fetched with rsync
@@ -169,11 +170,13 @@ stop_parallel() { # HUP: parallel starts no more runs, and waits for those that 
 submit() { # the array's indices are line numbers, counted from the offset of its part
   local size offset n id
   size=$(scontrol show config | awk '$1 == "MaxArraySize" {print $3}')
+  [ "${size:-0}" -gt 0 ] || fail "scontrol show config does not tell MaxArraySize"
   read -ra slurm_options <<<"$slurm_args"
   for ((offset = 0; offset < count; offset += size)); do
     n=$((count - offset < size ? count - offset : size))
-    id=$(sbatch --parsable --array="0-$((n - 1))" --requeue --signal=B:USR1@180 --ntasks=1 \
-      --cpus-per-task=1 --open-mode=append --output="$logs/slurm-%A.out" --job-name=noisy-sweep \
+    id=$(sbatch --parsable --array="0-$((n - 1))${jobs:+%$jobs}" --requeue --signal=B:USR1@180 \
+      --ntasks=1 --cpus-per-task=1 --job-name=noisy-sweep \
+      --open-mode=append --output="$logs/slurm-%A.out" \
       ${slurm_options[@]+"${slurm_options[@]}"} \
       --wrap "exec ./benchmark.sh slurm-task $(printf %q "$list") $offset") ||
       fail "sbatch refused runs $((offset + 1)) to $((offset + n)); submitted before: ${ids[*]}"
@@ -220,7 +223,7 @@ while kill -0 -- "-$group" 2>/dev/null; do
 done
 [ -z "$watch" ] || { kill "$watch" && echo >&2; }
 if [ "$stopped" -ne 0 ]; then
-  "$PYTHON" grid.py status "${grid[@]}"
+  "$PYTHON" grid.py stopped "${grid[@]}"
   echo "stopped; the same command goes on from here"
   exit "$stopped"
 fi

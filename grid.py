@@ -4,6 +4,7 @@ benchmark.sh is the way in; `./benchmark.sh --help` explains the arguments. What
 
     python grid.py list PRESET ...     one run per line: folder, "done" or "todo", command
     python grid.py status PRESET ...   a summary, the failed runs, the slowest of those running
+    python grid.py stopped PRESET ...  a summary and the failed runs, when the sweep was stopped
     python grid.py report PRESET ...   a summary and what did not finish, then exit status 1
     python grid.py watch PRESET ...    the summary as one line that is rewritten, on a terminal
 
@@ -34,7 +35,7 @@ from noisy_wrappers import canonical_noises, run_name
 SEEDS = {"sac": range(1, 6), "td3": range(1, 6), "ppo": range(1, 11)}  # the paper's
 ENVS = ["HalfCheetah-v5", "Hopper-v5", "Humanoid-v5", "Pusher-v5", "Walker2d-v5"]
 RATES = [0.01, 0.05, 0.1, 0.2, 0.5, 1.0]
-NOISES = [  # as the paper's authors ran them: see "What differs" in README.md
+NOISES = [  # as the paper's authors ran them: dropout keeps 90 %, mixup remembers the mixture
     "RandomDropoutObservation(0.9)",
     "RandomEarlyTermination(1, 100)",
     "RandomEarlyTermination(50)",
@@ -101,7 +102,7 @@ def parse_args(argv):
     split = argv.index("--") if "--" in argv else len(argv)
     parser = argparse.ArgumentParser(prog="benchmark.sh", add_help=False, allow_abbrev=False)
     parser.error = fail
-    parser.add_argument("view", choices=["list", "status", "report", "watch"])
+    parser.add_argument("view", choices=["list", "status", "stopped", "report", "watch"])
     parser.add_argument("preset")
     parser.add_argument("--algos", nargs="+", type=str.lower, default=list(SEEDS))
     parser.add_argument("--envs", nargs="+", default=ENVS)
@@ -223,7 +224,7 @@ def check_extra(runs):
             fail(f"{script} does not accept the arguments after --")
 
 
-def look(run, now, fresh=120):
+def look(run, now, fresh):
     """Return a run's progress, from its folder and a log that is `fresh` for so many seconds."""
     log, age, lines = run.folder.parent / "logs" / f"{run.folder.name}.log", float("inf"), []
     done = (run.folder / "result.json").exists()
@@ -296,13 +297,14 @@ def main(argv):
         return 0
     while args.view == "watch":
         width, now = shutil.get_terminal_size().columns - 1, time.time()
-        line = summary(runs, [look(run, now) for run in runs])
+        line = summary(runs, [look(run, now, fresh=120) for run in runs])
         print(f"\r{line[:width].ljust(width)}", end="", file=sys.stderr, flush=True)
         time.sleep(10)
 
-    over = args.view == "report"  # then nothing runs any more, however fresh its log is
-    progresses = [look(run, time.time(), fresh=0 if over else 120) for run in runs]
+    fresh = 120 if args.view == "status" else 0  # nothing runs any more, however fresh its log is
+    progresses = [look(run, time.time(), fresh) for run in runs]
     print(f"{args.runs_dir}: {summary(runs, progresses)}")
+    over = args.view == "report"
     named = [p for p in progresses if p.state == "failed" or (over and p.reason)]
     if named:
         print("not finished:" if over else "failed:")
@@ -312,7 +314,7 @@ def main(argv):
         for run, p in zip(runs, progresses, strict=True)
         if p.state == "running" and p.sps
     ]
-    if left and not over:
+    if left:
         print("slowest of those running (time left, steps per second, step):")
         left = sorted(left, key=lambda item: item[0], reverse=True)[:5]
         table(

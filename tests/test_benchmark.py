@@ -224,12 +224,12 @@ def output(command, env):
     return subprocess.run(command, env=env, capture_output=True, text=True).stdout.strip()
 
 
-@pytest.fixture(params=["local", "parallel", "ssh", "slurm"])
+@pytest.fixture
 def engine(request):
     """The options and the environment of one executor that runs two runs at a time."""
     if request.param == "slurm":
         return ["--executor", "slurm", "--wait"], request.getfixturevalue("slurm")
-    if request.param == "ssh":
+    if request.param == "ssh":  # one run on the "second machine", one on this one
         hosts = ["--jobs", "1", "--sshlogin", "second,:"]
         return ["--executor", "parallel", *hosts], request.getfixturevalue("sshd")
     if request.param == "parallel":
@@ -237,6 +237,7 @@ def engine(request):
     return ["--executor", request.param, "--jobs", "2"], ENV
 
 
+@pytest.mark.parametrize("engine", ["local", "ssh", "slurm"], indirect=True)
 def test_a_failing_and_a_killed_run(engine, tmp_path):
     executor, env = engine
     grid = [*GRID, "--total-timesteps", "30000", "--runs-dir", tmp_path / "my runs"]
@@ -270,17 +271,43 @@ def test_a_failing_and_a_killed_run(engine, tmp_path):
     assert logs == {folder: log_of(folder).read_text() for folder in logs}
 
 
+@pytest.mark.parametrize("engine", ["parallel", "ssh", "slurm"], indirect=True)
 def test_ctrl_c(engine, tmp_path):
     executor, env = engine
     grid = [*GRID, *FOREVER, "--runs-dir", tmp_path]
-    runs = folders(*grid)
     sweep = start(*grid, *executor, *CHEAP, env=env)
-    wait_for(lambda: sum(map(is_training, runs)) == 2, what="two runs at a time")
+    wait_for(lambda: sum(map(is_training, folders(*grid))) == 2, what="two runs at a time")
     sweep.send_signal(signal.SIGINT)
     out, err = sweep.communicate(timeout=60)
     assert sweep.returncode == 130, err
-    assert not processes(tmp_path)
-    assert "3 runs: 0 done, 0 running, 0 failed, 3 to do" in out
+    check_stopped(folders(*grid), out)
+
+
+def test_ctrl_c_on_a_terminal_and_the_progress_line(tmp_path):
+    grid = [*GRID, *FOREVER, "--runs-dir", tmp_path]
+    runs = folders(*grid)
+    controller, terminal = pty.openpty()
+    sweep = subprocess.Popen(
+        ["setsid", "--ctty", "./benchmark.sh", *map(str, grid), "--jobs", "2", *CHEAP],
+        **{"stdin": terminal, "stdout": terminal, "stderr": terminal, "env": ENV, "cwd": ROOT},
+    )
+    os.close(terminal)
+    shown = ""
+    while not (sum(map(is_training, runs)) == 2 and "2 running" in shown):
+        shown += os.read(controller, 1000).decode()
+    os.write(controller, b"\x03")
+    with pytest.raises(OSError):  # how a terminal ends
+        while True:
+            shown += os.read(controller, 1000).decode()
+    assert sweep.wait() == 130
+    assert "\r3 runs: 0 done, 2 running, 0 failed, 1 to do" in shown
+    check_stopped(runs, shown)
+
+
+def check_stopped(runs, shown):
+    """Two of three runs were under way: they, and only they, have a checkpoint."""
+    assert f"{runs[0].parent}: 3 runs: 0 done, 0 running, 0 failed, 3 to do" in shown
+    assert not processes(runs[0].parent)
     stopped = [folder for folder in runs if log_of(folder).exists()]
     assert len(stopped) == 2, "another run was started"
     for folder in stopped:
@@ -288,34 +315,13 @@ def test_ctrl_c(engine, tmp_path):
         assert attempts(folder)[0][-1].endswith("exit=143")
 
 
-def test_ctrl_c_on_a_terminal_and_the_progress_line(tmp_path):
-    grid = [*GRID, *FOREVER, "--runs-dir", tmp_path]
-    runs = folders(*grid)[:2]
-    controller, terminal = pty.openpty()
-    sweep = subprocess.Popen(
-        ["setsid", "--ctty", "./benchmark.sh", *map(str, grid), "--jobs", "2", *CHEAP],
-        **{"stdin": terminal, "stdout": terminal, "stderr": terminal, "env": ENV, "cwd": ROOT},
-    )
-    os.close(terminal)
-    shown = b""
-    while not (all(map(is_training, runs)) and b"2 running" in shown):
-        shown += os.read(controller, 1000)
-    os.write(controller, b"\x03")
-    with pytest.raises(OSError):  # how a terminal ends
-        while True:
-            shown += os.read(controller, 1000)
-    assert sweep.wait() == 130
-    assert re.search(rb"\r3 runs: 0 done, 2 running, 0 failed, 1 to do", shown)
-    assert all((folder / "checkpoint.pt").exists() for folder in runs)
-
-
 def test_machines_without_a_shared_folder(sshd, tmp_path):
     """The run folders travel: an interrupted run can go on elsewhere."""
     here, there = tmp_path / "here", tmp_path / "there"
     for folder in (here, there):
         folder.mkdir()
-        for file in (*ROOT.glob("*.py"), ROOT / "benchmark.sh"):
-            shutil.copy2(file, folder)
+        for file in ("benchmark.sh", "grid.py", "noisy_wrappers.py", "sac_continuous_noisy.py"):
+            shutil.copy2(ROOT / file, folder)
     grid = ["baseline", *GRID[1:7], "--total-timesteps", "80000"]
     machine = ["--executor", "parallel", "--sshlogin", "second", "--remote-dir", there]
     folder = here / folders(*grid)[0]
@@ -534,5 +540,5 @@ def test_help():
     assert len(examples) >= 5
     for example in examples:
         words = shlex.split(example.partition("|")[0])
-        result = run(*words, *(["--dry-run"] if words[0] != "status" else []))
-        assert result.code == 0, result.err
+        if words[0] not in ("status", "paper"):  # the paper's grid has its own test
+            assert run(*words, "--dry-run").code == 0

@@ -1,0 +1,81 @@
+"""Environments of the tests, for `--env-id toy_envs:Tiny-v0` and the like."""
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.spaces import Box
+
+
+class Tiny(gym.Env):
+    """Three states, two actions with bounds of their own, random steps and random ends."""
+
+    observation_space = Box(-np.inf, np.inf, (3,), np.float64)
+    action_space = Box(np.array([-1.0, -0.5], np.float32), np.array([2.0, 0.3], np.float32))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state = self.np_random.normal(size=3)
+        return self.state.copy(), {}
+
+    def step(self, action):
+        x, y = np.asarray(action, np.float64)
+        self.state = 0.8 * self.state + [x, y, x * y] + self.np_random.normal(0, 0.2, 3)
+        reward = 1.0 - np.square(self.state).sum()
+        return self.state.copy(), float(reward), bool(abs(self.state[0]) > 3), False, {}
+
+
+class Count(gym.Env):
+    """Observes the step, 1.0 is every reward; `break_at` gives NaN from that step of the run on."""
+
+    observation_space = Box(-np.inf, np.inf, (1,), np.float32)
+    action_space = Box(-1.0, 1.0, (1,), np.float32)
+
+    def __init__(self, shape=(1,), break_reward_at=np.inf, break_observation_at=np.inf):
+        self.observation_space = Box(-np.inf, np.inf, shape, np.float32)
+        self.break_reward_at, self.break_observation_at = break_reward_at, break_observation_at
+        self.total = 0
+
+    def observe(self):
+        value = np.nan if self.total >= self.break_observation_at else self.steps
+        return np.full(self.observation_space.shape, value, np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return self.observe(), {}
+
+    def step(self, action):
+        self.steps, self.total = self.steps + 1, self.total + 1
+        reward = np.nan if self.total >= self.break_reward_at else 1.0
+        return self.observe(), reward, False, False, {}
+
+
+class Other(Count):
+    """Count with other spaces."""
+
+    def __init__(self, **spaces):
+        super().__init__()
+        vars(self).update(spaces)
+
+
+class Broken(Count):
+    """Its constructor raises."""
+
+    def __init__(self):
+        raise RuntimeError("first line\nsecond line")
+
+
+def register(name, entry_point, steps, **kwargs):
+    gym.register(f"{name}-v0", entry_point, max_episode_steps=steps, kwargs=kwargs)
+
+
+dictionary = gym.spaces.Dict(position=Box(-1.0, 1.0, (2,)))
+register("Tiny", Tiny, 8)
+register("Count", Count, 8)
+register("Square", Count, 8, shape=(2, 2))
+register("NanReward", Count, 8, break_reward_at=70)
+register("NanObservation", Count, 8, break_observation_at=70)
+register("NanLate", Count, 8, break_reward_at=170)
+register("DictObservation", Other, 8, observation_space=dictionary)
+register("DiscreteAction", Other, 8, action_space=gym.spaces.Discrete(3))
+register("Unbounded", Other, 8, action_space=Box(-np.inf, np.inf, (1,)))
+register("Broken", Broken, 8)
