@@ -226,13 +226,13 @@ def make_studies(runs):
         for env, values in zip(envs, returns[BASELINE][-1].T, strict=True):
             if np.isnan(values).all():
                 notes.append(f"{algorithm}: no finished baseline on {env}, so no improvement there")
+        for name in sorted(set().union(*group["versions"])):
+            counts = group["versions"].map(lambda v, k=name: str(v.get(k))).value_counts()
+            if len(counts) > 1:
+                found = ", ".join(f"{version} (n = {n})" for version, n in sorted(counts.items()))
+                notes.append(f"{algorithm}: runs with different {name} share rows: {found}")
         base = group["base"].iloc[0]
         studies.append(Study(algorithm, base, envs, seeds, grid, returns))
-    for name in sorted(set().union(*finished["versions"])):
-        counts = finished["versions"].map(lambda v, k=name: str(v.get(k))).value_counts()
-        if len(counts) > 1:
-            found = ", ".join(f"{v} ({n} runs)" for v, n in sorted(counts.items()))
-            notes.append(f"runs with different {name} share rows: {found}")
     return studies, notes
 
 
@@ -554,7 +554,7 @@ def family_notes(statistics):
             else:
                 reach = "no configuration can reach 0.05"
             notes.append(
-                f"{algorithm}, {', '.join(same['environment'])}: {size} comparisons; the smallest "
+                f"{algorithm}, {', '.join(same['environment'])}: comparisons: {size}; the smallest "
                 f"p that this number of seeds can give is {smallest:.2g}, adjusted "
                 f"{min(1, size * smallest):.2g} for one configuration alone: {reach}."
             )
@@ -704,7 +704,7 @@ def main(args):
     missing = missing[["status", *KEYS, "seed", "run", "reason"]]
     counts = missing["status"].value_counts(sort=False)
     problems = ", ".join(f"{n} {status}" for status, n in counts.items())
-    problems = f"{len(missing)} runs do not count: {problems}." if problems else ""
+    problems = f"Runs that do not count: {len(missing)} ({problems})." if problems else ""
     if not studies:
         print(text_table("missing", missing))
         fail(f"no finished run in {args.runs_dir}")
@@ -717,13 +717,13 @@ def main(args):
     for name, figure, caption in figures(studies, tables):
         write_figure(args.out, name, figure)
         drawn.append((name, caption))
-    overview = "; ".join(
-        f"{study.algorithm}: {len(study.returns) - 1} noise configurations, "
-        f"{len(study.environments)} environments, {len(study.seeds)} seeds, "
-        f"{study.steps[-1]:,} steps"
+    overview = [f"Finished runs: {(runs['status'] == 'finished').sum()}."]
+    overview += [
+        f"{study.algorithm}: {study.steps[-1]:,} steps, seeds: {len(study.seeds)}, environments: "
+        f"{len(study.environments)}, noise configurations: {len(study.returns) - 1}."
         for study in studies
-    )
-    overview = f"{(runs['status'] == 'finished').sum()} finished runs. {overview}."
+    ]
+    overview = " ".join(overview)
     write_report(args.out, tables, drawn, overview, problems, notes)
     print(f"{overview}\n\n{text_table('best', tables['best'][0])}\n\n{tables['best'][1]}\n")
     for note in family_notes(tables["statistics"][0]) + notes:

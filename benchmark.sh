@@ -163,8 +163,11 @@ run_parallel() { # TERM comes from here if a machine loses its connection; the r
 stop_parallel() { # HUP: parallel starts no more runs, and waits for those that USR1 stops
   kill -HUP -- "-$group" 2>/dev/null
   local pattern="^bash ./benchmark.sh run-one $sweep"
-  if [ -z "$sshlogin" ]; then pkill -USR1 -f "$pattern" && return; fi
-  parallel "${parallel_options[@]}" --nonall pkill -USR1 -f "'$pattern'"
+  if [ -z "$sshlogin" ]; then
+    pkill -USR1 -f "$pattern"
+  else
+    parallel "${parallel_options[@]}" --nonall pkill -USR1 -f "'$pattern'"
+  fi
 }
 
 submit() { # the array's indices are line numbers, counted from the offset of its part
@@ -184,10 +187,10 @@ submit() { # the array's indices are line numbers, counted from the offset of it
   done
   echo "submitted; to stop: scancel ${ids[*]}" >&2
 }
-run_slurm() {
-  while [ -n "$(squeue --noheader --jobs "$(IFS=, && echo "${ids[*]}")" 2>/dev/null)" ]; do
-    sleep 5
-  done
+run_slurm() { # the arrays are over when squeue answers and does not name them
+  local queue
+  until queue=$(squeue --noheader --user="$(id -un)" --format=%F 2>/dev/null) &&
+    ! grep -qxF "$(printf '%s\n' "${ids[@]}")" <<<"$queue"; do sleep 5; done
 }
 stop_slurm() { scancel "${ids[@]}"; }
 

@@ -295,11 +295,14 @@ def main(argv):
         for run, is_done in zip(runs, done, strict=True):
             print(run.folder, "done" if is_done else "todo", shlex.join(run.command), sep="\t")
         return 0
+    parent = os.getppid()
     while args.view == "watch":
         width, now = shutil.get_terminal_size().columns - 1, time.time()
         line = summary(runs, [look(run, now, fresh=120) for run in runs])
         print(f"\r{line[:width].ljust(width)}", end="", file=sys.stderr, flush=True)
         time.sleep(10)
+        if os.getppid() != parent:  # benchmark.sh was killed
+            return 0
 
     fresh = 120 if args.view == "status" else 0  # nothing runs any more, however fresh its log is
     progresses = [look(run, time.time(), fresh) for run in runs]

@@ -23,6 +23,7 @@ import time
 from dataclasses import asdict, dataclass, replace
 from datetime import timedelta
 from pathlib import Path
+from typing import Literal
 
 import gymnasium as gym
 import mujoco
@@ -76,8 +77,8 @@ class Args:
     """CPU threads per run; a sweep gains more from several runs side by side"""
     compile: bool = True
     """compile the updates when learning starts, where a C++ compiler is at hand"""
-    matmul_precision: str = "highest"
-    """PyTorch's float32 matmul precision: highest, high or medium (checked: see config.json)"""
+    matmul_precision: Literal["highest", "high", "medium"] = "highest"
+    """PyTorch's precision of float32 products, raised to highest where accuracy is lost"""
 
     learning_rate: float = 3e-4
     """learning rate of the optimizer"""
@@ -196,14 +197,16 @@ class State:
 
     def load_state_dict(self, state):
         """Restore a state_dict."""
-        vars(self).update({name: tensor.numpy() for name, tensor in state.items()})
+        vars(self).update({name: tensor.numpy()[()] for name, tensor in state.items()})
 
 
 class Normalizer(State):
     """Running mean and variance of the samples so far, as in Gymnasium's Normalize wrappers."""
 
     def __init__(self, shape):
-        self.mean, self.var, self.count = np.zeros(shape), np.ones(shape), np.float64(1e-4)
+        # [()] makes a number of an array without dimensions, which is faster
+        self.mean, self.var = np.zeros(shape)[()], np.ones(shape)[()]
+        self.count = np.float64(1e-4)
 
     def update(self, sample):
         """Take one sample into account."""
@@ -294,6 +297,30 @@ def ppo_gradient(agent, batch, args):
     return {name: value * scale for name, value in gradient.items()}, curves
 
 
+def updater(gradient_function, optimizer, compile):
+    """Return a function of the same arguments that takes one optimizer step; it returns the curves.
+
+    The gradient is compiled at the first call, when learning starts, if a probe compiles here.
+    """
+
+    @functools.cache
+    def choose():
+        try:
+            if compile:
+                torch.compile(torch.neg)(torch.zeros(8))
+                return torch.compile(gradient_function, fullgraph=True, dynamic=False)
+        except Exception as error:  # no C++ compiler, no Python headers, ...
+            print("not compiled:", str(error).strip().partition("\n")[0])
+        return gradient_function
+
+    def update(*args):
+        gradient, curves = choose()(*args)
+        descend(optimizer, gradient)
+        return curves
+
+    return update
+
+
 def descend(optimizer, gradient):
     """Take one optimizer step; the gradient is in the order of the optimizer's parameters."""
     parameters = optimizer.param_groups[0]["params"]
@@ -315,22 +342,6 @@ def evaluate(policy, env, episodes):
             observation, reward, terminated, truncated, _ = env.step(policy(observation))
             results[episode] += reward, 1
     return results
-
-
-def compiled(function, enabled):
-    """Compile a function when it is first called; leave it as it is where a probe fails."""
-
-    @functools.cache
-    def choose():
-        try:
-            if enabled:
-                torch.compile(torch.neg)(torch.zeros(8))
-                return torch.compile(function, fullgraph=True, dynamic=False)
-        except Exception as error:  # no C++ compiler, no Python headers, ...
-            print("not compiled:", str(error).strip().partition("\n")[0])
-        return function
-
-    return lambda *args: choose()(*args)
 
 
 def use_matmul_precision(precision, device):
@@ -536,7 +547,8 @@ def train(args, stop=lambda: False):
     agent, rollout = Agent(env).requires_grad_(False).to(device), Rollout(args.num_steps, env)
     observation_stats, return_stats = Normalizer(observation.shape), Normalizer(())
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
-    log, of_agent = RunLog(run_dir, args, env), compiled(ppo_gradient, args.compile)
+    update = updater(ppo_gradient, optimizer, args.compile)
+    log = RunLog(run_dir, args, env)
     minibatch_size = args.num_steps // args.num_minibatches
     iterations = args.total_timesteps // args.num_steps
 
@@ -601,8 +613,7 @@ def train(args, stop=lambda: False):
                 order = torch.from_numpy(rng.permutation(args.num_steps)).to(device)
                 shuffled = [tensor[order].split(minibatch_size) for tensor in batch]
                 for minibatch in zip(*shuffled, strict=True):
-                    gradient, curves = of_agent(agent, minibatch, args)
-                    descend(optimizer, gradient)
+                    curves = update(agent, minibatch, args)
                     clipfracs.append(curves["clipfrac"])
                 if args.target_kl is not None and curves["approx_kl"] > args.target_kl:
                     break

@@ -23,6 +23,7 @@ import time
 from dataclasses import asdict, dataclass, replace
 from datetime import timedelta
 from pathlib import Path
+from typing import Literal
 
 import gymnasium as gym
 import mujoco
@@ -76,8 +77,8 @@ class Args:
     """CPU threads per run; a sweep gains more from several runs side by side"""
     compile: bool = True
     """compile the updates when learning starts, where a C++ compiler is at hand"""
-    matmul_precision: str = "medium"
-    """PyTorch's float32 matmul precision: highest, high or medium (checked: see config.json)"""
+    matmul_precision: Literal["highest", "high", "medium"] = "medium"
+    """PyTorch's precision of float32 products, raised to highest where accuracy is lost"""
 
     buffer_size: int = 1_000_000
     """transitions in the replay buffer"""
@@ -289,6 +290,30 @@ def temperature_gradient(actor, log_alpha, observations, noise, target_entropy):
     return {"log_alpha": gradient}, {"alpha_loss": alpha_loss, "alpha": log_alpha.exp()}
 
 
+def updater(gradient_function, optimizer, compile):
+    """Return a function of the same arguments that takes one optimizer step; it returns the curves.
+
+    The gradient is compiled at the first call, when learning starts, if a probe compiles here.
+    """
+
+    @functools.cache
+    def choose():
+        try:
+            if compile:
+                torch.compile(torch.neg)(torch.zeros(8))
+                return torch.compile(gradient_function, fullgraph=True, dynamic=False)
+        except Exception as error:  # no C++ compiler, no Python headers, ...
+            print("not compiled:", str(error).strip().partition("\n")[0])
+        return gradient_function
+
+    def update(*args):
+        gradient, curves = choose()(*args)
+        descend(optimizer, gradient)
+        return curves
+
+    return update
+
+
 def descend(optimizer, gradient):
     """Take one optimizer step; the gradient is in the order of the optimizer's parameters."""
     parameters = optimizer.param_groups[0]["params"]
@@ -310,22 +335,6 @@ def evaluate(policy, env, episodes):
             observation, reward, terminated, truncated, _ = env.step(policy(observation))
             results[episode] += reward, 1
     return results
-
-
-def compiled(function, enabled):
-    """Compile a function when it is first called; leave it as it is where a probe fails."""
-
-    @functools.cache
-    def choose():
-        try:
-            if enabled:
-                torch.compile(torch.neg)(torch.zeros(8))
-                return torch.compile(function, fullgraph=True, dynamic=False)
-        except Exception as error:  # no C++ compiler, no Python headers, ...
-            print("not compiled:", str(error).strip().partition("\n")[0])
-        return function
-
-    return lambda *args: choose()(*args)
 
 
 def use_matmul_precision(precision, device):
@@ -539,8 +548,9 @@ def train(args, stop=lambda: False):
     actor_optimizer = torch.optim.Adam(actor.parameters(), lr=args.policy_lr, fused=True)
     alpha_optimizer = torch.optim.Adam(temperature.parameters(), lr=args.q_lr, fused=True)
     buffer, log = ReplayBuffer(args.buffer_size, env), RunLog(run_dir, args, env)
-    updates = (critic_gradient, actor_gradient, temperature_gradient)
-    of_critic, of_actor, of_alpha = (compiled(update, args.compile) for update in updates)
+    update_critic = updater(critic_gradient, critic_optimizer, args.compile)
+    update_actor = updater(actor_gradient, actor_optimizer, args.compile)
+    update_temperature = updater(temperature_gradient, alpha_optimizer, args.compile)
 
     # RESUME: between two episodes an environment carries over no more than its generator
     state = {"actor": actor, "critic": critic, "target": target, "temperature": temperature}
@@ -573,21 +583,15 @@ def train(args, stop=lambda: False):
         if global_step > args.learning_starts:
             # LEARN: critic
             batch = [tensor.to(device) for tensor in buffer.sample(args.batch_size, rng)]
-            gradient, curves = of_critic(
-                actor, critic, target, log_alpha, batch, noise(), args.gamma
-            )
-            descend(critic_optimizer, gradient)
+            curves = update_critic(actor, critic, target, log_alpha, batch, noise(), args.gamma)
 
             # LEARN: actor and temperature; a delay is made up for by as many updates
             delayed = global_step % args.policy_frequency == 0
             for _ in range(args.policy_frequency if delayed else 0):
-                gradient, loss = of_actor(actor, critic, log_alpha, batch[0], noise())
-                descend(actor_optimizer, gradient)
-                curves |= loss
+                curves |= update_actor(actor, critic, log_alpha, batch[0], noise())
                 if args.autotune:
-                    gradient, loss = of_alpha(actor, log_alpha, batch[0], noise(), target_entropy)
-                    descend(alpha_optimizer, gradient)
-                    curves |= loss
+                    arguments = (actor, log_alpha, batch[0], noise(), target_entropy)
+                    curves |= update_temperature(*arguments)
 
             # LEARN: target
             if global_step % args.target_network_frequency == 0:

@@ -23,6 +23,7 @@ import time
 from dataclasses import asdict, dataclass, replace
 from datetime import timedelta
 from pathlib import Path
+from typing import Literal
 
 import gymnasium as gym
 import mujoco
@@ -76,8 +77,8 @@ class Args:
     """CPU threads per run; a sweep gains more from several runs side by side"""
     compile: bool = True
     """compile the updates when learning starts, where a C++ compiler is at hand"""
-    matmul_precision: str = "medium"
-    """PyTorch's float32 matmul precision: highest, high or medium (checked: see config.json)"""
+    matmul_precision: Literal["highest", "high", "medium"] = "medium"
+    """PyTorch's precision of float32 products, raised to highest where accuracy is lost"""
 
     buffer_size: int = 1_000_000
     """transitions in the replay buffer"""
@@ -271,6 +272,30 @@ def actor_gradient(actor, critic, observations):
     return gradient, {"actor_loss": actor_loss}
 
 
+def updater(gradient_function, optimizer, compile):
+    """Return a function of the same arguments that takes one optimizer step; it returns the curves.
+
+    The gradient is compiled at the first call, when learning starts, if a probe compiles here.
+    """
+
+    @functools.cache
+    def choose():
+        try:
+            if compile:
+                torch.compile(torch.neg)(torch.zeros(8))
+                return torch.compile(gradient_function, fullgraph=True, dynamic=False)
+        except Exception as error:  # no C++ compiler, no Python headers, ...
+            print("not compiled:", str(error).strip().partition("\n")[0])
+        return gradient_function
+
+    def update(*args):
+        gradient, curves = choose()(*args)
+        descend(optimizer, gradient)
+        return curves
+
+    return update
+
+
 def descend(optimizer, gradient):
     """Take one optimizer step; the gradient is in the order of the optimizer's parameters."""
     parameters = optimizer.param_groups[0]["params"]
@@ -292,22 +317,6 @@ def evaluate(policy, env, episodes):
             observation, reward, terminated, truncated, _ = env.step(policy(observation))
             results[episode] += reward, 1
     return results
-
-
-def compiled(function, enabled):
-    """Compile a function when it is first called; leave it as it is where a probe fails."""
-
-    @functools.cache
-    def choose():
-        try:
-            if enabled:
-                torch.compile(torch.neg)(torch.zeros(8))
-                return torch.compile(function, fullgraph=True, dynamic=False)
-        except Exception as error:  # no C++ compiler, no Python headers, ...
-            print("not compiled:", str(error).strip().partition("\n")[0])
-        return function
-
-    return lambda *args: choose()(*args)
 
 
 def use_matmul_precision(precision, device):
@@ -521,7 +530,8 @@ def train(args, stop=lambda: False):
     critic_optimizer = torch.optim.Adam(critic.parameters(), lr=args.learning_rate, fused=True)
     actor_optimizer = torch.optim.Adam(actor.parameters(), lr=args.learning_rate, fused=True)
     buffer, log = ReplayBuffer(args.buffer_size, env), RunLog(run_dir, args, env)
-    of_critic, of_actor = (compiled(u, args.compile) for u in (critic_gradient, actor_gradient))
+    update_critic = updater(critic_gradient, critic_optimizer, args.compile)
+    update_actor = updater(actor_gradient, actor_optimizer, args.compile)
 
     # RESUME: between two episodes an environment carries over no more than its generator
     state = {"actor": actor, "critic": critic, "buffer": buffer, "log": log}
@@ -554,16 +564,12 @@ def train(args, stop=lambda: False):
             batch = [tensor.to(device) for tensor in buffer.sample(args.batch_size, rng)]
             noise = args.policy_noise * torch.randn_like(batch[1])
             noise = noise.clamp(-args.noise_clip, args.noise_clip)
-            gradient, curves = of_critic(
-                critic, target_actor, target_critic, batch, noise, args.gamma
-            )
-            descend(critic_optimizer, gradient)
+            arguments = (critic, target_actor, target_critic, batch, noise, args.gamma)
+            curves = update_critic(*arguments)
 
             if global_step % args.policy_frequency == 0:
                 # LEARN: actor
-                gradient, loss = of_actor(actor, critic, batch[0])
-                descend(actor_optimizer, gradient)
-                curves |= loss
+                curves |= update_actor(actor, critic, batch[0])
 
                 # LEARN: targets
                 torch._foreach_lerp_(targets, online, args.tau)

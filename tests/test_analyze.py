@@ -453,7 +453,7 @@ def test_five_against_five_cannot_reach_significance_alone_among_90(tmp_path):
     assert table["p"].iloc[1] == pytest.approx(2 / 252)
     assert table["smallest_p_adjusted"].iloc[1] == pytest.approx(90 * 2 / 252)
     (note,) = analyze.family_notes(table)
-    assert "90 comparisons" in note and "0.0079" in note and "0.71 for one configuration" in note
+    assert "comparisons: 90;" in note and "0.0079" in note and "0.71 for one configuration" in note
     assert "only if 15 or more" in note  # 90 * 0.0079 / 0.05 = 14.3
     _, caption = analyze.make_tables([study])["statistics"]
     assert note in caption and f"{analyze.COVERAGE[5]} % (n = 5)" in caption
@@ -581,9 +581,9 @@ def test_unfinished_missing_and_duplicate_runs_are_listed(tmp_path, capsys):
     noisy = row(tables["summary_SAC"], environment="Pusher-v5", noise=SCALE, noise_rate="0.05")
     assert noisy["n"] == 2  # seeds 1 and 4
     printed = capsys.readouterr().out
-    assert "WARNING: 4 runs do not count" in printed and "copy" in printed
+    assert "WARNING: Runs that do not count: 4 (" in printed and "copy" in printed
     html = (tmp_path / "results/report.html").read_text()
-    assert "4 runs do not count" in html and "1 missing" in html
+    assert "do not count: 4 (" in html and "1 missing" in html
 
 
 def test_a_missing_baseline_is_said(tmp_path, capsys):
@@ -632,7 +632,7 @@ def test_paths_threads_and_evaluation_steps_do_not_split_rows(tmp_path, capsys):
     assert study.algorithm == "SAC" and study.steps.tolist() == [20_000, 40_000]
     assert study.returns[analyze.BASELINE][:, :, 0].tolist() == [[2, 6, 2], [4, 8, 5]]
     assert "cut to the 2 steps that all share (of up to 4)" in notes[0]
-    assert "different mujoco" in notes[1] and "3.14.0 (1 runs)" in notes[1]
+    assert "different mujoco" in notes[1] and "3.14.0 (n = 1)" in notes[1]
     run(tmp_path)
     printed = capsys.readouterr().out
     assert notes[0] in printed and notes[0] in (tmp_path / "results/report.html").read_text()
@@ -825,7 +825,7 @@ def test_one_baseline_run_is_enough_for_a_report(tmp_path, capsys):
     tables = run(tmp_path)
     assert tables["best"].empty and row(tables["summary_SAC"], n=1)["mean"] == 2
     assert (tmp_path / "results/curves_SAC_no_noise.png").exists()
-    assert "1 finished runs" in capsys.readouterr().out
+    assert "Finished runs: 1." in capsys.readouterr().out
 
 
 def test_help_names_every_option():

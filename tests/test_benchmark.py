@@ -322,7 +322,7 @@ def test_machines_without_a_shared_folder(sshd, tmp_path):
         folder.mkdir()
         for file in ("benchmark.sh", "grid.py", "noisy_wrappers.py", "sac_continuous_noisy.py"):
             shutil.copy2(ROOT / file, folder)
-    grid = ["baseline", *GRID[1:7], "--total-timesteps", "80000"]
+    grid = ["baseline", *GRID[1:7], "--total-timesteps", "40000"]
     machine = ["--executor", "parallel", "--sshlogin", "second", "--remote-dir", there]
     folder = here / folders(*grid)[0]
     sweep = start(*grid, *machine, *CHEAP, env=sshd, cwd=here)
@@ -336,7 +336,7 @@ def test_machines_without_a_shared_folder(sshd, tmp_path):
     again = run(*grid, *machine, *CHEAP, env=sshd, cwd=here)
     assert again.code == 0, again.out + again.err
     assert not attempts(folder)[1][0].startswith("step=1000/"), "not resumed"
-    assert json.loads((folder / "result.json").read_text())["total_timesteps"] == 80_000
+    assert json.loads((folder / "result.json").read_text())["total_timesteps"] == 40_000
 
 
 def test_a_lost_connection(sshd, tmp_path):
@@ -360,7 +360,7 @@ def test_an_unreachable_machine(sshd, tmp_path):
 
 
 def test_slurm_requeues_before_the_time_limit(slurm, tmp_path):
-    grid = ["baseline", *GRID[1:7], "--total-timesteps", "80000", "--runs-dir", tmp_path]
+    grid = ["baseline", *GRID[1:7], "--total-timesteps", "40000", "--runs-dir", tmp_path]
     (folder,) = folders(*grid)
     submitted = run(*grid, "--executor", "slurm", "--slurm-args=--comment=hello", *CHEAP, env=slurm)
     assert submitted.code == 0, submitted.err

@@ -93,12 +93,6 @@ def sample(transitions, batch_size, rng):
     return [torch.tensor(np.array(column), dtype=torch.float32) for column in columns]
 
 
-def random_batch(env, size):
-    """Return a batch in float64: s, a, r, s', terminated."""
-    batch = [torch.randn(size, 3), torch.randn(size, 2), torch.randn(size), torch.randn(size, 3)]
-    return [x.double() for x in (*batch, torch.arange(size) % 3 == 0)]
-
-
 class PlainSAC:
     def __init__(self, actor, critic, target, space, args, log_alpha=0.0):
         [self.actor] = ordinary(actor)
@@ -107,7 +101,9 @@ class PlainSAC:
         low, high = torch.tensor(space.low), torch.tensor(space.high)
         self.scale, self.bias = (high - low) / 2, (high + low) / 2
         self.args, self.target_entropy = args, -2.0
-        self.log_alpha = torch.full((1,), log_alpha, dtype=self.actor[0].weight.dtype, requires_grad=True)
+        self.log_alpha = torch.full(
+            (1,), log_alpha, dtype=self.actor[0].weight.dtype, requires_grad=True
+        )
         self.alpha = self.log_alpha.exp().item() if args.autotune else args.alpha
         self.q_optimizer = torch.optim.Adam(parameters(self.q1, self.q2), lr=args.q_lr)
         self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), lr=args.policy_lr)
@@ -238,9 +234,10 @@ def checkpoint(script, args, episodes, tmp_path):
 
 
 def assert_equal_networks(state, *networks):
-    actual, expected = parameters(*ordinary(state)), parameters(*networks)
-    print([f"{((a - b).norm() / b.norm()).item():.1e}" for a, b in zip(actual, expected)])
-    torch.testing.assert_close(actual, expected, rtol=0, atol=2e-5)
+    actual = nn.utils.parameters_to_vector(parameters(*ordinary(state)))
+    expected = nn.utils.parameters_to_vector(parameters(*networks))
+    # rounding alone gives 4e-7; one update left out, for one bias, some 1e-4
+    assert (actual - expected).norm() < 5e-6 * expected.norm()
 
 
 @pytest.mark.parametrize(
@@ -267,7 +264,7 @@ def test_sac_trains_as_a_plain_implementation(case, tmp_path):
     assert_equal_networks(state["target"], plain.q1_target, plain.q2_target)
     alpha = state["temperature"]["log_alpha"].exp().item()
     assert alpha == pytest.approx(plain.alpha, abs=1e-6)
-    assert (alpha != args.alpha) == args.autotune
+    assert (alpha != pytest.approx(args.alpha)) == args.autotune
 
 
 @pytest.mark.parametrize(
@@ -293,3 +290,403 @@ def test_td3_trains_as_a_plain_implementation(case, tmp_path):
     assert_equal_networks(state["critic"], plain.q1, plain.q2)
     assert_equal_networks(state["target_actor"], plain.actor_target)
     assert_equal_networks(state["target_critic"], plain.q1_target, plain.q2_target)
+
+
+class PlainPPO(nn.Module):
+    def __init__(self, agent, args):
+        super().__init__()
+        self.critic, self.actor_mean = ordinary(agent, nn.Tanh)
+        self.actor_logstd = nn.Parameter(agent["actor_logstd"].detach().clone())
+        self.args = args
+        self.optimizer = torch.optim.Adam(self.parameters(), lr=args.learning_rate, eps=1e-5)
+
+    def forward(self, observations, actions):
+        probs = Normal(self.actor_mean(observations), self.actor_logstd.exp())
+        entropy = probs.entropy().sum(1)
+        return probs.log_prob(actions).sum(1), entropy, self.critic(observations).view(-1)
+
+    def loss(self, minibatch):
+        args = self.args
+        observations, actions, old_logprobs, advantages, returns, old_values = minibatch
+        logprobs, entropy, values = self(observations, actions)
+        logratio = logprobs - old_logprobs
+        ratio = logratio.exp()
+        self.approx_kl = ((ratio - 1) - logratio).mean().item()
+        if args.norm_adv:
+            advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+        pg_loss1 = -advantages * ratio
+        pg_loss2 = -advantages * torch.clamp(ratio, 1 - args.clip_coef, 1 + args.clip_coef)
+        v_loss = (values - returns) ** 2
+        if args.clip_vloss:
+            clipped = torch.clamp(values - old_values, -args.clip_coef, args.clip_coef)
+            v_loss = torch.max(v_loss, (old_values + clipped - returns) ** 2)
+        v_loss = 0.5 * v_loss.mean()
+        pg_loss = torch.max(pg_loss1, pg_loss2).mean()
+        return pg_loss - args.ent_coef * entropy.mean() + args.vf_coef * v_loss
+
+    def learn(self, minibatch):
+        self.optimizer.zero_grad()
+        self.loss(minibatch).backward()
+        nn.utils.clip_grad_norm_(self.parameters(), self.args.max_grad_norm)
+        self.optimizer.step()
+
+
+def plain_ppo_training(plain, env, args):
+    """Train in CleanRL's stack of wrappers; return the environment and the epochs of rollouts."""
+    env = wrappers.ClipAction(env)
+    env = normalizing = wrappers.NormalizeObservation(env)
+    env = wrappers.TransformObservation(env, lambda x: np.clip(x, -10, 10), None)
+    env = wrappers.NormalizeReward(env, gamma=args.gamma)
+    env = wrappers.TransformReward(env, lambda reward: np.clip(reward, -10, 10))
+    T, rng, ends, epochs = args.num_steps, np.random.default_rng(args.seed), set(), []
+    next_obs, _ = env.reset(seed=args.seed)
+    next_done = 0.0
+    iterations = args.total_timesteps // T
+    for iteration in range(1, iterations + 1):
+        if args.anneal_lr:
+            frac = 1.0 - (iteration - 1.0) / iterations
+            plain.optimizer.param_groups[0]["lr"] = frac * args.learning_rate
+        obs, actions = torch.zeros(T, 3), torch.zeros(T, 2)
+        logprobs, rewards, dones, values = torch.zeros(4, T)
+        noise = torch.randn(T, 2)  # all at once, then action = mean + std * noise
+        for step in range(T):
+            obs[step], dones[step] = torch.Tensor(next_obs), next_done
+            with torch.no_grad():
+                mean, std = plain.actor_mean(obs[step]), plain.actor_logstd.exp()
+                actions[step] = mean + std * noise[step]
+                logprob, _, value = plain(obs[step][None], actions[step][None])
+            logprobs[step], values[step] = logprob, value
+            next_obs, reward, terminated, truncated, _ = env.step(actions[step].numpy())
+            next_done = float(terminated or truncated)
+            if truncated and not terminated and args.bootstrap_truncated:
+                reward += args.gamma * plain.critic(torch.Tensor(next_obs)).item()
+            rewards[step] = reward
+            if next_done:
+                ends.add("terminated" if terminated else "truncated")
+                next_obs, _ = env.reset()
+
+        with torch.no_grad():
+            next_value = plain.critic(torch.Tensor(next_obs)).item()
+            advantages, lastgaelam = torch.zeros(T), 0
+            for t in reversed(range(T)):
+                nextnonterminal = 1.0 - (next_done if t == T - 1 else dones[t + 1])
+                nextvalue = next_value if t == T - 1 else values[t + 1]
+                delta = rewards[t] + args.gamma * nextvalue * nextnonterminal - values[t]
+                lastgaelam = delta + args.gamma * args.gae_lambda * nextnonterminal * lastgaelam
+                advantages[t] = lastgaelam
+            returns = advantages + values
+
+        batch = (obs, actions, logprobs, advantages, returns, values)
+        for epoch in range(args.update_epochs):  # noqa: B007
+            order = rng.permutation(T)
+            for indices in np.split(order, args.num_minibatches):
+                plain.learn([tensor[indices] for tensor in batch])
+            if args.target_kl is not None and plain.approx_kl > args.target_kl:
+                break
+        epochs.append(epoch + 1)
+    assert {"terminated", "truncated"} == ends
+    return normalizing, epochs
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        {"ent_coef": 0.01},
+        {"norm_adv": False, "clip_vloss": False, "anneal_lr": False, "max_grad_norm": 100.0},
+        {"bootstrap_truncated": True, "clip_coef": 0.02, "vf_coef": 1.0, "max_grad_norm": 0.1},
+        {"target_kl": 0.004, "learning_rate": 3e-3, **NOISE},
+    ],
+)
+def test_ppo_trains_as_a_plain_implementation(case, tmp_path):
+    args = ppo.Args(**ON_POLICY | case)
+    env = make_env(args)
+    torch.manual_seed(args.seed)
+    plain = PlainPPO(ppo.Agent(env).state_dict(), args)
+    normalizing, epochs = plain_ppo_training(plain, env, args)
+    assert (min(epochs) < args.update_epochs) == (args.target_kl is not None)
+
+    assert ppo.train(replace(args, runs_dir=str(tmp_path)))
+    [path] = tmp_path.glob("*/policy.pt")
+    state = torch.load(path, weights_only=True)
+    assert_equal_networks(state["agent"], plain.critic, plain.actor_mean)
+    logstd = state["agent"]["actor_logstd"]
+    torch.testing.assert_close(logstd, plain.actor_logstd.data, rtol=0, atol=1e-6)
+    stats, expected = state["observation_stats"], normalizing.obs_rms
+    np.testing.assert_allclose(stats["mean"], expected.mean, rtol=1e-6)
+    np.testing.assert_allclose(stats["var"], expected.var, rtol=1e-6)
+    assert stats["count"].item() == pytest.approx(expected.count)
+
+
+# GRADIENTS in float64, where nothing hides behind rounding.
+
+
+def random_batch(size):
+    """Return s, a, r, s', terminated."""
+    batch = [torch.randn(size, 3), torch.randn(size, 2), torch.randn(size), torch.randn(size, 3)]
+    return [x.double() for x in (*batch, torch.arange(size) % 3 == 0)]
+
+
+def assert_equal_gradients(gradient, loss, parameters):
+    expected = torch.autograd.grad(loss, parameters)
+    torch.testing.assert_close(tuple(gradient.values()), expected, rtol=1e-8, atol=1e-12)
+
+
+def test_sac_gradients():
+    torch.manual_seed(0)
+    env, args, batch = gym.make(ENV), sac.Args(gamma=0.9), random_batch(64)
+    actor, critic, target = sac.Actor(env), sac.Critic(env), sac.Critic(env)
+    for network in (actor, critic, target):
+        network.double().requires_grad_(False)
+    log_alpha = torch.tensor(-0.7).double()
+    states = (network.state_dict() for network in (actor, critic, target))
+    plain = PlainSAC(*states, env.action_space, args, log_alpha.item())
+    noise = torch.randn(64, 2).double()
+
+    def expected(loss, *arguments):
+        """Call a loss so that rsample() draws `noise`."""
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("torch.distributions.normal._standard_normal", lambda *_, **__: noise)
+            return loss(*arguments)
+
+    gradient, curves = sac.critic_gradient(
+        actor, critic, target, log_alpha, batch, noise, args.gamma
+    )
+    loss = expected(plain.critic_loss, batch)
+    assert_equal_gradients(gradient, loss, parameters(plain.q1, plain.q2))
+    q1, q2 = q_value(plain.q1, *batch[:2]), q_value(plain.q2, *batch[:2])
+    assert curves["qf1_values"].item() == pytest.approx(q1.mean().item())
+    assert curves["qf2_values"].item() == pytest.approx(q2.mean().item())
+    assert curves["qf_loss"].item() == pytest.approx(loss.item() / 2)
+    assert (curves["qf1_loss"] + curves["qf2_loss"]).item() == pytest.approx(loss.item())
+
+    gradient, curves = sac.actor_gradient(actor, critic, log_alpha, batch[0], noise)
+    loss = expected(plain.actor_loss, batch[0])
+    assert_equal_gradients(gradient, loss, parameters(plain.actor))
+    assert curves["actor_loss"].item() == pytest.approx(loss.item())
+
+    gradient, curves = sac.temperature_gradient(actor, log_alpha, batch[0], noise, -2.0)
+    loss = expected(plain.alpha_loss, batch[0])
+    [log_alpha_gradient] = torch.autograd.grad(loss, plain.log_alpha)
+    torch.testing.assert_close(gradient["log_alpha"], log_alpha_gradient[0])
+    assert curves["alpha_loss"].item() == pytest.approx(loss.item())
+    assert curves["alpha"].item() == pytest.approx(plain.alpha)
+
+
+def test_td3_gradients_with_bounds_that_differ_between_dimensions():
+    torch.manual_seed(0)
+    env, batch = gym.make(ENV), random_batch(64)
+    args = td3.Args(gamma=0.9, policy_noise=2.0, noise_clip=1.5)
+    networks = td3.Actor(env), td3.Critic(env), td3.Actor(env), td3.Critic(env)
+    for network in networks:
+        network.double().requires_grad_(False)
+    actor, critic, target_actor, target_critic = networks
+    states = [network.state_dict() for network in networks]
+    plain = PlainTD3(*states, env.action_space, args)
+
+    noise = torch.randn(64, 2).double()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("torch.randn_like", lambda actions: noise)
+        loss = plain.critic_loss(batch)
+    clipped = (args.policy_noise * noise).clamp(-args.noise_clip, args.noise_clip)
+    gradient, curves = td3.critic_gradient(
+        critic, target_actor, target_critic, batch, clipped, args.gamma
+    )
+    assert_equal_gradients(gradient, loss, parameters(plain.q1, plain.q2))
+    assert curves["qf_loss"].item() == pytest.approx(loss.item() / 2)
+    actions = target_actor(batch[3], clipped)  # each bound was reached, and no other one
+    assert actions.min(0).values.tolist() == pytest.approx([-1, -0.5])
+    assert actions.max(0).values.tolist() == pytest.approx([2, 0.3])
+
+    gradient, curves = td3.actor_gradient(actor, critic, batch[0])
+    loss = plain.actor_loss(batch[0])
+    assert_equal_gradients(gradient, loss, parameters(plain.actor))
+    assert curves["actor_loss"].item() == pytest.approx(loss.item())
+
+
+@pytest.mark.parametrize("norm_adv", [True, False])
+@pytest.mark.parametrize("clip_vloss", [True, False])
+@pytest.mark.parametrize("max_grad_norm", [0.01, 1e6])
+def test_ppo_gradient(norm_adv, clip_vloss, max_grad_norm):
+    torch.manual_seed(0)
+    args = ppo.Args(norm_adv=norm_adv, clip_vloss=clip_vloss, max_grad_norm=max_grad_norm)
+    args.ent_coef = 0.01
+    agent = ppo.Agent(gym.make(ENV)).double().requires_grad_(False)
+    agent.actor_logstd += torch.tensor([-0.5, 0.2])
+    plain = PlainPPO(agent.state_dict(), args)
+    observations, actions, advantages, returns, _ = random_batch(64)
+    returns = returns[:, 0]
+    logprobs, entropy, values = plain(observations, actions)
+    old_logprobs = logprobs.detach() + 0.3 * torch.randn(64)
+    old_values = values.detach() + 0.3 * torch.randn(64)
+    minibatch = (observations, actions, old_logprobs, advantages, returns, old_values)
+    gradient, curves = ppo.ppo_gradient(agent, minibatch, args)
+
+    plain.loss(minibatch).backward()
+    nn.utils.clip_grad_norm_(plain.parameters(), max_grad_norm)
+    expected = {name: parameter.grad for name, parameter in plain.named_parameters()}
+    assert gradient.keys() == expected.keys()
+    for name in gradient:
+        torch.testing.assert_close(gradient[name], expected[name], rtol=1e-8, atol=1e-12)
+    ratio = (logprobs - old_logprobs).exp()
+    assert curves["clipfrac"].item() == pytest.approx(((ratio - 1).abs() > 0.2).float().mean())
+    assert curves["approx_kl"].item() == pytest.approx(plain.approx_kl)
+    assert curves["old_approx_kl"].item() == pytest.approx(-ratio.log().mean().item())
+    assert curves["entropy"].item() == pytest.approx(entropy.mean().item())
+
+
+def test_ppo_starts_from_orthogonal_weights():
+    agent = ppo.Agent(gym.make(ENV))
+    for network, last in ((agent.critic, 1.0), (agent.actor_mean, 0.01)):
+        gains = (2**0.5, 2**0.5, last)
+        linear = [layer for layer in network if isinstance(layer, nn.Linear)]
+        for layer, gain in zip(linear, gains, strict=True):
+            weight = (
+                layer.weight if layer.weight.shape[0] <= layer.weight.shape[1] else layer.weight.T
+            )
+            identity = torch.eye(len(weight)) * gain**2
+            torch.testing.assert_close(weight @ weight.T, identity, rtol=0, atol=1e-5 * gain**2)
+            assert not layer.bias.any()
+    assert not agent.actor_logstd.any()
+
+
+# PARTS
+
+
+def test_gae_of_a_case_computed_by_hand():
+    rewards, dones = np.float32([1, 2, 3, 4]), np.float32([0, 1, 0, 0])
+    values = torch.tensor([0.5, 1.0, 1.5, 2.0, 2.5])
+    # delta_3 = 4 + 0.5 * 2.5 - 2 = 3.25, delta_2 = 3 + 0.5 * 2 - 1.5 = 2.5,
+    # delta_1 = 2 - 1 = 1 at the end of an episode, delta_0 = 1 + 0.5 * 1 - 0.5 = 1
+    expected = [1 + 0.2 * 1, 1.0, 2.5 + 0.2 * 3.25, 3.25]
+    actual = ppo.compute_gae(rewards, values, dones, gamma=0.5, gae_lambda=0.4)
+    torch.testing.assert_close(actual, torch.tensor(expected))
+    dones[3] = 1  # what comes after the last step counts no more
+    actual = ppo.compute_gae(rewards, values, dones, gamma=0.5, gae_lambda=0.4)
+    torch.testing.assert_close(actual, torch.tensor([1.2, 1.0, 2.5 + 0.2 * 2, 2.0]))
+
+
+def test_normalizer_is_gymnasiums():
+    raw = gym.make("Hopper-v5")
+    raw.action_space.seed(0)
+    observed = wrappers.NormalizeObservation(raw)
+    rewarded = wrappers.NormalizeReward(observed, gamma=0.99)
+    observation_stats, return_stats = ppo.Normalizer((11,)), ppo.Normalizer(())
+
+    def check(expected):
+        observation = raw.unwrapped._get_obs()
+        observation_stats.update(observation)
+        actual = observation_stats.normalize(observation)
+        assert actual.dtype == np.float32
+        np.testing.assert_allclose(actual, expected.clip(-10, 10), rtol=1e-5, atol=1e-6)
+
+    check(rewarded.reset(seed=0)[0])
+    discounted, resets = 0.0, 0
+    for _ in range(300):
+        expected, expected_reward, terminated, _, info = rewarded.step(raw.action_space.sample())
+        check(expected)
+        reward = sum(value for name, value in info.items() if name.startswith("reward_"))
+        discounted = discounted * 0.99 * (1 - terminated) + reward
+        return_stats.update(discounted)
+        expected_reward = np.clip(expected_reward, -10, 10)
+        assert return_stats.scale(reward) == pytest.approx(expected_reward, rel=1e-5)
+        if terminated:
+            check(rewarded.reset()[0])
+            resets += 1
+    assert resets > 3
+    np.testing.assert_allclose(observation_stats.mean, observed.obs_rms.mean, rtol=1e-9)
+    np.testing.assert_allclose(observation_stats.var, observed.obs_rms.var, rtol=1e-9)
+    np.testing.assert_allclose(return_stats.var, rewarded.return_rms.var, rtol=1e-9)
+    assert observation_stats.normalize(np.full(11, 1e6)).tolist() == [10.0] * 11
+    assert return_stats.scale(-1e6) == -10
+
+
+def play(lengths):
+    """Yield the transitions of episodes, in which no two observations are equal."""
+    count = 0
+    for length, end in lengths:
+        for step in range(1, length + 1):
+            before, after = np.array([[count, -count, 0.5], [count + 1, -count - 1, 0.5]])
+            last = step == length
+            ends = last and end != "truncated", last and end != "terminated"
+            yield before, np.float32([count, 1]), count / 8, after, *ends
+            count += 1
+        count += 1
+
+
+def rows(batch):
+    """Return a batch as a list of flat tuples."""
+    return [tuple(row) for row in torch.cat([x.reshape(len(x), -1) for x in batch], 1).tolist()]
+
+
+def expected_rows(transitions):
+    return {
+        (*observation, *action, reward, *next_observation, float(terminated))
+        for observation, action, reward, next_observation, terminated, _ in transitions
+    }
+
+
+episodes = st.lists(
+    st.tuples(st.integers(1, 9), st.sampled_from(["terminated", "truncated", "both"])),
+    min_size=1,
+    max_size=8,
+)
+
+
+@pytest.mark.parametrize("script", [sac, td3])
+@settings(deadline=None, derandomize=True, max_examples=100)
+@given(capacity=st.integers(1, 12), lengths=episodes)
+def test_replay_buffer_is_a_list_of_the_last_transitions(script, capacity, lengths):
+    buffer, transitions = script.ReplayBuffer(capacity, gym.make(ENV)), []
+    rng = np.random.default_rng(0)
+    for transition in play(lengths):
+        transitions.append(copy.deepcopy(transition))
+        buffer.add(*transition)
+        for array in (transition[0], transition[1], transition[3]):
+            array[:] = np.nan  # an environment may write into its arrays again
+        if len(transitions) % 5 == 1:
+            sampled = set(rows(buffer.sample(600, rng)))  # misses a transition with p < 1e-21
+            assert sampled == expected_rows(transitions[-capacity:])
+
+
+@pytest.mark.parametrize("script", [sac, td3])
+@pytest.mark.parametrize("end", ["terminated", "truncated"])
+def test_replay_buffer_returns_the_last_observation_of_an_episode(script, end):
+    buffer = script.ReplayBuffer(10, gym.make(ENV))
+    for transition in play([(2, end), (1, end)]):
+        buffer.add(*transition)
+    batch = buffer.sample(100, np.random.default_rng(0))
+    assert [x.dtype for x in batch] == [torch.float32] * 5
+    assert [x.shape[1:] for x in batch] == [(3,), (2,), (), (3,), ()]
+    observed, next_observed, terminated = batch[0][:, 0], batch[3][:, 0], batch[4]
+    triples = set(rows((observed, next_observed, terminated)))
+    over = float(end == "terminated")
+    assert triples == {(0, 1, 0), (1, 2, over), (3, 4, over)}  # not 1 -> 3
+
+
+@pytest.mark.parametrize("script", [sac, td3])
+def test_replay_buffer_samples_uniformly(script):
+    buffer = script.ReplayBuffer(10, gym.make(ENV))
+    for transition in play([(7, "terminated"), (6, "truncated")]):
+        buffer.add(*transition)
+    batch = buffer.sample(20_000, np.random.default_rng(0))
+    counts = np.unique(batch[0][:, 0], return_counts=True)[1]
+    chi_squared = np.square(counts - 2000).sum() / 2000
+    assert len(counts) == 10 and chi_squared < 27.9  # exceeded with p = 0.001
+
+
+@pytest.mark.parametrize("script", [sac, td3])
+@pytest.mark.parametrize("before", [5, 27])
+def test_replay_buffer_goes_on_from_a_state_dict(script, before, tmp_path):
+    buffer = script.ReplayBuffer(10, gym.make(ENV))
+    transitions = list(play([(3, "truncated"), (1, "terminated")] * 10))
+    for transition in transitions[:before]:
+        buffer.add(*transition)
+    torch.save(buffer.state_dict(), tmp_path / "buffer.pt")
+    restored = script.ReplayBuffer(10, gym.make(ENV))
+    restored.load_state_dict(torch.load(tmp_path / "buffer.pt", weights_only=True))
+    for transition in [None, *transitions[before:]]:
+        for one in (buffer, restored):
+            if transition:
+                one.add(*transition)
+        batches = [one.sample(50, np.random.default_rng(1)) for one in (buffer, restored)]
+        torch.testing.assert_close(*batches, rtol=0, atol=0)

@@ -1,0 +1,630 @@
+"""A run killed anywhere and started again ends like a run left alone, bit for bit.
+
+Most commands here are processes forked from a server that has imported PyTorch already: what takes
+`python script.py` seconds takes them a moment. They run the script as that would, and can be told
+to die, or to be sent a signal, at a chosen moment. `real` commands are plain subprocesses.
+"""
+
+import functools
+import io
+import itertools
+import json
+import math
+import multiprocessing
+import os
+import pickle
+import pkgutil
+import random
+import resource
+import runpy
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+import tyro
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+ROOT = Path(__file__).parent.parent
+ALGORITHMS = ("sac", "td3", "ppo")
+ENVS = ("Hopper-v5", "Pendulum-v1")
+NOISE = (
+    "RandomEarlyTermination(3, 25)",
+    "RandomMixupObservation(0.5)",
+    "RandomNormalNoisyReward(0.1)",
+    "RandomUniformScaleObservation(0.9, 1.1)",
+    "RandomNormalNoisyReward(0.1)",
+)
+RATES = ("1", "0.3", "0.3", "0.3", "0.3")  # 1: episodes of 25 steps at most
+TRAINING_STEP = "gymnasium.wrappers.RecordEpisodeStatistics.step"  # the test env has none of these
+
+FORK = multiprocessing.get_context("forkserver")
+FORK.set_forkserver_preload(
+    "pytest tyro tqdm gymnasium.envs.mujoco torch.utils.tensorboard torch.testing "
+    "tensorboard.backend.event_processing.event_accumulator".split()
+)
+
+
+def script(algorithm):
+    return import_module(f"{algorithm}_continuous_noisy")
+
+
+def options(algorithm, runs_dir, env_id="Hopper-v5", noise=NOISE, rates=RATES, **more):
+    """A short run's command-line options: episodes, checkpoints and evaluations are frequent."""
+    values = {"env_id": env_id, "noise": noise, "noise_rate": rates, "runs_dir": runs_dir}
+    values |= {"total_timesteps": 260, "eval_frequency": 70, "eval_episodes": 2}
+    values |= {"checkpoint_frequency": 40, "compile": False}
+    if algorithm == "ppo":
+        values |= {"num_steps": 60, "num_minibatches": 4, "update_epochs": 2}
+    else:  # a buffer that overflows
+        values |= {"learning_starts": 110, "batch_size": 16, "buffer_size": 150}
+    words = []
+    for name, value in (values | more).items():
+        flag = name.replace("_", "-")
+        if isinstance(value, bool):
+            words += [f"--{flag}" if value else f"--no-{flag}"]
+        else:
+            words += [f"--{flag}", *map(str, value if isinstance(value, tuple) else (value,))]
+    return words
+
+
+def train(algorithm, words, episodes=math.inf):
+    """Train in this process, stopped after a number of episodes; return what train() does."""
+    module, ended = script(algorithm), itertools.count(1)
+    return module.train(tyro.cli(module.Args, args=words), stop=lambda: next(ended) >= episodes)
+
+
+def at(target, number, action):
+    """Make the number-th call of `target` in this process (None: every call) act first."""
+    owner, _, name = target.rpartition(".")
+    owner, calls = pkgutil.resolve_name(owner), itertools.count(1)
+    function = getattr(owner, name)
+
+    @functools.wraps(function)
+    def patched(*args, **kwargs):
+        if next(calls) == number or number is None:
+            action(*args)
+        return function(*args, **kwargs)
+
+    setattr(owner, name, patched)
+
+
+def die(*args):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def die_half_way(value, file):
+    """Die in torch.save when half of the file is on the disk."""
+    whole = io.BytesIO()
+    torch.serialization.save(value, whole)
+    file.write(whole.getvalue()[: whole.tell() // 2])
+    file.flush()
+    die()
+
+
+def die_half_way_in_policy(value, file):
+    if "policy" in Path(file.name).name:
+        die_half_way(value, file)
+
+
+def send(*numbers):
+    return functools.partial(send_all, numbers)
+
+
+def send_all(numbers, *args):
+    for number in numbers:
+        os.kill(os.getpid(), number)
+
+
+def disk_full(file_size, name=""):
+    return functools.partial(limit_files, file_size, name)
+
+
+def limit_files(file_size, name, *args):
+    """From now on no file grows beyond a size (if this is about the file `name`)."""
+    if name in str(args):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, resource.RLIM_INFINITY))
+
+
+def child(algorithm, words, stdout, stderr, moments):
+    os.dup2(stdout.fileno(), 1)
+    os.dup2(stderr.fileno(), 2)
+    for moment in moments:
+        at(*moment)
+    sys.argv = [str(ROOT / f"{algorithm}_continuous_noisy.py"), *words]
+    runpy.run_path(sys.argv[0], run_name="__main__")
+
+
+def start(algorithm, words, *moments):
+    """Start a command; each moment is (dotted name, number of the call, action)."""
+    (out, stdout), (err, stderr) = FORK.Pipe(duplex=False), FORK.Pipe(duplex=False)
+    arguments = (algorithm, words, stdout, stderr, moments)
+    process = FORK.Process(target=child, args=arguments, daemon=True)
+    process.start()
+    stdout.close()
+    stderr.close()
+    process.out, process.err = out, err
+    return process
+
+
+def ended(process):
+    """Wait for a command; return its exit code (-9 after SIGKILL), stdout and stderr."""
+    process.join(120)
+    assert process.exitcode is not None
+    texts = []
+    for connection in (process.out, process.err):
+        with open(os.dup(connection.fileno()), errors="replace") as file:
+            texts.append(file.read())
+    return SimpleNamespace(code=process.exitcode, out=texts[0], err=texts[1])
+
+
+def run(algorithm, words, *moments):
+    return ended(start(algorithm, words, *moments))
+
+
+def real(algorithm, words, **kwargs):
+    """Start a command as a user does."""
+    command = [sys.executable, str(ROOT / f"{algorithm}_continuous_noisy.py"), *words]
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(command, **streams | kwargs)
+
+
+def folder(runs_dir):
+    """The one run folder there is."""
+    (path,) = Path(runs_dir).iterdir()
+    return path
+
+
+def files(path):
+    """All that a folder holds but the lock."""
+    found = [file for file in path.iterdir() if file.name != ".lock"]
+    return {file.name: (file.stat().st_mtime_ns, file.read_bytes()) for file in found}
+
+
+def tensors(value):
+    """Nested dicts of tensors -> one flat dict of bytes."""
+    if isinstance(value, torch.Tensor):
+        return {"": (value.dtype, tuple(value.shape), value.numpy().tobytes())}
+    nested = {name: tensors(inner) for name, inner in value.items()}
+    return {f"{name}/{key}": x for name, inner in nested.items() for key, x in inner.items()}
+
+
+def events(path):
+    """All scalars in TensorBoard, without the speed -> {tag: [(step, value), ...]}."""
+    accumulator = EventAccumulator(str(path), size_guidance={"scalars": 0, "tensors": 0})
+    tags = accumulator.Reload().Tags()
+    found = {tag: accumulator.Tensors(tag) for tag in tags["tensors"]}
+    found = {tag: [event.step for event in found[tag]] for tag in found}
+    for tag in set(tags["scalars"]) - {"charts/SPS"}:
+        found[tag] = [(event.step, repr(event.value)) for event in accumulator.Scalars(tag)]
+    return found
+
+
+def outcome(path):
+    """All that must not depend on interruptions."""
+    result = json.loads((path / "result.json").read_text())
+    timing = ("steps_per_second", "wall_time_seconds")
+    policy = tensors(torch.load(path / "policy.pt", weights_only=True))
+    rows = (path / "eval.csv").read_bytes()
+    numbers = {name: repr(value) for name, value in result.items() if name not in timing}
+    return {"rows": rows, "policy": policy, "result": numbers, "events": events(path)}
+
+
+def assert_finished(path):
+    found = {file.name for file in path.iterdir() if "tfevents" not in file.name}
+    assert found == {".lock", "config.json", "eval.csv", "policy.pt", "result.json"}
+    lines = (path / "eval.csv").read_text().splitlines()
+    keys = [tuple(line.split(",")[:2]) for line in lines]
+    assert len(set(keys)) == len(keys)
+    for tag, logged in events(path).items():
+        steps = [event[0] for event in logged if isinstance(event, tuple)]
+        assert len(set(steps)) == len(steps), tag
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """The outcome of a run that nothing interrupted, trained once for all tests."""
+
+    @functools.cache
+    def train_once(algorithm, env_id="Hopper-v5"):
+        runs_dir = tmp_path_factory.mktemp("alone")
+        assert train(algorithm, options(algorithm, runs_dir, env_id))
+        assert_finished(folder(runs_dir))
+        return outcome(folder(runs_dir))
+
+    return train_once
+
+
+@pytest.fixture(scope="module")
+def checkpoints(tmp_path_factory):
+    """Run folders left by stopping after some episodes -> (runs_dir, checkpoint)."""
+
+    @functools.cache
+    def stop_after(algorithm, episodes):
+        runs_dir = tmp_path_factory.mktemp("stopped")
+        assert not train(algorithm, options(algorithm, runs_dir), episodes)
+        return runs_dir, torch.load(folder(runs_dir) / "checkpoint.pt", weights_only=True)
+
+    return stop_after
+
+
+# KILLED ANYWHERE
+
+KILLS = {
+    "before learning starts and before the first checkpoint": (TRAINING_STEP, 30, die),
+    "the first checkpoint half written": ("torch.save", 1, die_half_way),
+    "the first checkpoint written, not yet in place": ("os.replace", 1, die),
+    "mid-episode, after an evaluation that the checkpoint lacks": (TRAINING_STEP, 80, die),
+    "the next checkpoint half written": ("torch.save", 1, die_half_way),
+    "the next but one not yet in place": ("os.replace", 2, die),
+    "mid-episode": (TRAINING_STEP, 71, die),
+    "the policy half written": ("torch.save", None, die_half_way_in_policy),
+    "the result not yet in place": ("os.replace", 2, die),
+}
+
+
+@pytest.mark.parametrize("env_id", ENVS)
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_killed_again_and_again_it_ends_as_if_left_alone(algorithm, env_id, alone, tmp_path):
+    words, steps, cut = options(algorithm, tmp_path, env_id), [], False
+    for name, moment in KILLS.items():
+        result = run(algorithm, words, moment)
+        assert result.code == -signal.SIGKILL, (name, result)
+        path = folder(tmp_path)
+        if (path / "checkpoint.pt").exists():
+            checkpoint = torch.load(path / "checkpoint.pt", weights_only=True)
+            steps.append(checkpoint["step"])
+            cut |= (path / "eval.csv").stat().st_size > checkpoint["log"]["csv_size"]
+    assert steps == sorted(steps) and len(set(steps)) > 2, steps
+    assert any(step % 60 for step in steps)  # in mid-rollout, for PPO
+    assert cut  # there were rows of eval.csv newer than the checkpoint
+    result = run(algorithm, words)
+    assert (result.code, result.err) == (0, "")
+    assert_finished(path)
+    assert outcome(path) == alone(algorithm, env_id)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_killed_while_every_step_ends_an_episode_it_logs_each_once(algorithm, tmp_path):
+    """The steps next to a checkpoint are logged too: one cut too many or too few would show."""
+    short = {"noise": ("RandomEarlyTermination(1)",), "rates": ("1",), "checkpoint_frequency": 25}
+    short |= {"total_timesteps": 120, "eval_frequency": 0, "eval_episodes": 1}
+    words = options(algorithm, tmp_path, **short)
+    for _ in range(2):  # the log is flushed with each checkpoint: newer events than the last one's
+        assert run(algorithm, words, ("torch.save", 2, die_half_way)).code == -signal.SIGKILL
+    assert run(algorithm, words).code == 0
+    logged = events(folder(tmp_path))
+    for tag in ("charts/episodic_return", "charts/episodic_length"):
+        assert [step for step, _ in logged[tag]] == list(range(1, 121))
+    assert logged["hyperparameters/text_summary"] == [0]
+    (tmp_path / "alone").mkdir()
+    assert train(algorithm, options(algorithm, tmp_path / "alone", **short))
+    assert outcome(folder(tmp_path / "alone")) == outcome(next(tmp_path.glob("Hopper*")))
+
+
+def test_killed_by_somebody_else_at_random_times_compiled(tmp_path):
+    """Real commands, torch.compile, kill -9 and SIGTERM from outside."""
+    length = {"total_timesteps": 3000, "eval_frequency": 1000, "compile": True}
+    words = options("td3", tmp_path / "killed", **length)
+    (tmp_path / "killed").mkdir()
+    uninterrupted = real("td3", options("td3", tmp_path / "alone", **length))
+    assert uninterrupted.wait(240) == 0, uninterrupted.stderr.read()
+    kills, codes = [signal.SIGKILL, signal.SIGKILL, signal.SIGTERM], []
+    for number in kills:
+        process, delay = real("td3", words), random.uniform(0.2, 1.0)
+        before = None
+        while process.poll() is None:
+            time.sleep(0.02)
+            now = [path.stat().st_mtime_ns for path in tmp_path.glob("killed/*/checkpoint.pt")]
+            before = now if before is None else before
+            if now != before:  # it is training and has written a checkpoint of its own
+                time.sleep(delay)
+                process.send_signal(number)
+                break
+        codes.append(process.wait(60))
+    assert codes == [-9, -9, 143]
+    process = real("td3", words)
+    _, err = process.communicate(timeout=240)
+    assert (process.returncode, err) == (0, "")
+    assert_finished(folder(tmp_path / "killed"))
+    assert outcome(folder(tmp_path / "killed")) == outcome(folder(tmp_path / "alone"))
+
+
+# STOPPED
+
+
+@pytest.mark.parametrize("number, code", [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_signal_ends_the_episode_and_the_run_resumes(algorithm, number, code, alone, tmp_path):
+    words = options(algorithm, tmp_path)
+    result = run(algorithm, words, (TRAINING_STEP, 65, send(number)))
+    assert (result.code, result.err) == (code, "")
+    checkpoint = torch.load(folder(tmp_path) / "checkpoint.pt", weights_only=True)
+    assert 65 <= checkpoint["step"] < 100
+    assert not (folder(tmp_path) / "policy.pt").exists()
+    result = run(algorithm, words, (TRAINING_STEP, 70, send(number)))
+    assert (result.code, result.err) == (code, "")
+    assert run(algorithm, words).code == 0
+    assert_finished(folder(tmp_path))
+    assert outcome(folder(tmp_path)) == alone(algorithm)
+
+
+@pytest.mark.parametrize(
+    "numbers, code",
+    [((signal.SIGTERM, signal.SIGTERM), 143), ((signal.SIGTERM, signal.SIGINT), 130)],
+)
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_second_signal_exits_at_once(algorithm, numbers, code, tmp_path):
+    result = run(algorithm, options(algorithm, tmp_path), (TRAINING_STEP, 30, send(*numbers)))
+    assert (result.code, result.err) == (code, "")
+    assert not (folder(tmp_path) / "checkpoint.pt").exists()
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_signal_stops_a_run_that_has_an_evaluation_due_at_every_episode(algorithm, tmp_path):
+    short = {"eval_frequency": 5, "eval_episodes": 1, "total_timesteps": 120}
+    words = options(algorithm, tmp_path, **short)
+    for _ in range(2):
+        result = run(algorithm, words, (TRAINING_STEP, 20, send(signal.SIGTERM)))
+        assert (result.code, result.err) == (143, "")
+    assert run(algorithm, words, ("torch.save", 1, die_half_way)).code == -signal.SIGKILL
+    assert run(algorithm, words).code == 0
+    assert_finished(folder(tmp_path))
+    (tmp_path / "alone").mkdir()
+    assert train(algorithm, options(algorithm, tmp_path / "alone", **short))
+    assert outcome(folder(tmp_path / "alone")) == outcome(next(tmp_path.glob("Hopper*")))
+
+
+# WHAT A CHECKPOINT HOLDS
+# A field that was not saved, or not loaded, would have kept an old value: here one field at a time
+# of a checkpoint is as it was in an earlier one, and the run must end differently.
+
+NETWORKS = "actor critic actor_optimizer critic_optimizer"
+BUFFER = "observations actions rewards terminated final position size"
+ROLLOUT = "observations noise actions rewards dones discounted_return"
+FIELDS = {
+    "sac": f"{NETWORKS} target temperature alpha_optimizer".split()
+    + [f"buffer.{name}" for name in BUFFER.split()]
+    + ["generators.0", "generators.1", "generators.2"],  # sampling, actions, environment
+    "td3": f"{NETWORKS} target_actor target_critic".split()
+    + [f"buffer.{name}" for name in BUFFER.split()]
+    + ["generators.0", "generators.1", "generators.2"],
+    "ppo": ["agent", "optimizer", "generators.0", "generators.1"]  # minibatches, environment
+    + [f"rollout.{name}" for name in ROLLOUT.split()]
+    + [f"{stats}.{x}" for stats in ("observation_stats", "return_stats") for x in ("mean", "var")]
+    + ["observation_stats.count", "return_stats.count"],
+}
+for fields in FIELDS.values():
+    fields += ["step", "torch", "log.returns", "log.csv_size"]
+    for wrapper in [noise.partition("(")[0] for noise in NOISE[:-1]] + [
+        "RandomNormalNoisyReward_2"
+    ]:
+        fields += [f"{wrapper}.{x}" for x in ("gate", "noise", "opportunities", "times_applied")]
+INERT = {"format", "run", "log.seconds", "RandomMixupObservation.noise"}  # mixup draws no noise
+
+
+def names(checkpoint):
+    """The fields of a checkpoint; a network, an optimizer, a generator is one field."""
+    whole = {name for name in checkpoint if name not in ("buffer", "rollout", "log", "generators")}
+    whole = {name for name in whole if not name.startswith("Random") and "stats" not in name}
+    for name in set(checkpoint) - whole:
+        inner = checkpoint[name]
+        whole |= {f"{name}.{x}" for x in (range(len(inner)) if isinstance(inner, list) else inner)}
+    return whole
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_checkpoint_holds_no_other_fields(algorithm, checkpoints):
+    _, checkpoint = checkpoints(algorithm, 12)
+    assert names(checkpoint) == set(FIELDS[algorithm]) | INERT
+
+
+def ending(algorithm, runs_dir, checkpoint, tmp_path):
+    """Finish a copy of a stopped run from a changed checkpoint; return its outcome."""
+    shutil.copytree(runs_dir, tmp_path / "copy")
+    torch.save(checkpoint, folder(tmp_path / "copy") / "checkpoint.pt")
+    assert train(algorithm, options(algorithm, tmp_path / "copy"))
+    result = outcome(folder(tmp_path / "copy"))
+    del result["events"]
+    return result
+
+
+@pytest.mark.parametrize("episodes", [2, 5, 12])
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_an_unchanged_checkpoint_gives_the_same_run(
+    algorithm, episodes, alone, checkpoints, tmp_path
+):
+    runs_dir, checkpoint = checkpoints(algorithm, episodes)
+    expected = {name: value for name, value in alone(algorithm).items() if name != "events"}
+    assert ending(algorithm, runs_dir, checkpoint, tmp_path) == expected
+
+
+@pytest.mark.parametrize(
+    "algorithm, field", [(name, x) for name in FIELDS for x in FIELDS[name] if x not in INERT]
+)
+def test_every_field_of_a_checkpoint_is_needed(algorithm, field, alone, checkpoints, tmp_path):
+    exploring = (algorithm, field) in (("sac", "generators.1"), ("td3", "generators.1"))
+    runs_dir, checkpoint = checkpoints(algorithm, 5 if exploring else 12)
+    _, earlier = checkpoints(algorithm, 2)
+    checkpoint, outer = dict(checkpoint), checkpoint
+    *path, last = (int(x) if x.isdigit() else x for x in field.split("."))
+    target = checkpoint
+    for name in path:
+        target[name] = outer[name].copy()
+        target, outer, earlier = target[name], outer[name], earlier[name]
+    target[last] = earlier[last]
+    try:
+        ended = ending(algorithm, runs_dir, checkpoint, tmp_path)
+    except (SystemExit, IndexError, KeyError):
+        return  # it did not even run
+    expected = {name: value for name, value in alone(algorithm).items() if name != "events"}
+    assert ended != expected
+
+
+# REFUSED
+
+
+def refused(algorithm, words, capsys):
+    """Run a command that must fail with one line and touch nothing; return the line."""
+    path = folder(words[words.index("--runs-dir") + 1])
+    before = files(path)
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as error:
+        train(algorithm, words)
+    assert error.value.code == 2
+    assert files(path) == before
+    line = capsys.readouterr().err
+    assert line.startswith("error: ") and line.count("\n") == 1, line
+    assert "--overwrite" in line
+    return line
+
+
+@pytest.fixture
+def stopped(algorithm, checkpoints, tmp_path):
+    """A copy of a stopped run -> (options, path of its checkpoint)."""
+    runs_dir, _ = checkpoints(algorithm, 12)
+    shutil.copytree(runs_dir, tmp_path / "runs")
+    path = folder(tmp_path / "runs") / "checkpoint.pt"
+    return options(algorithm, tmp_path / "runs"), path
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_flipped_bit_anywhere_in_the_data_is_found(algorithm, stopped, capsys):
+    words, path = stopped
+    whole = path.read_bytes()
+    with zipfile.ZipFile(path) as archive:
+        members = [member for member in archive.infolist() if member.file_size]
+    for member in members[:: max(1, len(members) // 15)] + members[-3:]:
+        header = whole[member.header_offset :][:30]
+        lengths = int.from_bytes(header[26:28], "little") + int.from_bytes(header[28:], "little")
+        flipped = bytearray(whole)
+        flipped[member.header_offset + 30 + lengths + member.file_size // 2] ^= 1
+        path.write_bytes(flipped)
+        assert "checkpoint.pt" in refused(algorithm, words, capsys), member.filename
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_what_is_no_whole_checkpoint_is_refused(algorithm, stopped, capsys):
+    words, path = stopped
+    whole = path.read_bytes()
+    for part in (whole[:1000], whole[: len(whole) // 2], whole[:-1], whole[:-100], whole[100:]):
+        path.write_bytes(part)
+        assert "checkpoint.pt" in refused(algorithm, words, capsys)
+    for other in (b"", b"PK", b"an essay", bytes(100_000), random.Random(1).randbytes(100_000)):
+        path.write_bytes(other)
+        assert "checkpoint.pt" in refused(algorithm, words, capsys)
+    for value in ({}, [], None, 1, {"format": 1}, torch.zeros(3)):
+        torch.save(value, path)
+        assert "checkpoint.pt" in refused(algorithm, words, capsys)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_checkpoint_of_another_run_is_refused(algorithm, stopped, checkpoints, tmp_path, capsys):
+    words, path = stopped
+    checkpoint = torch.load(path, weights_only=True)
+    torch.save(checkpoint | {"format": 2}, path)
+    assert "2" in refused(algorithm, words, capsys)
+    assert not train(algorithm, options(algorithm, tmp_path / "seed", seed=2), episodes=3)
+    shutil.copy(folder(tmp_path / "seed") / "checkpoint.pt", path)
+    assert path.parent.name[:-1] + "2" in refused(algorithm, words, capsys)
+    for other in set(ALGORITHMS) - {algorithm}:  # even under this run's name
+        _, foreign = checkpoints(other, 12)
+        torch.save(foreign, path)
+        assert f"{other}_continuous_noisy" in refused(algorithm, words, capsys)
+        torch.save(foreign | {"run": path.parent.name}, path)
+        assert "checkpoint.pt" in refused(algorithm, words, capsys)
+
+
+class Intruder:
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_checkpoint_cannot_run_code(algorithm, stopped, tmp_path, capsys):
+    words, path = stopped
+    trace = tmp_path / "trace"
+    checkpoint = torch.load(path, weights_only=True)
+    pickle.loads(pickle.dumps(Intruder(trace)))
+    assert trace.exists()  # it works where it is let in
+    trace.unlink()
+    path.write_bytes(pickle.dumps(Intruder(trace)))
+    refused(algorithm, words, capsys)
+    for zipped in (True, False):
+        torch.save(
+            checkpoint | {"log": Intruder(trace)}, path, _use_new_zipfile_serialization=zipped
+        )
+        refused(algorithm, words, capsys)
+    assert not trace.exists()
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_checkpoint_without_its_eval_csv_is_refused(algorithm, stopped, capsys):
+    words, path = stopped
+    log = path.with_name("eval.csv")
+    log.write_bytes(log.read_bytes()[:-1])
+    assert "eval.csv" in refused(algorithm, words, capsys)
+    log.unlink()
+    assert "eval.csv" in refused(algorithm, words, capsys)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_folder_of_another_configuration_is_refused_until_overwritten(
+    algorithm, stopped, alone, tmp_path, capsys
+):
+    words, path = stopped
+    line = refused(algorithm, [*words, "--gamma", "0.5", "--eval-episodes", "3"], capsys)
+    assert "gamma" in line and "eval_episodes" in line and "total_timesteps" not in line
+    path.write_bytes(b"damaged")
+    refused(algorithm, words, capsys)
+    free = ["--checkpoint-frequency", "90", "--torch-threads", "1"]  # not part of the identity
+    assert train(algorithm, [*words, "--overwrite", *free])
+    assert_finished(path.parent)
+    assert outcome(path.parent) == alone(algorithm)
+    line = refused(algorithm, [*words, "--gamma", "0.5"], capsys)  # finished: likewise
+    assert "gamma" in line
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_second_process_is_refused_while_the_first_one_lives(algorithm, tmp_path):
+    long = {"total_timesteps": 10**9, "eval_frequency": 10**9, "checkpoint_frequency": 1}
+    words = options(algorithm, tmp_path, **long)
+    first = start(algorithm, words)
+    while not list(tmp_path.glob("*/checkpoint.pt")):
+        assert first.is_alive()
+        time.sleep(0.01)
+    for more in ([], ["--overwrite"]):
+        second = run(algorithm, [*words, *more])
+        assert second.code == 2
+        assert second.err.startswith("error: ") and second.err.count("\n") == 1
+        assert str(folder(tmp_path)) in second.err and "in use" in second.err
+    assert first.is_alive()
+    first.kill()
+    assert ended(first).code == -signal.SIGKILL
+    third = run(algorithm, words, (TRAINING_STEP, 10, send(signal.SIGTERM)))
+    assert (third.code, third.err) == (143, "")
+
+
+# FULL DISK
+
+SMALL = 50_000  # bytes: room for events and eval.csv, not for a checkpoint
+FAILURES = {
+    "config.json": ("gymnasium.make", 1, disk_full(0)),
+    "eval.csv": (TRAINING_STEP, 64, disk_full(0)),
+    "checkpoint.pt": (TRAINING_STEP, 1, disk_full(SMALL)),
+    "policy.pt": ("os.fsync", None, disk_full(SMALL, "policy")),
+    "result.json": ("os.replace", None, disk_full(0, "policy.tmp")),
+    "tfevents": ("torch.save", 1, disk_full(0)),
+}
