@@ -164,11 +164,11 @@ def curves_figure(study, noise):
         curves = curves[:, np.isfinite(curves[-1])]
         mean = curves.mean(axis=1) if curves.size else np.full(len(x), np.nan)
         std = curves.std(axis=1, ddof=1) if curves.shape[1] > 1 else 0
-        color = viridis(0.85 * (i - 1) / max(1, len(configs) - 2)) if i else "black"
+        color = viridis(0.7 * (i - 1) / max(1, len(configs) - 2)) if i else "black"
         line, marker = ["-", "--", "-.", ":"][i % 4], ["", "o", "s", "^", "D", "v", "P", "X"][i % 8]
-        marks = {"marker": marker, "markevery": (min(i, every - 1), every), "markersize": 4}
+        marks = {"marker": marker, "markevery": (min(i, every - 1), every), "markersize": 4.5}
         ax.plot(x, mean, line, color=color, linewidth=1.1 if i else 1.8, label=config[1], **marks)
-        ax.fill_between(x, mean - std, mean + std, color=color, alpha=0.12, linewidth=0)
+        ax.fill_between(x, mean - std, mean + std, color=color, alpha=0.07, linewidth=0)
         ax.set_xlabel(f"training steps ({word})")
     add_legend()
     title = f"{study.algorithm}, {noise or 'no noise'}"

@@ -193,6 +193,22 @@ def test_consistent_by_hand(sweep):
     )
 
 
+def test_consistent_is_80_percent_or_more_best_first():
+    shares = {
+        "a": (80, 1),
+        "b": (79.9, 9),
+        "c": (100, 0.5),
+        "d": (0.1, 9),
+        "e": (80, 2),
+        "f": (0, -9),
+    }
+    names = ("noise", "percent_of_environments", "average_improvement_percent")
+    rows = [dict(zip(names, (noise, *v), strict=True)) for noise, v in shares.items()]
+    table = analyze.frame("consistency", [{"algorithm": "SAC"} | row for row in rows])
+    good, bad = analyze.split_consistency(table)
+    assert list(good["noise"]) == ["c", "e", "a"] and list(bad["noise"]) == ["f"]
+
+
 def test_fails_at_every_rate_needs_every_rate(tmp_path):
     for seed, (noise, rate, final) in enumerate(
         [((), (), 10), (SCALE, 0.1, 5), (SCALE, 0.2, 20), (ENDING, 0.1, 5), (ENDING, 0.2, 9)]
@@ -334,6 +350,12 @@ def test_probability_of_improvement_is_rliables():
         p, low, high = analyze.probability_of_improvement(x, y)
         assert p == pytest.approx(probability, rel=1e-12)
         assert 0 <= low < p < high <= 1
+
+
+def test_the_interval_decides_whether_no_improvement_is_excluded():
+    cases = [(X, Z, "no"), (Z, X, "no"), (X + 200, Y, "yes, better"), (X, Y + 200, "yes, worse")]
+    for x, y, verdict in cases:
+        assert analyze.against_baseline(x, y)["excludes_no_improvement"] == verdict
 
 
 def test_a_missing_run_is_not_a_score():
@@ -524,6 +546,7 @@ CORRUPTIONS = {
     "a word": lambda text: text.replace(",1000\n", ",many\n", 1),
     "nan": lambda text: re.sub(r"(?m)^(10000,0,)[^,]*", r"\1nan", text),
     "a missing episode": lambda text: re.sub(r"(?m)^20000,1,.*\n", "", text),
+    "one episode twice": lambda text: text.replace("\n20000,1,", "\n20000,0,"),
     "a missing evaluation at the end": lambda text: re.sub(r"(?m)^50000,.*\n", "", text),
     "an evaluation twice": lambda text: text + "".join(text.splitlines(keepends=True)[-2:]),
     "steps out of order": lambda text: text.replace("\n30000,", "\n10000,"),
@@ -548,6 +571,14 @@ def test_corrupt_evaluations_are_reported_and_left_out(name, tmp_path):
     (study,), _ = analyze.make_studies(runs)
     assert study.final(analyze.BASELINE).ravel().tolist() == [51, 52]
     assert analyze.missing_runs(runs).empty  # it is there, only broken
+
+
+def test_a_run_that_was_cut_short_is_not_finished(tmp_path):
+    folder = write_run(tmp_path, [5, 5, 5])
+    text = (folder / "eval.csv").read_text()
+    (folder / "eval.csv").write_text(re.sub(r"(?m)^30000,.*\n", "", text))
+    (status,), (reason,) = analyze.read_runs(tmp_path)[["status", "reason"]].T.values
+    assert status == "corrupt" and "steps do not ascend to 30000" in reason
 
 
 @pytest.mark.parametrize("name", ["config.json", "result.json"])
@@ -774,9 +805,11 @@ def test_report_sorts_in_a_browser(sweep, tmp_path):
         const read = name => [...table.tBodies[0].rows].map(r => r.cells[column(name)].textContent);
         const click = name => { heads[column(name)].querySelector("button").click();
           return [heads[column(name)].getAttribute("aria-sort"), read(name)]; };
-        return [click("mean"), click("mean"), click("improvement %"), click("noise")];"""
+        return [number("-1,234.5 \u00b1 6"), click("mean"), click("mean"), click("improvement %"),
+          click("noise")];"""
     answer = in_browser(sweep.path / "results/report.html", script, 1280, tmp_path)
-    (_, first), (_, second), (state, improvements), (_, noises) = answer
+    value, (_, first), (_, second), (state, improvements), (_, noises) = answer
+    assert value == -1234.5
     means = [float(text.split(" ")[0]) for text in (*first, *second)]
     values = [-80, -55, -40, -25, 25, 115, 115, 145]
     assert means == [*reversed(values), *values]  # numbers: the highest first

@@ -41,6 +41,7 @@ GRID = ["custom", "--algos", "sac", "--envs", "Pendulum-v1", "--seeds", "1"]
 GRID += ["--noises", SCALE, BOTH, "--noise-rates", "0.5"]
 CHEAP = "--no-compile --learning-starts 1000000000 --buffer-size 1000 --eval-episodes 1"
 CHEAP = ["--", *CHEAP.split(), "--eval-frequency", "1000", "--checkpoint-frequency", "1000"]
+ON_SIGNAL = [*CHEAP[:-1], "1000000000"]  # a checkpoint only when the run is told to stop
 FOREVER = ["--total-timesteps", "1000000000"]
 
 
@@ -275,7 +276,7 @@ def test_a_failing_and_a_killed_run(engine, tmp_path):
 def test_ctrl_c(engine, tmp_path):
     executor, env = engine
     grid = [*GRID, *FOREVER, "--runs-dir", tmp_path]
-    sweep = start(*grid, *executor, *CHEAP, env=env)
+    sweep = start(*grid, *executor, *ON_SIGNAL, env=env)
     wait_for(lambda: sum(map(is_training, folders(*grid))) == 2, what="two runs at a time")
     sweep.send_signal(signal.SIGINT)
     out, err = sweep.communicate(timeout=60)
@@ -288,7 +289,7 @@ def test_ctrl_c_on_a_terminal_and_the_progress_line(tmp_path):
     runs = folders(*grid)
     controller, terminal = pty.openpty()
     sweep = subprocess.Popen(
-        ["setsid", "--ctty", "./benchmark.sh", *map(str, grid), "--jobs", "2", *CHEAP],
+        ["setsid", "--ctty", "./benchmark.sh", *map(str, grid), "--jobs", "2", *ON_SIGNAL],
         **{"stdin": terminal, "stdout": terminal, "stderr": terminal, "env": ENV, "cwd": ROOT},
     )
     os.close(terminal)
@@ -325,7 +326,7 @@ def test_machines_without_a_shared_folder(sshd, tmp_path):
     grid = ["baseline", *GRID[1:7], "--total-timesteps", "40000"]
     machine = ["--executor", "parallel", "--sshlogin", "second", "--remote-dir", there]
     folder = here / folders(*grid)[0]
-    sweep = start(*grid, *machine, *CHEAP, env=sshd, cwd=here)
+    sweep = start(*grid, *machine, *ON_SIGNAL, env=sshd, cwd=here)
     wait_for(lambda: is_training(folder), what="the first evaluation")
     sweep.send_signal(signal.SIGINT)
     _, err = sweep.communicate(timeout=60)
@@ -333,7 +334,7 @@ def test_machines_without_a_shared_folder(sshd, tmp_path):
     assert (folder / "checkpoint.pt").exists(), err
 
     shutil.rmtree(there / "runs")
-    again = run(*grid, *machine, *CHEAP, env=sshd, cwd=here)
+    again = run(*grid, *machine, *ON_SIGNAL, env=sshd, cwd=here)
     assert again.code == 0, again.out + again.err
     assert not attempts(folder)[1][0].startswith("step=1000/"), "not resumed"
     assert json.loads((folder / "result.json").read_text())["total_timesteps"] == 40_000
@@ -342,7 +343,7 @@ def test_machines_without_a_shared_folder(sshd, tmp_path):
 def test_a_lost_connection(sshd, tmp_path):
     grid = ["baseline", *GRID[1:7], *FOREVER, "--runs-dir", tmp_path]
     (folder,) = folders(*grid)
-    sweep = start(*grid, "--executor", "parallel", "--sshlogin", "second", *CHEAP, env=sshd)
+    sweep = start(*grid, "--executor", "parallel", "--sshlogin", "second", *ON_SIGNAL, env=sshd)
     wait_for(lambda: is_training(folder), what="the first evaluation")
     subprocess.run(["pkill", "-KILL", "-f", f"^{sshd['PARALLEL_SSH']} second"], check=True)
     out, _ = sweep.communicate(timeout=60)
@@ -362,7 +363,9 @@ def test_an_unreachable_machine(sshd, tmp_path):
 def test_slurm_requeues_before_the_time_limit(slurm, tmp_path):
     grid = ["baseline", *GRID[1:7], "--total-timesteps", "40000", "--runs-dir", tmp_path]
     (folder,) = folders(*grid)
-    submitted = run(*grid, "--executor", "slurm", "--slurm-args=--comment=hello", *CHEAP, env=slurm)
+    submitted = run(
+        *grid, "--executor", "slurm", "--slurm-args=--comment=hello", *ON_SIGNAL, env=slurm
+    )
     assert submitted.code == 0, submitted.err
     (job,) = re.findall(r"scancel (\d+)$", submitted.err.strip())
     shown = output(["scontrol", "show", "job", job], slurm)

@@ -38,19 +38,20 @@ ROOT = Path(__file__).parent.parent
 ALGORITHMS = ("sac", "td3", "ppo")
 ENVS = ("Hopper-v5", "Pendulum-v1")
 NOISE = (
-    "RandomEarlyTermination(3, 25)",
+    "RandomEarlyTermination(3, 25, truncate=True)",
+    "RandomEarlyTermination(30)",  # so that no episode is long
     "RandomMixupObservation(0.5)",
     "RandomNormalNoisyReward(0.1)",
     "RandomUniformScaleObservation(0.9, 1.1)",
-    "RandomNormalNoisyReward(0.1)",
 )
-RATES = ("1", "0.3", "0.3", "0.3", "0.3")  # 1: episodes of 25 steps at most
+RATES = ("0.5", "1", "0.3", "0.3", "0.3")
+EARLY, EXPLORING, LATE = 2, 5, 10  # ends of an episode: near steps 25, 75 and 150
 TRAINING_STEP = "gymnasium.wrappers.RecordEpisodeStatistics.step"  # the test env has none of these
 
 FORK = multiprocessing.get_context("forkserver")
 FORK.set_forkserver_preload(
-    "pytest tyro tqdm gymnasium.envs.mujoco torch.utils.tensorboard torch.testing "
-    "tensorboard.backend.event_processing.event_accumulator".split()
+    ["pytest", "tyro", "tqdm", "gymnasium.envs.mujoco", "torch.utils.tensorboard"]
+    + ["torch._dynamo", "tensorboard.backend.event_processing.event_accumulator"]
 )
 
 
@@ -92,7 +93,7 @@ def at(target, number, action):
     @functools.wraps(function)
     def patched(*args, **kwargs):
         if next(calls) == number or number is None:
-            action(*args)
+            action(*args, **kwargs)
         return function(*args, **kwargs)
 
     setattr(owner, name, patched)
@@ -116,6 +117,25 @@ def die_half_way_in_policy(value, file):
         die_half_way(value, file)
 
 
+def die_flushing_checkpoint(number):
+    if "checkpoint" in os.readlink(f"/proc/self/fd/{number}"):
+        die()
+
+
+def die_once_in_place(temporary, path):
+    os.rename(temporary, path)
+    die()
+
+
+def die_removing_checkpoint(path, *args, **kwargs):
+    if path.name == "checkpoint.pt":
+        die()
+
+
+def wait(*args):
+    time.sleep(0.05)
+
+
 def send(*numbers):
     return functools.partial(send_all, numbers)
 
@@ -129,9 +149,9 @@ def disk_full(file_size, name=""):
     return functools.partial(limit_files, file_size, name)
 
 
-def limit_files(file_size, name, *args):
+def limit_files(file_size, name, *args, **kwargs):
     """From now on no file grows beyond a size (if this is about the file `name`)."""
-    if name in str(args):
+    if name in f"{args} {kwargs}":
         resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, resource.RLIM_INFINITY))
 
 
@@ -262,13 +282,18 @@ def checkpoints(tmp_path_factory):
 KILLS = {
     "before learning starts and before the first checkpoint": (TRAINING_STEP, 30, die),
     "the first checkpoint half written": ("torch.save", 1, die_half_way),
-    "the first checkpoint written, not yet in place": ("os.replace", 1, die),
+    "the first one written, not on the disk": (
+        "os.fsync",
+        None,
+        die_flushing_checkpoint,
+    ),
+    "the first one on the disk, not in place": ("os.replace", 1, die),
     "mid-episode, after an evaluation that the checkpoint lacks": (TRAINING_STEP, 80, die),
     "the next checkpoint half written": ("torch.save", 1, die_half_way),
-    "the next but one not yet in place": ("os.replace", 2, die),
+    "the next but one not in place": ("os.replace", 2, die),
     "mid-episode": (TRAINING_STEP, 71, die),
     "the policy half written": ("torch.save", None, die_half_way_in_policy),
-    "the result not yet in place": ("os.replace", 2, die),
+    "the result not in place": ("os.replace", 2, die),
 }
 
 
@@ -296,7 +321,8 @@ def test_killed_again_and_again_it_ends_as_if_left_alone(algorithm, env_id, alon
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_killed_while_every_step_ends_an_episode_it_logs_each_once(algorithm, tmp_path):
     """The steps next to a checkpoint are logged too: one cut too many or too few would show."""
-    short = {"noise": ("RandomEarlyTermination(1)",), "rates": ("1",), "checkpoint_frequency": 25}
+    noise = ("RandomEarlyTermination(1)", "RandomNormalNoisyReward(1)")
+    short = {"noise": noise, "rates": ("1",), "checkpoint_frequency": 25}
     short |= {"total_timesteps": 120, "eval_frequency": 0, "eval_episodes": 1}
     words = options(algorithm, tmp_path, **short)
     for _ in range(2):  # the log is flushed with each checkpoint: newer events than the last one's
@@ -309,6 +335,16 @@ def test_killed_while_every_step_ends_an_episode_it_logs_each_once(algorithm, tm
     (tmp_path / "alone").mkdir()
     assert train(algorithm, options(algorithm, tmp_path / "alone", **short))
     assert outcome(folder(tmp_path / "alone")) == outcome(next(tmp_path.glob("Hopper*")))
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_events_are_on_the_disk_before_the_checkpoint_is(algorithm, alone, tmp_path):
+    slow = ("tensorboard.summary.writer.record_writer.RecordWriter.write", None, wait)
+    words = options(algorithm, tmp_path)
+    result = run(algorithm, words, slow, ("os.replace", 2, die_once_in_place))
+    assert result.code == -signal.SIGKILL and (folder(tmp_path) / "checkpoint.pt").exists()
+    assert run(algorithm, words).code == 0
+    assert outcome(folder(tmp_path)) == alone(algorithm)
 
 
 def test_killed_by_somebody_else_at_random_times_compiled(tmp_path):
@@ -403,13 +439,15 @@ FIELDS = {
     + [f"{stats}.{x}" for stats in ("observation_stats", "return_stats") for x in ("mean", "var")]
     + ["observation_stats.count", "return_stats.count"],
 }
+WRAPPERS = [noise.partition("(")[0] for noise in NOISE]
+WRAPPERS[1] += "_2"
+WRAPPER = ("gate", "noise", "opportunities", "times_applied")
 for fields in FIELDS.values():
     fields += ["step", "torch", "log.returns", "log.csv_size"]
-    for wrapper in [noise.partition("(")[0] for noise in NOISE[:-1]] + [
-        "RandomNormalNoisyReward_2"
-    ]:
-        fields += [f"{wrapper}.{x}" for x in ("gate", "noise", "opportunities", "times_applied")]
-INERT = {"format", "run", "log.seconds", "RandomMixupObservation.noise"}  # mixup draws no noise
+    fields += [f"{wrapper}.{name}" for wrapper in WRAPPERS for name in WRAPPER]
+INERT = {"format", "run", "log.seconds"}
+INERT |= {"RandomMixupObservation.noise"}  # mixup draws none
+INERT |= {"RandomEarlyTermination_2.gate", "RandomEarlyTermination_2.noise"}  # always the same
 
 
 def names(checkpoint):
@@ -424,8 +462,8 @@ def names(checkpoint):
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_a_checkpoint_holds_no_other_fields(algorithm, checkpoints):
-    _, checkpoint = checkpoints(algorithm, 12)
-    assert names(checkpoint) == set(FIELDS[algorithm]) | INERT
+    _, checkpoint = checkpoints(algorithm, LATE)
+    assert names(checkpoint) == INERT.union(FIELDS[algorithm])
 
 
 def ending(algorithm, runs_dir, checkpoint, tmp_path):
@@ -438,7 +476,7 @@ def ending(algorithm, runs_dir, checkpoint, tmp_path):
     return result
 
 
-@pytest.mark.parametrize("episodes", [2, 5, 12])
+@pytest.mark.parametrize("episodes", [EARLY, EXPLORING, LATE])
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_an_unchanged_checkpoint_gives_the_same_run(
     algorithm, episodes, alone, checkpoints, tmp_path
@@ -453,8 +491,8 @@ def test_an_unchanged_checkpoint_gives_the_same_run(
 )
 def test_every_field_of_a_checkpoint_is_needed(algorithm, field, alone, checkpoints, tmp_path):
     exploring = (algorithm, field) in (("sac", "generators.1"), ("td3", "generators.1"))
-    runs_dir, checkpoint = checkpoints(algorithm, 5 if exploring else 12)
-    _, earlier = checkpoints(algorithm, 2)
+    runs_dir, checkpoint = checkpoints(algorithm, EXPLORING if exploring else LATE)
+    _, earlier = checkpoints(algorithm, EARLY)
     checkpoint, outer = dict(checkpoint), checkpoint
     *path, last = (int(x) if x.isdigit() else x for x in field.split("."))
     target = checkpoint
@@ -491,7 +529,7 @@ def refused(algorithm, words, capsys):
 @pytest.fixture
 def stopped(algorithm, checkpoints, tmp_path):
     """A copy of a stopped run -> (options, path of its checkpoint)."""
-    runs_dir, _ = checkpoints(algorithm, 12)
+    runs_dir, _ = checkpoints(algorithm, LATE)
     shutil.copytree(runs_dir, tmp_path / "runs")
     path = folder(tmp_path / "runs") / "checkpoint.pt"
     return options(algorithm, tmp_path / "runs"), path
@@ -522,7 +560,7 @@ def test_what_is_no_whole_checkpoint_is_refused(algorithm, stopped, capsys):
     for other in (b"", b"PK", b"an essay", bytes(100_000), random.Random(1).randbytes(100_000)):
         path.write_bytes(other)
         assert "checkpoint.pt" in refused(algorithm, words, capsys)
-    for value in ({}, [], None, 1, {"format": 1}, torch.zeros(3)):
+    for value in ({}, [], None, 1, {"format": 1}):
         torch.save(value, path)
         assert "checkpoint.pt" in refused(algorithm, words, capsys)
 
@@ -537,7 +575,7 @@ def test_a_checkpoint_of_another_run_is_refused(algorithm, stopped, checkpoints,
     shutil.copy(folder(tmp_path / "seed") / "checkpoint.pt", path)
     assert path.parent.name[:-1] + "2" in refused(algorithm, words, capsys)
     for other in set(ALGORITHMS) - {algorithm}:  # even under this run's name
-        _, foreign = checkpoints(other, 12)
+        _, foreign = checkpoints(other, LATE)
         torch.save(foreign, path)
         assert f"{other}_continuous_noisy" in refused(algorithm, words, capsys)
         torch.save(foreign | {"run": path.parent.name}, path)
@@ -619,12 +657,131 @@ def test_a_second_process_is_refused_while_the_first_one_lives(algorithm, tmp_pa
 
 # FULL DISK
 
-SMALL = 50_000  # bytes: room for events and eval.csv, not for a checkpoint
 FAILURES = {
     "config.json": ("gymnasium.make", 1, disk_full(0)),
-    "eval.csv": (TRAINING_STEP, 64, disk_full(0)),
-    "checkpoint.pt": (TRAINING_STEP, 1, disk_full(SMALL)),
-    "policy.pt": ("os.fsync", None, disk_full(SMALL, "policy")),
+    "events": (TRAINING_STEP, 20, disk_full(0)),  # the next thing to log is the end of an episode
+    "eval.csv": ("gymnasium.wrappers.TimeLimit.reset", None, disk_full(0, "1000001")),
+    "checkpoint.pt": (TRAINING_STEP, 1, disk_full(50_000)),  # room for eval.csv and events
+    "policy.pt": ("torch.save", None, disk_full(0, "policy.tmp")),
     "result.json": ("os.replace", None, disk_full(0, "policy.tmp")),
-    "tfevents": ("torch.save", 1, disk_full(0)),
 }
+
+
+@pytest.mark.parametrize("name", FAILURES)
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_file_that_cannot_be_written_is_named_and_the_run_can_go_on(
+    algorithm, name, alone, checkpoints, tmp_path
+):
+    words = options(algorithm, tmp_path)
+    path = None
+    if name in ("checkpoint.pt", "policy.pt", "result.json"):
+        shutil.copytree(checkpoints(algorithm, EXPLORING)[0], tmp_path, dirs_exist_ok=True)
+        path = folder(tmp_path) / "checkpoint.pt"
+        before = path.read_bytes()
+    result = run(algorithm, words, FAILURES[name])
+    assert result.code == 1, result
+    lines = result.err.splitlines()
+    if name == "events":  # TensorBoard's writer, a thread, has its own say
+        lines = [line for line in lines if line.startswith("error: ")]
+    (line,) = lines
+    assert line.startswith("error: cannot write ")
+    assert str(folder(tmp_path)) in line and name in line
+    assert not list(tmp_path.glob("*/*.tmp"))
+    assert not list(tmp_path.glob("*/result.json"))
+    if name == "checkpoint.pt":
+        assert path.read_bytes() == before
+    if path:
+        assert torch.load(path, weights_only=True)["step"]
+    assert run(algorithm, words).code == 0
+    assert_finished(folder(tmp_path))
+    assert outcome(folder(tmp_path)) == alone(algorithm)
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 16 MB."""
+    path = tmp_path / "disk"
+    path.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=16m", "tmpfs", str(path)]
+    if subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("mounting a file system takes root")
+    yield path
+    subprocess.run(["umount", "--lazy", str(path)], check=True)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_full_disk_costs_no_more_than_the_newest_checkpoint(
+    algorithm, alone, checkpoints, small_disk
+):
+    runs_dir = shutil.copytree(checkpoints(algorithm, EXPLORING)[0], small_disk / "runs")
+    words, path = options(algorithm, runs_dir), folder(runs_dir) / "checkpoint.pt"
+    before, free = path.read_bytes(), shutil.disk_usage(small_disk).free
+    (small_disk / "others").write_bytes(bytes(free - len(before) // 2))
+    result = run(algorithm, words)
+    assert result.code == 1, result
+    assert result.err.startswith(f"error: cannot write {path}: ") and result.err.count("\n") == 1
+    assert path.read_bytes() == before
+    assert not list(path.parent.glob("*.tmp"))
+    (small_disk / "others").unlink()
+    assert run(algorithm, words).code == 0
+    assert outcome(path.parent) == alone(algorithm)
+
+
+# FINISHED
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_finished_run_says_so_and_changes_nothing(algorithm, alone, tmp_path):
+    words = options(algorithm, tmp_path)
+    result = run(algorithm, words, ("pathlib.Path.unlink", None, die_removing_checkpoint))
+    assert result.code == -signal.SIGKILL
+    path = folder(tmp_path)
+    assert (path / "checkpoint.pt").exists() and (path / "result.json").exists()
+    for _ in range(2):
+        result = run(algorithm, words)
+        assert (result.code, result.err) == (0, "") and "is finished" in result.out
+        assert_finished(path)
+        assert outcome(path) == alone(algorithm)
+        before = files(path)
+    assert run(algorithm, words).code == 0
+    assert files(path) == before
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_checkpoint_cut_short_by_kill_after_sigterm_leaves_nothing(algorithm, alone, tmp_path):
+    words = options(algorithm, tmp_path, checkpoint_frequency=1000)
+    moments = (TRAINING_STEP, 65, send(signal.SIGTERM)), ("torch.save", 1, die_half_way)
+    assert run(algorithm, words, *moments).code == -signal.SIGKILL
+    assert run(algorithm, words).code == 0
+    assert_finished(folder(tmp_path))
+    assert outcome(folder(tmp_path)) == alone(algorithm)
+
+
+# WHY AT THE END OF AN EPISODE
+
+MUJOCO = ["HalfCheetah-v5", "Hopper-v5", "Humanoid-v5", "Pusher-v5", "Walker2d-v5"]
+
+
+@pytest.mark.parametrize("env_id", [*MUJOCO, "Ant-v5", "Pendulum-v1"])
+def test_between_episodes_an_environment_is_its_random_generator(env_id):
+    used, fresh = gym.make(env_id), gym.make(env_id)
+    for env in (used, fresh):
+        env.reset(seed=1)
+    used.action_space.seed(1)
+    for _ in range(2):
+        over = False
+        while not over:
+            _, _, terminated, truncated, _ = used.step(used.action_space.sample())
+            over = terminated or truncated
+        before = used.unwrapped.np_random.bit_generator.state
+        first, _ = used.reset()
+    fresh.unwrapped.np_random.bit_generator.state = before
+    assert np.array_equal(first, fresh.reset()[0])
+    steps = 0
+    while steps < 300:
+        action = used.action_space.sample()
+        (o1, r1, *end1, _), (o2, r2, *end2, _) = used.step(action), fresh.step(action)
+        assert o1.tobytes() == o2.tobytes() and r1 == r2 and end1 == end2
+        steps += 1
+        if any(end1):
+            assert np.array_equal(used.reset()[0], fresh.reset()[0])

@@ -552,6 +552,37 @@ def test_ppo_starts_from_orthogonal_weights():
 # PARTS
 
 
+@pytest.mark.parametrize("script", [sac, td3])
+def test_the_test_policy_of_sac_and_td3_takes_the_mean_action(script, tmp_path):
+    env, observation = gym.make(ENV), np.array([1.0, -2.0, 0.5])
+    state = script.Actor(env).state_dict()
+    torch.save(state, tmp_path / "policy.pt")
+    [network] = ordinary(state)
+    low, high = torch.tensor(env.action_space.low), torch.tensor(env.action_space.high)
+    squashed = torch.tanh(network(torch.Tensor(observation))[:2]).detach()
+    expected = squashed * (high - low) / 2 + (high + low) / 2
+    actual = script.load_policy(tmp_path, env)(observation)
+    np.testing.assert_allclose(actual, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("bias", [0.1, -9.0])  # inside the action space, and in its corner
+def test_the_test_policy_of_ppo_takes_the_mean_action(bias, tmp_path):
+    env, agent, stats = gym.make(ENV), ppo.Agent(gym.make(ENV)), ppo.Normalizer((3,))
+    samples = np.array([[0.0, 1.0, 2.0], [0.5, -3.0, 2.5], [2.0, 2.0, 1.5]])
+    for sample in samples:
+        stats.update(sample)
+    state = {"agent": agent.state_dict(), "observation_stats": stats.state_dict()}
+    state["agent"]["actor_mean.4.bias"] += bias
+    torch.save(state, tmp_path / "policy.pt")
+    policy = ppo.load_policy(tmp_path, env)
+    _, actor_mean = ordinary(state["agent"], nn.Tanh)
+    for observation in (np.array([1.0, -2.0, 0.5]), np.array([1.0, -2.0, 40.0])):  # 40: clipped
+        normalized = (observation - samples.mean(0)) / samples.std(0)
+        mean = actor_mean(torch.Tensor(normalized.clip(-10, 10))).detach().numpy()
+        expected = mean.clip(env.action_space.low, env.action_space.high)
+        np.testing.assert_allclose(policy(observation), expected, atol=1e-5)
+
+
 def test_gae_of_a_case_computed_by_hand():
     rewards, dones = np.float32([1, 2, 3, 4]), np.float32([0, 1, 0, 0])
     values = torch.tensor([0.5, 1.0, 1.5, 2.0, 2.5])
