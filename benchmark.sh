@@ -81,7 +81,10 @@ slurm_task() { # LINES OFFSET: one task of a job array, requeued if it was stopp
 
 cd "$(dirname "${BASH_SOURCE[0]}")"
 case ${1:-} in # how the executors call this script: run-one and run-logged SWEEP FOLDER COMMAND
-  run-one) run_one "$3" "$4" || exit 1 && exit ;;
+  run-one) # on a machine whose connection may break: the run must outlive its reader
+    trap : TERM INT USR1
+    run_one "$3" "$4" | { trap '' TERM INT USR1 && { cat || cat >/dev/null; }; } || exit 1
+    exit ;;
   run-logged) run_one "$3" "$4" >>"$(log_of "$3")" || exit 1 && exit ;;
   slurm-task) slurm_task "$2" "$3" ;;
   "" | -h | --help) usage && exit ;;

@@ -247,7 +247,7 @@ def test_a_failing_and_a_killed_run(engine, tmp_path):
     fails.write_text("a file where the run's folder should be")
 
     sweep = start(*grid, *executor, *CHEAP, env=env)
-    wait_for(lambda: is_training(killed), what="the first evaluation")
+    wait_for((killed / "checkpoint.pt").exists, what="the first checkpoint")
     os.kill(*processes("--noise", SCALE, tmp_path), signal.SIGKILL)
     out, err = sweep.communicate(timeout=120)
     assert sweep.returncode == 1, err
