@@ -6,9 +6,12 @@ BIN := .venv/bin
 
 demo: $(BIN)/.run
 	./benchmark.sh demo
+	$(BIN)/python analyze.py --runs-dir runs/demo --out runs/demo/results
+	@echo "The curves: .venv/bin/tensorboard --logdir runs/demo"
+	@echo "The tables and figures: runs/demo/results/report.html"
 
 test: $(BIN)/.dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 
 lint: $(BIN)/.dev
 	$(BIN)/ruff check .

@@ -110,6 +110,8 @@ def read_runs(runs_dir):
     """Read all run folders; `status` is finished, unfinished, corrupt or duplicate."""
     rows = []
     for folder in sorted(path for path in Path(runs_dir).iterdir() if path.is_dir()):
+        if "__" not in folder.name and not (folder / "config.json").exists():
+            continue  # the logs of a sweep, say
         row = {"run": folder.name, "status": "corrupt"}
         rows.append(row)
         try:

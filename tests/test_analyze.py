@@ -600,7 +600,8 @@ def test_unfinished_missing_and_duplicate_runs_are_listed(tmp_path, capsys):
     shutil.rmtree(root / f"Pusher-v5__SAC__{SCALE}+0.05__3")
     write_run(root, [-1, -1, -1, -1, 1e6], seed=3, finished=False, **args)
     write_run(root, [-1, -1, -1, -1, 1e6], seed=4, folder="copy", **args)
-    (root / "empty").mkdir()
+    (root / "Pusher-v5__empty").mkdir()
+    (root / "logs").mkdir()  # no run
     (root / "a file").write_text("")
     tables = run(tmp_path)
     missing = tables["missing"].set_index("status")
@@ -608,7 +609,7 @@ def test_unfinished_missing_and_duplicate_runs_are_listed(tmp_path, capsys):
     assert missing.loc["missing", "seed"] == 2 and missing.loc["missing", "noise"] == SCALE
     assert missing.loc["unfinished", "seed"] == 3
     assert "50,000" in missing.loc["unfinished", "reason"]
-    assert missing.loc["corrupt", "run"] == "empty"
+    assert missing.loc["corrupt", "run"] == "Pusher-v5__empty"
     noisy = row(tables["summary_SAC"], environment="Pusher-v5", noise=SCALE, noise_rate="0.05")
     assert noisy["n"] == 2  # seeds 1 and 4
     printed = capsys.readouterr().out
