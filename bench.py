@@ -62,7 +62,7 @@ PHASES = ("act", "env", "store", "sample", "update", "log")
 LABELS = {"ACT": "act", "STEP": "env", "STORE": "store", "LEARN: advantages": "sample"}
 LABELS |= {"LEARN": "update", "TEST": "env"}  # the first that fits
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1", "CUDA_VISIBLE_DEVICES": ""}
-ENVIRONMENT |= {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false", "JAX_PLATFORMS": "cpu"}
+ENVIRONMENT |= {"JAX_PLATFORMS": "cpu"}  # whose threads are as many as the process has cores
 
 
 def fail(message, code=2):
@@ -319,8 +319,8 @@ class Program:
     def run(self, core, last=math.inf, barrier=None):
         """Run up to a step, or to the result -> ({step: (wall, cpu)}, {"memory", "start", ...})."""
         os.sched_setaffinity(0, {core})  # of this thread; the process inherits it
-        marks, tail, result, start = {}, collections.deque(maxlen=3), {}, time.perf_counter()
-        every = stride(self.algo)
+        marks, tail, result, start = {}, collections.deque(maxlen=60), {}, time.perf_counter()
+        every, done = stride(self.algo), False
         first = every if self.algo == "ppo" else LEARNING_STARTS + every
         streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
         with tempfile.TemporaryDirectory() as folder:
@@ -336,22 +336,23 @@ class Program:
                     elif word == "result":
                         result = json.loads(value)
                     else:
-                        tail.append(line)
-                    if result or max(marks, default=0) >= last:
+                        tail += re.findall(r"[^\s─│╭╮╰╯]+", line)  # no boxes
+                    if done := bool(result) or max(marks, default=0) >= last:
                         break
-                else:
-                    fail(f"{self.name} {self.algo} ended early: {' '.join(tail)}", code=1)
                 if barrier:  # go on until the others are measured
-                    barrier.wait()
-            except BaseException:
-                if barrier:
-                    barrier.abort()
-                raise
+                    barrier.wait() if done else barrier.abort()
+            except threading.BrokenBarrierError:
+                raise SystemExit(1) from None  # another one has failed, and said so
             finally:
                 with contextlib.suppress(ProcessLookupError):
                     os.killpg(process.pid, signal.SIGKILL)
                 process.stdout.close()
-                _, process.returncode, usage = os.wait4(process.pid, 0)
+                _, status, usage = os.wait4(process.pid, 0)
+                process.returncode = os.waitstatus_to_exitcode(status)
+        if not done:
+            bad_arguments = process.returncode == 2
+            text = " ".join(tail).removeprefix("error: ")
+            fail(f"{self.name} {self.algo}: {text}", code=2 if bad_arguments else 1)
         result |= {"memory": usage.ru_maxrss / 1024}
         return marks, result | {"start": marks[0][0] - start if 0 in marks else None}
 

@@ -151,11 +151,11 @@ stop_local() { kill -TERM -- "-$group"; } # xargs ends at once, the runs after t
 export PARALLEL_SSH=${PARALLEL_SSH:-ssh -o BatchMode=yes}
 parallel_options=(--will-cite --workdir "${remote_dir:-$PWD}")
 [ -z "$sshlogin" ] || parallel_options+=(--sshlogin "$sshlogin")
-run_parallel() { # TERM comes from here if a machine loses its connection; the runs need time then
+run_parallel() { # --termseq: where a connection is lost, the runs get TERM and are left in peace
   trap '' HUP
   local chatter='^parallel: (SIGHUP|Waiting for|\./benchmark)|will not be transferred'
   local options=(--jobs "${jobs:-100%}" --joblog "+$logs/joblog.tsv")
-  options+=(--termseq "TERM,600000,KILL,25")
+  options+=(--termseq "TERM,600000")
   [ -z "$remote_dir" ] || options+=(--transferfile '{1}' --return '{1}')
   parallel "${parallel_options[@]}" "${options[@]}" --line-buffer --tagstring '{1}' --colsep '\t' \
     ./benchmark.sh run-one "$sweep" '{1}' '{2}' :::: "$list" 2> >(grep -Ev "$chatter" >&2) |

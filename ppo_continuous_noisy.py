@@ -11,6 +11,7 @@ Writes runs/{env_id}__{exp_name}__{noise}__{seed}/: config.json, eval.csv, Tenso
 policy.pt and result.json when done. The same command again resumes from checkpoint.pt.
 """
 
+import contextlib
 import fcntl
 import functools
 import json
@@ -20,6 +21,7 @@ import signal
 import subprocess
 import sys
 import time
+import zipfile
 from dataclasses import asdict, dataclass, replace
 from datetime import timedelta
 from pathlib import Path
@@ -38,7 +40,6 @@ from tqdm import tqdm
 
 from noisy_wrappers import canonical_noises, make_noisy, noise_wrappers, run_name
 
-CHECKPOINT_FORMAT = 1
 TEST_SEED = 1_000_000  # of the first test episode; the same in every run and evaluation
 
 
@@ -121,11 +122,9 @@ def fail(message, code=2):
 def check(args, at_least_0, at_least_1, at_most_1):
     """Return the arguments with their noise in canonical notation, or fail."""
     for name in (at_least_0 + at_least_1 + at_most_1).split():
-        value, low = getattr(args, name), int(name in at_least_1.split())
-        high = 1 if name in at_most_1.split() else sys.float_info.max
-        if not low <= value <= high:
-            text = "in [0, 1]" if high == 1 else f"at least {low}"
-            fail(f"--{name.replace('_', '-')} must be {text}, not {value}")
+        low, high = int(name in at_least_1.split()), 1 if name in at_most_1.split() else 2**63
+        if not low <= (value := getattr(args, name)) <= high:
+            fail(f"--{name.replace('_', '-')} must be from {low} to {high:g}, not {value}")
     if args.cuda and not torch.cuda.is_available():
         fail("--cuda: PyTorch finds no GPU; leave it out to run on the CPU")
     try:
@@ -144,6 +143,8 @@ def make_env(env_id, **kwargs):
     for name, space in (("observation", env.observation_space), ("action", env.action_space)):
         if not isinstance(space, gym.spaces.Box):
             fail(f"--env-id {env_id}: choose one whose {name} space is a Box, not {space}")
+    if len(env.action_space.shape) != 1:
+        fail(f"--env-id {env_id}: actions must be one-dimensional, not {env.action_space}")
     flat = len(env.observation_space.shape) == 1
     return env if flat else gym.wrappers.FlattenObservation(env)
 
@@ -354,6 +355,15 @@ def use_matmul_precision(precision, device):
     return precision
 
 
+@contextlib.contextmanager
+def writing(path):
+    """Turn what the operating system says into one line that names the file."""
+    try:
+        yield
+    except OSError as error:
+        fail(f"cannot write {path}: {error}", code=1)
+
+
 def write_file(path, write):
     """Write a file whole or not at all: a kill or a full disk leaves the previous one."""
     temporary = path.with_suffix(".tmp")
@@ -385,7 +395,7 @@ def open_run(args, algorithm, precision):
         fail(f"{run_dir} is in use by another process")
     except OSError as error:
         fail(f"--runs-dir: {error}")
-    for path in run_dir.glob("[!.]*") if args.overwrite else ():
+    for path in run_dir.glob("[!.]*" if args.overwrite else "*.tmp"):
         path.unlink()
     if (path := run_dir / "config.json").exists():
         old = json.loads(path.read_text())["args"]
@@ -395,7 +405,7 @@ def open_run(args, algorithm, precision):
             fail(f"{run_dir} holds a run with {'; '.join(differ)}; --overwrite replaces it")
         return run_dir, lock
     versions = {module.__name__: module.__version__ for module in (torch, gym, mujoco, np)}
-    git = ["git", "-C", Path(__file__).parent, "rev-parse", "--verify", "HEAD"]
+    git = ["/bin/sh", "-c", 'git -C "$0" rev-parse --verify HEAD', Path(__file__).parent]
     commit = subprocess.run(git, capture_output=True, text=True).stdout.strip() or None
     config = {"algorithm": algorithm, "args": new, "matmul_precision": precision}
     versions["python"] = sys.version.split()[0]
@@ -416,6 +426,8 @@ def load_checkpoint(run_dir, state, generators):
     if not (path := run_dir / "checkpoint.pt").exists():
         return 0
     try:
+        if bad := zipfile.ZipFile(path).testzip():  # torch.load checks no checksums
+            raise ValueError(f"{bad} is damaged")
         checkpoint = torch.load(path, weights_only=True)
         if (checkpoint["format"], checkpoint["run"]) != (1, run_dir.name):
             raise ValueError(f"format {checkpoint['format']} of {checkpoint['run']}")
@@ -439,14 +451,20 @@ class RunLog:
 
     def open(self, step):
         """Start after `step`: what an interrupted run wrote later than its checkpoint is cut."""
-        self.writer = SummaryWriter(str(self.run_dir), purge_step=step and step + 1)
-        if step:
-            os.truncate(self.csv, self.csv_size)
-        else:
-            self.csv.write_text("step,episode,episodic_return,episodic_length\n")
-            config = {name: str(value) for name, value in asdict(self.args).items()}
-            table = "".join(f"|{name}|{value}|\n" for name, value in config.items())
+        for path in () if step else self.run_dir.glob("events.*"):
+            path.unlink()
+        with writing(self.run_dir):
+            self.writer = SummaryWriter(str(self.run_dir), purge_step=step and step + 1)
+        with writing(self.csv):
+            if step:
+                os.truncate(self.csv, self.csv_size)
+            else:
+                self.csv.write_text("step,episode,episodic_return,episodic_length\n")
+        if not step:
+            table = "".join(f"|{name}|{value}|\n" for name, value in vars(self.args).items())
             self.writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + table)
+            config = vars(self.args) | {"noise_rate": max(self.args.noise_rate, default=0.0)}
+            config = {k: v if isinstance(v, int | float) else str(v) for k, v in config.items()}
             for summary in hparams(config, {"eval/episodic_return_mean": 0}):
                 self.writer.file_writer.add_summary(summary)
         total, plain = self.args.total_timesteps, not sys.stdout.isatty()
@@ -456,8 +474,9 @@ class RunLog:
     def scalars(self, step, values):
         """Log {tag: value} and the speed to TensorBoard; show the progress every ten seconds."""
         sps = (step - self.first_step) / (time.time() - self.start)
-        for tag, value in (values | {"charts/SPS": sps}).items():
-            self.writer.add_scalar(tag, value, step)
+        with writing(f"events.* in {self.run_dir}"):
+            for tag, value in (values | {"charts/SPS": sps}).items():
+                self.writer.add_scalar(tag, value, step)
         self.bar.update(step - self.bar.n)
         if self.bar.disable and time.time() - self.printed > 10:
             eta = timedelta(seconds=round((self.args.total_timesteps - step) / sps))
@@ -479,28 +498,32 @@ class RunLog:
         charts = {"charts/episodic_return": episode["r"], "charts/episodic_length": episode["l"]}
         self.scalars(step, charts)
 
-    def evaluation(self, step, results):
+    def evaluation(self, step, results, now):
         """Log the (N, 2) returns and lengths of the test episodes."""
-        try:
-            with open(self.csv, "a") as file:
-                for i, (episodic_return, length) in enumerate(results.tolist()):
-                    file.write(f"{step},{i},{episodic_return},{length:.0f}\n")
-        except OSError as error:
-            fail(f"cannot write {self.csv}: {error}", code=1)
+        if not np.isfinite(results).all():
+            fail(f"step {step}: a test return is not finite", code=1)
+        with writing(self.csv), open(self.csv, "a") as file:
+            for i, (episodic_return, length) in enumerate(results.tolist()):
+                file.write(f"{step},{i},{episodic_return},{length:.0f}\n")
+            file.flush()
+            os.fsync(file.fileno())
         self.mean, length, self.std = *results.mean(0), results[:, 0].std(ddof=len(results) > 1)
         self.text, self.printed = f"eval_return={self.mean:.1f} ", 0  # 0: print it now
         self.bar.set_description_str(self.text)
         values = {"return_mean": self.mean, "return_std": self.std, "length_mean": length}
-        self.scalars(step, {f"eval/episodic_{name}": value for name, value in values.items()})
+        self.scalars(now, {f"eval/episodic_{name}": value for name, value in values.items()})
 
     def state_dict(self):
         """What a checkpoint keeps of the log; flushes its files, to be no older than that."""
-        self.writer.flush()
+        with writing(f"events.* in {self.run_dir}"):
+            self.writer.flush()
         seconds = self.seconds + time.time() - self.start
         return {"returns": self.returns, "seconds": seconds, "csv_size": self.csv.stat().st_size}
 
     def load_state_dict(self, state):
         """Restore a state_dict."""
+        if self.csv.stat().st_size < state["csv_size"]:
+            raise ValueError(f"{self.csv} is shorter than it was")
         vars(self).update(state)
 
     def finish(self, policy):
@@ -528,14 +551,15 @@ def train(args, stop=lambda: False):
         "num_minibatches update_epochs ",
         at_most_1="gamma gae_lambda",
     )
-    if not args.num_minibatches <= args.num_steps <= args.total_timesteps:
-        fail("--num-steps must be at least --num-minibatches and at most --total-timesteps")
+    if not 2 * args.num_minibatches <= args.num_steps <= args.total_timesteps:
+        fail("--num-steps must be at least 2 * --num-minibatches and at most --total-timesteps")
     env = make_noisy(make_env(args.env_id), args.noise, args.noise_rate)
     test_env = make_env(args.env_id)  # never sees noise
     torch.set_num_threads(args.torch_threads)
     device = torch.device("cuda" if args.cuda else "cpu")
     run_dir, lock = open_run(args, "PPO", use_matmul_precision(args.matmul_precision, device))
     if (run_dir / "result.json").exists():
+        (run_dir / "checkpoint.pt").unlink(missing_ok=True)
         print(f"{run_dir} is finished")
         return True
 
@@ -591,6 +615,7 @@ def train(args, stop=lambda: False):
             value = in_numpy(agent.critic)(observation_stats.normalize(observation))
             rollout.rewards[step] += args.gamma * value[0]
 
+        done = global_step == iterations * args.num_steps
         if step == args.num_steps - 1:
             # LEARN: advantages
             rollout.observations[-1] = observation_stats.normalize(observation)
@@ -620,26 +645,22 @@ def train(args, stop=lambda: False):
             act, std = acting()
 
             curves["clipfrac"] = torch.stack(clipfracs).mean()
-            curves["explained_variance"] = 1 - (returns - values).var() / returns.var()
+            curves["explained_variance"] = 1 - (returns - values).var() / returns.var().clamp(1e-8)
             log.losses(global_step, curves)
             log.scalars(global_step, {"charts/learning_rate": optimizer.param_groups[0]["lr"]})
 
-        # TEST: at the end of a rollout, if an evaluation fell due during it
-        rollout_start = global_step - step - 1
-        due = args.eval_frequency and global_step // args.eval_frequency * args.eval_frequency
-        waiting = due > rollout_start
-        done = global_step == iterations * args.num_steps
-        if done or (waiting and step == args.num_steps - 1):
-            policy = make_policy(agent, observation_stats, env)
-            results = evaluate(policy, test_env, args.eval_episodes)
-            log.evaluation(args.total_timesteps if done else due, results)
-            waiting = False
+            # TEST: if an evaluation fell due during the rollout; eval.csv has the step it fell due
+            due = args.eval_frequency and global_step - global_step % args.eval_frequency
+            if done or due > global_step - args.num_steps:
+                policy = make_policy(agent, observation_stats, env)
+                results = evaluate(policy, test_env, args.eval_episodes)
+                log.evaluation(args.total_timesteps if done else due, results, now=global_step)
 
         if terminated or truncated:
             log.episode(global_step, info["episode"])
             stopping = stop()
             late = global_step - saved_step >= args.checkpoint_frequency
-            if not done and not waiting and (stopping or late):
+            if not done and (stopping or late):
                 save_checkpoint(run_dir, global_step, state, generators)
                 if stopping:
                     return False

@@ -11,6 +11,7 @@ Writes runs/{env_id}__{exp_name}__{noise}__{seed}/: config.json, eval.csv, Tenso
 policy.pt and result.json when done. The same command again resumes from checkpoint.pt.
 """
 
+import contextlib
 import fcntl
 import functools
 import json
@@ -20,6 +21,7 @@ import signal
 import subprocess
 import sys
 import time
+import zipfile
 from dataclasses import asdict, dataclass, replace
 from datetime import timedelta
 from pathlib import Path
@@ -113,11 +115,9 @@ def fail(message, code=2):
 def check(args, at_least_0, at_least_1, at_most_1):
     """Return the arguments with their noise in canonical notation, or fail."""
     for name in (at_least_0 + at_least_1 + at_most_1).split():
-        value, low = getattr(args, name), int(name in at_least_1.split())
-        high = 1 if name in at_most_1.split() else sys.float_info.max
-        if not low <= value <= high:
-            text = "in [0, 1]" if high == 1 else f"at least {low}"
-            fail(f"--{name.replace('_', '-')} must be {text}, not {value}")
+        low, high = int(name in at_least_1.split()), 1 if name in at_most_1.split() else 2**63
+        if not low <= (value := getattr(args, name)) <= high:
+            fail(f"--{name.replace('_', '-')} must be from {low} to {high:g}, not {value}")
     if args.cuda and not torch.cuda.is_available():
         fail("--cuda: PyTorch finds no GPU; leave it out to run on the CPU")
     try:
@@ -136,6 +136,8 @@ def make_env(env_id, **kwargs):
     for name, space in (("observation", env.observation_space), ("action", env.action_space)):
         if not isinstance(space, gym.spaces.Box):
             fail(f"--env-id {env_id}: choose one whose {name} space is a Box, not {space}")
+    if len(env.action_space.shape) != 1:
+        fail(f"--env-id {env_id}: actions must be one-dimensional, not {env.action_space}")
     flat = len(env.observation_space.shape) == 1
     return env if flat else gym.wrappers.FlattenObservation(env)
 
@@ -347,6 +349,15 @@ def use_matmul_precision(precision, device):
     return precision
 
 
+@contextlib.contextmanager
+def writing(path):
+    """Turn what the operating system says into one line that names the file."""
+    try:
+        yield
+    except OSError as error:
+        fail(f"cannot write {path}: {error}", code=1)
+
+
 def write_file(path, write):
     """Write a file whole or not at all: a kill or a full disk leaves the previous one."""
     temporary = path.with_suffix(".tmp")
@@ -378,7 +389,7 @@ def open_run(args, algorithm, precision):
         fail(f"{run_dir} is in use by another process")
     except OSError as error:
         fail(f"--runs-dir: {error}")
-    for path in run_dir.glob("[!.]*") if args.overwrite else ():
+    for path in run_dir.glob("[!.]*" if args.overwrite else "*.tmp"):
         path.unlink()
     if (path := run_dir / "config.json").exists():
         old = json.loads(path.read_text())["args"]
@@ -388,7 +399,7 @@ def open_run(args, algorithm, precision):
             fail(f"{run_dir} holds a run with {'; '.join(differ)}; --overwrite replaces it")
         return run_dir, lock
     versions = {module.__name__: module.__version__ for module in (torch, gym, mujoco, np)}
-    git = ["git", "-C", Path(__file__).parent, "rev-parse", "--verify", "HEAD"]
+    git = ["/bin/sh", "-c", 'git -C "$0" rev-parse --verify HEAD', Path(__file__).parent]
     commit = subprocess.run(git, capture_output=True, text=True).stdout.strip() or None
     config = {"algorithm": algorithm, "args": new, "matmul_precision": precision}
     versions["python"] = sys.version.split()[0]
@@ -409,6 +420,8 @@ def load_checkpoint(run_dir, state, generators):
     if not (path := run_dir / "checkpoint.pt").exists():
         return 0
     try:
+        if bad := zipfile.ZipFile(path).testzip():  # torch.load checks no checksums
+            raise ValueError(f"{bad} is damaged")
         checkpoint = torch.load(path, weights_only=True)
         if (checkpoint["format"], checkpoint["run"]) != (1, run_dir.name):
             raise ValueError(f"format {checkpoint['format']} of {checkpoint['run']}")
@@ -432,14 +445,20 @@ class RunLog:
 
     def open(self, step):
         """Start after `step`: what an interrupted run wrote later than its checkpoint is cut."""
-        self.writer = SummaryWriter(str(self.run_dir), purge_step=step and step + 1)
-        if step:
-            os.truncate(self.csv, self.csv_size)
-        else:
-            self.csv.write_text("step,episode,episodic_return,episodic_length\n")
-            config = {name: str(value) for name, value in asdict(self.args).items()}
-            table = "".join(f"|{name}|{value}|\n" for name, value in config.items())
+        for path in () if step else self.run_dir.glob("events.*"):
+            path.unlink()
+        with writing(self.run_dir):
+            self.writer = SummaryWriter(str(self.run_dir), purge_step=step and step + 1)
+        with writing(self.csv):
+            if step:
+                os.truncate(self.csv, self.csv_size)
+            else:
+                self.csv.write_text("step,episode,episodic_return,episodic_length\n")
+        if not step:
+            table = "".join(f"|{name}|{value}|\n" for name, value in vars(self.args).items())
             self.writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + table)
+            config = vars(self.args) | {"noise_rate": max(self.args.noise_rate, default=0.0)}
+            config = {k: v if isinstance(v, int | float) else str(v) for k, v in config.items()}
             for summary in hparams(config, {"eval/episodic_return_mean": 0}):
                 self.writer.file_writer.add_summary(summary)
         total, plain = self.args.total_timesteps, not sys.stdout.isatty()
@@ -449,8 +468,9 @@ class RunLog:
     def scalars(self, step, values):
         """Log {tag: value} and the speed to TensorBoard; show the progress every ten seconds."""
         sps = (step - self.first_step) / (time.time() - self.start)
-        for tag, value in (values | {"charts/SPS": sps}).items():
-            self.writer.add_scalar(tag, value, step)
+        with writing(f"events.* in {self.run_dir}"):
+            for tag, value in (values | {"charts/SPS": sps}).items():
+                self.writer.add_scalar(tag, value, step)
         self.bar.update(step - self.bar.n)
         if self.bar.disable and time.time() - self.printed > 10:
             eta = timedelta(seconds=round((self.args.total_timesteps - step) / sps))
@@ -472,28 +492,32 @@ class RunLog:
         charts = {"charts/episodic_return": episode["r"], "charts/episodic_length": episode["l"]}
         self.scalars(step, charts)
 
-    def evaluation(self, step, results):
+    def evaluation(self, step, results, now):
         """Log the (N, 2) returns and lengths of the test episodes."""
-        try:
-            with open(self.csv, "a") as file:
-                for i, (episodic_return, length) in enumerate(results.tolist()):
-                    file.write(f"{step},{i},{episodic_return},{length:.0f}\n")
-        except OSError as error:
-            fail(f"cannot write {self.csv}: {error}", code=1)
+        if not np.isfinite(results).all():
+            fail(f"step {step}: a test return is not finite", code=1)
+        with writing(self.csv), open(self.csv, "a") as file:
+            for i, (episodic_return, length) in enumerate(results.tolist()):
+                file.write(f"{step},{i},{episodic_return},{length:.0f}\n")
+            file.flush()
+            os.fsync(file.fileno())
         self.mean, length, self.std = *results.mean(0), results[:, 0].std(ddof=len(results) > 1)
         self.text, self.printed = f"eval_return={self.mean:.1f} ", 0  # 0: print it now
         self.bar.set_description_str(self.text)
         values = {"return_mean": self.mean, "return_std": self.std, "length_mean": length}
-        self.scalars(step, {f"eval/episodic_{name}": value for name, value in values.items()})
+        self.scalars(now, {f"eval/episodic_{name}": value for name, value in values.items()})
 
     def state_dict(self):
         """What a checkpoint keeps of the log; flushes its files, to be no older than that."""
-        self.writer.flush()
+        with writing(f"events.* in {self.run_dir}"):
+            self.writer.flush()
         seconds = self.seconds + time.time() - self.start
         return {"returns": self.returns, "seconds": seconds, "csv_size": self.csv.stat().st_size}
 
     def load_state_dict(self, state):
         """Restore a state_dict."""
+        if self.csv.stat().st_size < state["csv_size"]:
+            raise ValueError(f"{self.csv} is shorter than it was")
         vars(self).update(state)
 
     def finish(self, policy):
@@ -529,6 +553,7 @@ def train(args, stop=lambda: False):
     device = torch.device("cuda" if args.cuda else "cpu")
     run_dir, lock = open_run(args, "SAC", use_matmul_precision(args.matmul_precision, device))
     if (run_dir / "result.json").exists():
+        (run_dir / "checkpoint.pt").unlink(missing_ok=True)
         print(f"{run_dir} is finished")
         return True
 
@@ -580,6 +605,7 @@ def train(args, stop=lambda: False):
         buffer.add(observation, action, reward, next_observation, terminated, truncated)
         observation = next_observation
 
+        done = global_step == args.total_timesteps
         if global_step > args.learning_starts:
             # LEARN: critic
             batch = [tensor.to(device) for tensor in buffer.sample(args.batch_size, rng)]
@@ -598,13 +624,13 @@ def train(args, stop=lambda: False):
                 targets, online = list(target.parameters()), list(critic.parameters())
                 torch._foreach_lerp_(targets, online, args.tau)
 
-            if global_step % 100 == 0:
+            if done or global_step % 100 == 0:
                 log.losses(global_step, curves)
 
         # TEST
-        done = global_step == args.total_timesteps
         if done or args.eval_frequency and global_step % args.eval_frequency == 0:
-            log.evaluation(global_step, evaluate(actor.policy, test_env, args.eval_episodes))
+            results = evaluate(actor.policy, test_env, args.eval_episodes)
+            log.evaluation(global_step, results, now=global_step)
 
         if terminated or truncated:
             log.episode(global_step, info["episode"])

@@ -89,7 +89,7 @@ def test_a_program_is_measured_and_its_failure_told(capfd, monkeypatch):
 
     with pytest.raises(SystemExit):
         bench.Program("SBX", "td3", [sys.executable, "-c", "import nothing_like_it"]).run(0)
-    assert "error: SBX td3 ended early" in capfd.readouterr().err
+    assert "error: SBX td3: " in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(

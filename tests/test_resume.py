@@ -21,6 +21,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 import zipfile
 from importlib import import_module
@@ -33,6 +34,7 @@ import pytest
 import torch
 import tyro
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tqdm import tqdm
 
 ROOT = Path(__file__).parent.parent
 ALGORITHMS = ("sac", "td3", "ppo")
@@ -132,6 +134,10 @@ def die_removing_checkpoint(path, *args, **kwargs):
         die()
 
 
+def uninstall_git(*args, **kwargs):
+    os.environ["PATH"] = ""
+
+
 def wait(*args):
     time.sleep(0.05)
 
@@ -158,6 +164,7 @@ def limit_files(file_size, name, *args, **kwargs):
 def child(algorithm, words, stdout, stderr, moments):
     os.dup2(stdout.fileno(), 1)
     os.dup2(stderr.fileno(), 2)
+    tqdm.set_lock(threading.RLock())  # a kill would leave the default one's semaphore behind
     for moment in moments:
         at(*moment)
     sys.argv = [str(ROOT / f"{algorithm}_continuous_noisy.py"), *words]
@@ -745,6 +752,14 @@ def test_a_finished_run_says_so_and_changes_nothing(algorithm, alone, tmp_path):
         before = files(path)
     assert run(algorithm, words).code == 0
     assert files(path) == before
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_run_needs_no_git(algorithm, tmp_path):
+    moments = ("gymnasium.make", 1, uninstall_git), (TRAINING_STEP, 1, send(signal.SIGTERM))
+    result = run(algorithm, options(algorithm, tmp_path), *moments)
+    assert (result.code, result.err) == (143, "")
+    assert json.loads((folder(tmp_path) / "config.json").read_text())["git_commit"] is None
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
