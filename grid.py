@@ -266,8 +266,7 @@ def summary(runs, progresses):
     text = f"{len(runs)} runs: " + ", ".join(f"{n} {state}" for state, n in count.items())
     if count["running"] and speed:
         seconds = sum(
-            remaining(run, p)
-            / next(speed[k] for k in (*(run.kind, run.kind[0]), None) if k in speed)
+            remaining(run, p) / (speed.get(run.kind) or speed.get(run.kind[0]) or speed[None])
             for run, p in zip(runs, progresses, strict=True)
         )
         now = sum(p.sps for p in progresses if p.state == "running")

@@ -634,8 +634,10 @@ def train(args, stop=lambda: False):
 
         if terminated or truncated:
             log.episode(global_step, info["episode"])
+            if done:
+                break
             stopping = stop()
-            if not done and (stopping or global_step - saved_step >= args.checkpoint_frequency):
+            if stopping or global_step - saved_step >= args.checkpoint_frequency:
                 save_checkpoint(run_dir, global_step, state, generators)
                 if stopping:
                     return False

@@ -342,8 +342,10 @@ def test_machines_without_a_shared_folder(sshd, tmp_path):
 
 def test_a_lost_connection(sshd, tmp_path):
     grid = ["baseline", *GRID[1:7], *FOREVER, "--runs-dir", tmp_path]
-    (folder,) = folders(*grid)
-    sweep = start(*grid, "--executor", "parallel", "--sshlogin", "second", *ON_SIGNAL, env=sshd)
+    grid += ["--executor", "parallel", "--sshlogin", "second"]
+    (folder,) = folders(*grid[:-4])
+    talkative = [*ON_SIGNAL, "--eval-frequency", "100"]  # it must not die of its output either
+    sweep = start(*grid, *talkative, env=sshd)
     wait_for(lambda: is_training(folder), what="the first evaluation")
     subprocess.run(["pkill", "-KILL", "-f", f"^{sshd['PARALLEL_SSH']} second"], check=True)
     out, _ = sweep.communicate(timeout=60)

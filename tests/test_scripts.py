@@ -683,6 +683,8 @@ def test_tensorboard_shows_the_curves(algorithm, scalars):
     assert set(values) == losses | rate | set(CHARTS.split())
     rows = np.array(evaluations(run_dir)).reshape(-1, 3, 4)
     steps = rows[:, 0, 0].astype(int).tolist()
+    if algorithm == "PPO":  # eval.csv has the step that an evaluation was due at
+        steps = [math.ceil(step / 12) * 12 for step in steps]
     for tag, expected in (
         ("eval/episodic_return_mean", rows[:, :, 2].mean(1)),
         ("eval/episodic_return_std", rows[:, :, 2].std(1, ddof=1)),
