@@ -11,6 +11,7 @@ import json
 import os
 import pty
 import re
+import select
 import shlex
 import shutil
 import signal
@@ -42,12 +43,26 @@ GRID += ["--noises", SCALE, BOTH, "--noise-rates", "0.5"]
 CHEAP = "--no-compile --learning-starts 1000000000 --buffer-size 1000 --eval-episodes 1"
 CHEAP = ["--", *CHEAP.split(), "--eval-frequency", "1000", "--checkpoint-frequency", "1000"]
 ON_SIGNAL = [*CHEAP[:-1], "1000000000"]  # a checkpoint only when the run is told to stop
+SWEEPS = []  # the sweeps of the current test
 FOREVER = ["--total-timesteps", "1000000000"]
 
 
 def start(*args, env=ENV, cwd=ROOT, **kwargs):
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | kwargs
-    return subprocess.Popen(["./benchmark.sh", *map(str, args)], env=env, cwd=cwd, **streams)
+    SWEEPS.append(
+        subprocess.Popen(["./benchmark.sh", *map(str, args)], env=env, cwd=cwd, **streams)
+    )
+    return SWEEPS[-1]
+
+
+@pytest.fixture(autouse=True)
+def no_sweep_outlives_its_test():
+    yield
+    for sweep in SWEEPS:
+        if sweep.poll() is None:
+            sweep.terminate()
+            sweep.wait(timeout=60)
+    SWEEPS.clear()
 
 
 def run(*args, **kwargs):
@@ -293,13 +308,20 @@ def test_ctrl_c_on_a_terminal_and_the_progress_line(tmp_path):
         **{"stdin": terminal, "stdout": terminal, "stderr": terminal, "env": ENV, "cwd": ROOT},
     )
     os.close(terminal)
+    SWEEPS.append(sweep)
     shown = ""
-    while not (sum(map(is_training, runs)) == 2 and "2 running" in shown):
-        shown += os.read(controller, 1000).decode()
+
+    def progress_line():
+        nonlocal shown
+        if select.select([controller], [], [], 0)[0]:
+            shown += os.read(controller, 10_000).decode()
+        return sum(map(is_training, runs)) == 2 and "2 running" in shown
+
+    wait_for(progress_line, what="the progress line")
     os.write(controller, b"\x03")
     with pytest.raises(OSError):  # how a terminal ends
         while True:
-            shown += os.read(controller, 1000).decode()
+            shown += os.read(controller, 10_000).decode()
     assert sweep.wait() == 130
     assert "\r3 runs: 0 done, 2 running, 0 failed, 1 to do" in shown
     check_stopped(runs, shown)
