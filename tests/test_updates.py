@@ -363,6 +363,8 @@ def plain_ppo_training(plain, env, args):
             rewards[step] = reward
             if next_done:
                 ends.add("terminated" if terminated else "truncated")
+            # nothing is observed after the last step: the policy's statistics are the tested ones
+            if next_done and (iteration < iterations or step < T - 1):
                 next_obs, _ = env.reset()
 
         with torch.no_grad():
