@@ -50,7 +50,7 @@ interpreter is $PYTHON, else .venv/bin/python, else python. Exit status: 0 every
 END
 }
 
-fail() { echo "error: $*" >&2 && exit 2; }
+fail() { echo "error: $*" >&2 || true; exit 2; }
 
 log_of() { echo "${1%/*}/logs/${1##*/}.log"; }
 
@@ -87,7 +87,7 @@ case ${1:-} in # how the executors call this script: run-one and run-logged SWEE
     exit ;;
   run-logged) run_one "$3" "$4" >>"$(log_of "$3")" || exit 1 && exit ;;
   slurm-task) slurm_task "$2" "$3" ;;
-  "" | -h | --help) usage && exit ;;
+  "" | -h | --help) usage || true; exit ;;
 esac
 
 view=list executor=local jobs='' sshlogin='' remote_dir='' slurm_args='' wait='' dry_run='' grid=()
@@ -103,7 +103,7 @@ while [ $# -gt 0 ]; do
       shift 2 ;;
     --dry-run) dry_run=1 && shift ;;
     --wait) wait=1 && shift ;;
-    -h | --help) usage && exit ;;
+    -h | --help) usage || true; exit ;;
     --) grid+=("$@") && break ;;
     *) grid+=("$1") && shift ;;
   esac
@@ -125,7 +125,8 @@ lines=$("$PYTHON" grid.py list "${grid[@]}") || exit $?
 todo=$(awk -F'\t' -v OFS='\t' '$2 == "todo" {print $1, $3}' <<<"$lines")
 count=$(grep -c . <<<"$todo" || true)
 echo "$(wc -l <<<"$lines") runs, $count to do" >&2
-if [ -n "$dry_run" ]; then cut -f3 <<<"$lines" && exit; fi
+# Whatever becomes of the reader of a pipe ("| head"), nothing is started
+if [ -n "$dry_run" ]; then cut -f3 <<<"$lines" || true; exit; fi
 
 if [ "$executor" = parallel ]; then
   parallel --version 2>/dev/null | grep -q "GNU parallel" ||

@@ -429,6 +429,16 @@ def test_paper_grid():
         assert {line.text for line in lines if line.seed == seed} <= set(first)
 
 
+@pytest.mark.parametrize("arguments", ["paper --dry-run --runs-dir {}", "--help"])
+def test_a_reader_that_leaves_starts_no_sweep(arguments, tmp_path):
+    command = f"set -o pipefail; ./benchmark.sh {arguments.format(tmp_path / 'runs')} | head -n 1"
+    process = subprocess.run(
+        ["bash", "-c", command], cwd=ROOT, env=ENV, capture_output=True, text=True, timeout=60
+    )
+    assert process.returncode == 0 and process.stdout.count("\n") == 1
+    assert not (tmp_path / "runs").exists()
+
+
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_scripts_accept_every_line(algorithm):
     script = import_module(f"{algorithm}_continuous_noisy")
