@@ -17,6 +17,7 @@ import argparse
 import csv
 import functools
 import itertools
+import json
 import os
 import re
 import shlex
@@ -224,10 +225,20 @@ def check_extra(runs):
             fail(f"{script} does not accept the arguments after --")
 
 
+def is_done(run):
+    """Tell whether a run is finished; exit if its folder holds a run of another length."""
+    path = run.folder / "result.json"
+    if not path.exists():
+        return False
+    if (steps := json.loads(path.read_text())["total_timesteps"]) != run.total_timesteps:
+        fail(f"{run.folder} holds a finished run of {steps} steps; choose another --runs-dir")
+    return True
+
+
 def look(run, now, fresh):
     """Return a run's progress, from its folder and a log that is `fresh` for so many seconds."""
     log, age, lines = run.folder.parent / "logs" / f"{run.folder.name}.log", float("inf"), []
-    done = (run.folder / "result.json").exists()
+    done = is_done(run)
     if log.exists():
         with open(log, "rb") as file:
             age = now - os.fstat(file.fileno()).st_mtime
@@ -288,11 +299,11 @@ def main(argv):
     check(args)
     runs = grid(args)
     if args.view == "list":
-        done = [(run.folder / "result.json").exists() for run in runs]
+        done = [is_done(run) for run in runs]
         if args.extra and not all(done):
             check_extra(runs)
-        for run, is_done in zip(runs, done, strict=True):
-            print(run.folder, "done" if is_done else "todo", shlex.join(run.command), sep="\t")
+        for run, over in zip(runs, done, strict=True):
+            print(run.folder, "done" if over else "todo", shlex.join(run.command), sep="\t")
         return 0
     parent = os.getppid()
     while args.view == "watch":

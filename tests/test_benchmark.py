@@ -496,7 +496,7 @@ def test_status_arithmetic(tmp_path):
     done, running, slow, failed, stopped, lost = folders(*grid)
     (tmp_path / "logs").mkdir()
     done.mkdir()
-    (done / "result.json").write_text("{}")
+    (done / "result.json").write_text('{"total_timesteps": 1000}')
     for folder, text in {
         done: "step=1000/1000 sps=200 eval_return=1.0\n# now host: exit=0\n",
         running: "step=100/1000 sps=100 eta=0:00:09\nstep=200/1000 sps=100 eta=0:00:08\n",
@@ -519,6 +519,17 @@ def test_status_arithmetic(tmp_path):
         ["0:01:20", "10/s", "200", str(slow)],
         ["0:00:08", "100/s", "200", str(running)],
     ]
+
+
+def test_a_finished_run_of_another_length_is_not_taken_for_done(tmp_path):
+    grid = ["baseline", "--algos", "ppo", "--envs", "Hopper-v5", "--seeds", "1"]
+    grid += ["--total-timesteps", "1000", "--runs-dir", tmp_path]
+    [folder] = folders(*grid)
+    folder.mkdir()
+    (folder / "result.json").write_text('{"total_timesteps": 20}')
+    result = run(*grid)
+    assert result.code == 2 and "holds a finished run of 20 steps" in result.err
+    assert not (tmp_path / "logs").exists()
 
 
 @pytest.mark.parametrize(
