@@ -36,7 +36,7 @@ Executor options
 
 Examples
   ./benchmark.sh demo
-  ./benchmark.sh best --envs Hopper-v5 --seeds 1 --total-timesteps 200000
+  ./benchmark.sh best --envs Hopper-v5 --seeds 1 --total-timesteps 200000 --runs-dir runs/short
   ./benchmark.sh custom --algos td3 --noises "RandomUniformScaleReward(0.5, 1.5)" --noise-rates 0.05
   ./benchmark.sh paper --executor parallel --sshlogin hostA,hostB
   ./benchmark.sh paper --executor slurm --slurm-args "--time=24:00:00 --mem-per-cpu=4G"
