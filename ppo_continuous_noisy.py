@@ -316,18 +316,13 @@ def updater(gradient_function, optimizer, compile):
 
     def update(*args):
         gradient, curves = choose()(*args)
-        descend(optimizer, gradient)
+        parameters = optimizer.param_groups[0]["params"]
+        for parameter, value in zip(parameters, gradient.values(), strict=True):
+            parameter.grad = value
+        optimizer.step()
         return curves
 
     return update
-
-
-def descend(optimizer, gradient):
-    """Take one optimizer step; the gradient is in the order of the optimizer's parameters."""
-    parameters = optimizer.param_groups[0]["params"]
-    for parameter, value in zip(parameters, gradient.values(), strict=True):
-        parameter.grad = value
-    optimizer.step()
 
 
 # THE RUN: tests, speed, files; word for word the same in the three scripts.

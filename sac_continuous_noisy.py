@@ -32,7 +32,6 @@ import mujoco
 import numpy as np
 import torch
 import torch.nn as nn
-import torch.nn.functional as F
 import tyro
 from torch.func import functional_call, grad_and_value
 from torch.utils.tensorboard import SummaryWriter
@@ -142,10 +141,33 @@ def make_env(env_id, **kwargs):
     return env if flat else gym.wrappers.FlattenObservation(env)
 
 
-def mlp(inputs, outputs):
+def mlp(linear, inputs, outputs):
     """Two hidden layers of 256 rectified linear units."""
-    hidden = [nn.Linear(inputs, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU()]
-    return nn.Sequential(*hidden, nn.Linear(256, outputs))
+    hidden = [linear(inputs, 256), nn.ReLU(), linear(256, 256), nn.ReLU()]
+    return nn.Sequential(*hidden, linear(256, outputs))
+
+
+def in_numpy(network, observation):
+    """Evaluate an mlp for one observation; acting takes a fifth of the time that PyTorch takes."""
+    w1, b1, w2, b2, w3, b3 = (parameter.cpu().numpy() for parameter in network.parameters())
+    hidden = np.maximum(w1 @ np.asarray(observation, np.float32) + b1, 0)
+    return w3 @ np.maximum(w2 @ hidden + b2, 0) + b3
+
+
+class TwinLinear(nn.Module):
+    """Two nn.Linear as one batched product, -> (2, B, outputs)."""
+
+    def __init__(self, inputs, outputs):
+        super().__init__()
+        q1, q2 = nn.Linear(inputs, outputs), nn.Linear(inputs, outputs)
+        self.weight = nn.Parameter(torch.stack([q1.weight.T, q2.weight.T]))
+        self.bias = nn.Parameter(torch.stack([q1.bias, q2.bias]).unsqueeze(1))
+
+    def forward(self, inputs):
+        """Apply both to the same inputs (B, inputs), or each to its own (2, B, inputs)."""
+        if self.weight.shape[2] == 1:  # a sum is faster than a product with one column
+            return (inputs * self.weight.mT).sum(2, keepdim=True) + self.bias
+        return inputs @ self.weight + self.bias
 
 
 class Critic(nn.Module):
@@ -154,12 +176,11 @@ class Critic(nn.Module):
     def __init__(self, env):
         super().__init__()
         inputs = env.observation_space.shape[0] + env.action_space.shape[0]
-        self.q1, self.q2 = mlp(inputs, 1), mlp(inputs, 1)
+        self.network = mlp(TwinLinear, inputs, 1)
 
     def forward(self, observations, actions):
-        """Return Q1 (B,) and Q2 (B,)."""
-        inputs = torch.cat([observations, actions], 1)
-        return self.q1(inputs).squeeze(1), self.q2(inputs).squeeze(1)
+        """Return Q1 and Q2, the rows of (2, B)."""
+        return self.network(torch.cat([observations, actions], 1)).squeeze(2)
 
 
 class Actor(nn.Module):
@@ -168,27 +189,27 @@ class Actor(nn.Module):
     def __init__(self, env):
         super().__init__()
         low, high = torch.tensor(env.action_space.low), torch.tensor(env.action_space.high)
-        self.network = mlp(env.observation_space.shape[0], 2 * len(low))
+        self.network = mlp(nn.Linear, env.observation_space.shape[0], 2 * len(low))
         self.register_buffer("action_scale", (high - low) / 2)
         self.register_buffer("action_bias", (high + low) / 2)
 
-    def forward(self, observations, noise, with_log_prob=True):
-        """Return actions (B, A) and their log-probabilities (B,); noise 0 gives the mean action."""
+    def forward(self, observations, noise):
+        """Return actions (B, A) and their log-probabilities (B,)."""
         mean, log_std = self.network(observations).chunk(2, dim=-1)
         # a smooth clamp, from SpinUp / Denis Yarats
         log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (torch.tanh(log_std) + 1)
         squashed = torch.tanh(mean + log_std.exp() * noise)
         actions = squashed * self.action_scale + self.action_bias
-        if not with_log_prob:
-            return actions
         log_prob = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
         log_prob = log_prob - torch.log(self.action_scale * (1 - squashed.square()) + 1e-6)
         return actions, log_prob.sum(1)
 
     def policy(self, observation, noise=0.0):
-        """Return the action for one observation, NumPy to NumPy."""
-        observation = torch.as_tensor(observation, dtype=torch.float32).to(self.action_scale.device)
-        return self(observation, noise, with_log_prob=False).cpu().numpy()
+        """Return the action for one observation, NumPy to NumPy; noise 0 gives the mean action."""
+        scale, bias = (buffer.cpu().numpy() for buffer in self.buffers())
+        mean, log_std = np.split(in_numpy(self.network, observation), 2)
+        log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (np.tanh(log_std) + 1)
+        return np.tanh(mean + np.exp(log_std) * noise) * scale + bias
 
 
 def load_policy(run_dir, env):
@@ -227,8 +248,8 @@ class ReplayBuffer:
         """Draw (s, a, r, s', terminated) uniformly: float32 tensors with batch_size rows."""
         oldest = self.position - self.size
         i = (oldest + rng.integers(self.size, size=batch_size)) % self.rows
-        arrays = (self.observations[i], self.actions[i], self.rewards[i])
-        arrays += (self.observations[(i + 1) % self.rows], self.terminated[i])
+        arrays = [getattr(self, name).take(i, axis=0) for name in self.ARRAYS]
+        arrays.insert(3, self.observations.take((i + 1) % self.rows, axis=0))
         batch = [torch.from_numpy(array) for array in arrays]
         for b, row in enumerate(i.tolist()):
             if row in self.final:
@@ -256,13 +277,13 @@ def critic_gradient(actor, critic, target, log_alpha, batch, noise, gamma):
     """Mean squared error of Q1 and Q2 to y = r + gamma (min(Q1', Q2') - alpha log pi)(s', a')."""
     observations, actions, rewards, next_observations, terminated = batch
     next_actions, next_log_prob = actor(next_observations, noise)
-    next_q = torch.minimum(*target(next_observations, next_actions))
+    next_q = target(next_observations, next_actions).amin(0)
     y = rewards + (1 - terminated) * gamma * (next_q - log_alpha.exp() * next_log_prob)
 
     def loss(params):
-        q1, q2 = functional_call(critic, params, (observations, actions))
-        qf1_loss, qf2_loss = F.mse_loss(q1, y), F.mse_loss(q2, y)
-        curves = {"qf1_values": q1.mean(), "qf2_values": q2.mean()}
+        q = functional_call(critic, params, (observations, actions))
+        (qf1_values, qf2_values), (qf1_loss, qf2_loss) = q.mean(1), (q - y).square().mean(1)
+        curves = {"qf1_values": qf1_values, "qf2_values": qf2_values}
         curves |= {"qf1_loss": qf1_loss, "qf2_loss": qf2_loss, "qf_loss": (qf1_loss + qf2_loss) / 2}
         return qf1_loss + qf2_loss, curves
 
@@ -275,7 +296,7 @@ def actor_gradient(actor, critic, log_alpha, observations, noise):
 
     def loss(params):
         actions, log_prob = functional_call(actor, params, (observations, noise))
-        return (log_alpha.exp() * log_prob - torch.minimum(*critic(observations, actions))).mean()
+        return (log_alpha.exp() * log_prob - critic(observations, actions).amin(0)).mean()
 
     gradient, actor_loss = grad_and_value(loss)(dict(actor.named_parameters()))
     return gradient, {"actor_loss": actor_loss}
@@ -310,18 +331,13 @@ def updater(gradient_function, optimizer, compile):
 
     def update(*args):
         gradient, curves = choose()(*args)
-        descend(optimizer, gradient)
+        parameters = optimizer.param_groups[0]["params"]
+        for parameter, value in zip(parameters, gradient.values(), strict=True):
+            parameter.grad = value
+        optimizer.step()
         return curves
 
     return update
-
-
-def descend(optimizer, gradient):
-    """Take one optimizer step; the gradient is in the order of the optimizer's parameters."""
-    parameters = optimizer.param_groups[0]["params"]
-    for parameter, value in zip(parameters, gradient.values(), strict=True):
-        parameter.grad = value
-    optimizer.step()
 
 
 # THE RUN: tests, speed, files; word for word the same in the three scripts.
@@ -568,6 +584,7 @@ def train(args, stop=lambda: False):
     target.load_state_dict(critic.state_dict())
     for network in (actor, critic, target, temperature):
         network.requires_grad_(False).to(device)
+    online, targets = list(critic.parameters()), list(target.parameters())
     log_alpha, target_entropy = temperature["log_alpha"], -float(env.action_space.shape[0])
     critic_optimizer = torch.optim.Adam(critic.parameters(), lr=args.q_lr, fused=True)
     actor_optimizer = torch.optim.Adam(actor.parameters(), lr=args.policy_lr, fused=True)
@@ -596,7 +613,7 @@ def train(args, stop=lambda: False):
         if global_step <= args.learning_starts:
             action = env.action_space.sample()
         else:
-            action = actor.policy(observation, torch.randn(env.action_space.shape).to(device))
+            action = actor.policy(observation, torch.randn(env.action_space.shape).numpy())
 
         # STEP
         next_observation, reward, terminated, truncated, info = env.step(action)
@@ -621,7 +638,6 @@ def train(args, stop=lambda: False):
 
             # LEARN: target
             if global_step % args.target_network_frequency == 0:
-                targets, online = list(target.parameters()), list(critic.parameters())
                 torch._foreach_lerp_(targets, online, args.tau)
 
             if done or global_step % 100 == 0:

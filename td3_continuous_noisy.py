@@ -32,7 +32,6 @@ import mujoco
 import numpy as np
 import torch
 import torch.nn as nn
-import torch.nn.functional as F
 import tyro
 from torch.func import functional_call, grad_and_value
 from torch.utils.tensorboard import SummaryWriter
@@ -139,10 +138,33 @@ def make_env(env_id, **kwargs):
     return env if flat else gym.wrappers.FlattenObservation(env)
 
 
-def mlp(inputs, outputs):
+def mlp(linear, inputs, outputs):
     """Two hidden layers of 256 rectified linear units."""
-    hidden = [nn.Linear(inputs, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU()]
-    return nn.Sequential(*hidden, nn.Linear(256, outputs))
+    hidden = [linear(inputs, 256), nn.ReLU(), linear(256, 256), nn.ReLU()]
+    return nn.Sequential(*hidden, linear(256, outputs))
+
+
+def in_numpy(network, observation):
+    """Evaluate an mlp for one observation; acting takes a fifth of the time that PyTorch takes."""
+    w1, b1, w2, b2, w3, b3 = (parameter.cpu().numpy() for parameter in network.parameters())
+    hidden = np.maximum(w1 @ np.asarray(observation, np.float32) + b1, 0)
+    return w3 @ np.maximum(w2 @ hidden + b2, 0) + b3
+
+
+class TwinLinear(nn.Module):
+    """Two nn.Linear as one batched product, -> (2, B, outputs)."""
+
+    def __init__(self, inputs, outputs):
+        super().__init__()
+        q1, q2 = nn.Linear(inputs, outputs), nn.Linear(inputs, outputs)
+        self.weight = nn.Parameter(torch.stack([q1.weight.T, q2.weight.T]))
+        self.bias = nn.Parameter(torch.stack([q1.bias, q2.bias]).unsqueeze(1))
+
+    def forward(self, inputs):
+        """Apply both to the same inputs (B, inputs), or each to its own (2, B, inputs)."""
+        if self.weight.shape[2] == 1:  # a sum is faster than a product with one column
+            return (inputs * self.weight.mT).sum(2, keepdim=True) + self.bias
+        return inputs @ self.weight + self.bias
 
 
 class Critic(nn.Module):
@@ -151,12 +173,11 @@ class Critic(nn.Module):
     def __init__(self, env):
         super().__init__()
         inputs = env.observation_space.shape[0] + env.action_space.shape[0]
-        self.q1, self.q2 = mlp(inputs, 1), mlp(inputs, 1)
+        self.network = mlp(TwinLinear, inputs, 1)
 
     def forward(self, observations, actions):
-        """Return Q1 (B,) and Q2 (B,)."""
-        inputs = torch.cat([observations, actions], 1)
-        return self.q1(inputs).squeeze(1), self.q2(inputs).squeeze(1)
+        """Return Q1 and Q2, the rows of (2, B)."""
+        return self.network(torch.cat([observations, actions], 1)).squeeze(2)
 
 
 class Actor(nn.Module):
@@ -165,7 +186,7 @@ class Actor(nn.Module):
     def __init__(self, env):
         super().__init__()
         low, high = torch.tensor(env.action_space.low), torch.tensor(env.action_space.high)
-        self.network = mlp(env.observation_space.shape[0], len(low))
+        self.network = mlp(nn.Linear, env.observation_space.shape[0], len(low))
         self.register_buffer("low", low)
         self.register_buffer("high", high)
         self.register_buffer("action_scale", (high - low) / 2)
@@ -179,8 +200,9 @@ class Actor(nn.Module):
 
     def policy(self, observation, noise=0.0):
         """Return the action for one observation, NumPy to NumPy."""
-        observation = torch.as_tensor(observation, dtype=torch.float32).to(self.action_scale.device)
-        return self(observation, noise).cpu().numpy()
+        low, high, scale, bias = (buffer.cpu().numpy() for buffer in self.buffers())
+        action = np.tanh(in_numpy(self.network, observation)) + noise
+        return np.clip(action * scale + bias, low, high)
 
 
 def load_policy(run_dir, env):
@@ -219,8 +241,8 @@ class ReplayBuffer:
         """Draw (s, a, r, s', terminated) uniformly: float32 tensors with batch_size rows."""
         oldest = self.position - self.size
         i = (oldest + rng.integers(self.size, size=batch_size)) % self.rows
-        arrays = (self.observations[i], self.actions[i], self.rewards[i])
-        arrays += (self.observations[(i + 1) % self.rows], self.terminated[i])
+        arrays = [getattr(self, name).take(i, axis=0) for name in self.ARRAYS]
+        arrays.insert(3, self.observations.take((i + 1) % self.rows, axis=0))
         batch = [torch.from_numpy(array) for array in arrays]
         for b, row in enumerate(i.tolist()):
             if row in self.final:
@@ -248,13 +270,13 @@ def critic_gradient(critic, target_actor, target_critic, batch, noise, gamma):
     """Mean squared error of Q1 and Q2 to y = r + gamma min(Q1', Q2')(s', pi'(s') + noise)."""
     observations, actions, rewards, next_observations, terminated = batch
     next_actions = target_actor(next_observations, noise)
-    next_q = torch.minimum(*target_critic(next_observations, next_actions))
+    next_q = target_critic(next_observations, next_actions).amin(0)
     y = rewards + (1 - terminated) * gamma * next_q
 
     def loss(params):
-        q1, q2 = functional_call(critic, params, (observations, actions))
-        qf1_loss, qf2_loss = F.mse_loss(q1, y), F.mse_loss(q2, y)
-        curves = {"qf1_values": q1.mean(), "qf2_values": q2.mean()}
+        q = functional_call(critic, params, (observations, actions))
+        (qf1_values, qf2_values), (qf1_loss, qf2_loss) = q.mean(1), (q - y).square().mean(1)
+        curves = {"qf1_values": qf1_values, "qf2_values": qf2_values}
         curves |= {"qf1_loss": qf1_loss, "qf2_loss": qf2_loss, "qf_loss": (qf1_loss + qf2_loss) / 2}
         return qf1_loss + qf2_loss, curves
 
@@ -264,10 +286,11 @@ def critic_gradient(critic, target_actor, target_critic, batch, noise, gamma):
 
 def actor_gradient(actor, critic, observations):
     """The mean of -Q1(s, pi(s)), with a frozen critic."""
+    q1 = {name: twin[:1] for name, twin in critic.named_parameters()}
 
     def loss(params):
         actions = functional_call(actor, params, (observations,))
-        return -critic.q1(torch.cat([observations, actions], 1)).mean()
+        return -functional_call(critic, q1, (observations, actions)).mean()
 
     gradient, actor_loss = grad_and_value(loss)(dict(actor.named_parameters()))
     return gradient, {"actor_loss": actor_loss}
@@ -291,18 +314,13 @@ def updater(gradient_function, optimizer, compile):
 
     def update(*args):
         gradient, curves = choose()(*args)
-        descend(optimizer, gradient)
+        parameters = optimizer.param_groups[0]["params"]
+        for parameter, value in zip(parameters, gradient.values(), strict=True):
+            parameter.grad = value
+        optimizer.step()
         return curves
 
     return update
-
-
-def descend(optimizer, gradient):
-    """Take one optimizer step; the gradient is in the order of the optimizer's parameters."""
-    parameters = optimizer.param_groups[0]["params"]
-    for parameter, value in zip(parameters, gradient.values(), strict=True):
-        parameter.grad = value
-    optimizer.step()
 
 
 # THE RUN: tests, speed, files; word for word the same in the three scripts.
@@ -573,7 +591,7 @@ def train(args, stop=lambda: False):
         if global_step <= args.learning_starts:
             action = env.action_space.sample()
         else:
-            noise = args.exploration_noise * torch.randn(env.action_space.shape).to(device)
+            noise = args.exploration_noise * torch.randn(env.action_space.shape).numpy()
             action = actor.policy(observation, noise)
 
         # STEP

@@ -56,6 +56,10 @@ def make_env(args):
 def ordinary(state, activation=nn.ReLU):
     """Return trainable networks of three layers each with the weights of a state_dict."""
     values = [v.detach().clone() for k, v in state.items() if k.endswith((".weight", ".bias"))]
+    if values[0].ndim == 3:  # twins
+        values = [
+            v[i].T.contiguous() if v.shape[1] > 1 else v[i, 0] for i in (0, 1) for v in values
+        ]
     networks = []
     for i in range(0, len(values), 6):
         layers = []
@@ -428,9 +432,10 @@ def random_batch(size):
     return [x.double() for x in (*batch, torch.arange(size) % 3 == 0)]
 
 
-def assert_equal_gradients(gradient, loss, parameters):
-    expected = torch.autograd.grad(loss, parameters)
-    torch.testing.assert_close(tuple(gradient.values()), expected, rtol=1e-8, atol=1e-12)
+def assert_equal_gradients(gradient, loss, *networks):
+    expected = torch.autograd.grad(loss, parameters(*networks))
+    actual = tuple(parameters(*ordinary(gradient)))
+    torch.testing.assert_close(actual, expected, rtol=1e-8, atol=1e-12)
 
 
 def test_sac_gradients():
@@ -454,7 +459,7 @@ def test_sac_gradients():
         actor, critic, target, log_alpha, batch, noise, args.gamma
     )
     loss = expected(plain.critic_loss, batch)
-    assert_equal_gradients(gradient, loss, parameters(plain.q1, plain.q2))
+    assert_equal_gradients(gradient, loss, plain.q1, plain.q2)
     q1, q2 = q_value(plain.q1, *batch[:2]), q_value(plain.q2, *batch[:2])
     assert curves["qf1_values"].item() == pytest.approx(q1.mean().item())
     assert curves["qf2_values"].item() == pytest.approx(q2.mean().item())
@@ -463,7 +468,7 @@ def test_sac_gradients():
 
     gradient, curves = sac.actor_gradient(actor, critic, log_alpha, batch[0], noise)
     loss = expected(plain.actor_loss, batch[0])
-    assert_equal_gradients(gradient, loss, parameters(plain.actor))
+    assert_equal_gradients(gradient, loss, plain.actor)
     assert curves["actor_loss"].item() == pytest.approx(loss.item())
 
     gradient, curves = sac.temperature_gradient(actor, log_alpha, batch[0], noise, -2.0)
@@ -493,7 +498,7 @@ def test_td3_gradients_with_bounds_that_differ_between_dimensions():
     gradient, curves = td3.critic_gradient(
         critic, target_actor, target_critic, batch, clipped, args.gamma
     )
-    assert_equal_gradients(gradient, loss, parameters(plain.q1, plain.q2))
+    assert_equal_gradients(gradient, loss, plain.q1, plain.q2)
     assert curves["qf_loss"].item() == pytest.approx(loss.item() / 2)
     actions = target_actor(batch[3], clipped)  # each bound was reached, and no other one
     assert actions.min(0).values.tolist() == pytest.approx([-1, -0.5])
@@ -501,7 +506,7 @@ def test_td3_gradients_with_bounds_that_differ_between_dimensions():
 
     gradient, curves = td3.actor_gradient(actor, critic, batch[0])
     loss = plain.actor_loss(batch[0])
-    assert_equal_gradients(gradient, loss, parameters(plain.actor))
+    assert_equal_gradients(gradient, loss, plain.actor)
     assert curves["actor_loss"].item() == pytest.approx(loss.item())
 
 
@@ -552,6 +557,18 @@ def test_ppo_starts_from_orthogonal_weights():
 
 
 # PARTS
+
+
+@pytest.mark.parametrize("script", [sac, td3])
+@pytest.mark.parametrize("outputs", [4, 1])
+def test_twin_linear_is_two_linear_layers(script, outputs):
+    torch.manual_seed(0)
+    twin = script.TwinLinear(5, outputs)
+    torch.manual_seed(0)
+    first, second = nn.Linear(5, outputs), nn.Linear(5, outputs)
+    x, y = torch.randn(2, 7, 5)
+    torch.testing.assert_close(twin(x), torch.stack([first(x), second(x)]))
+    torch.testing.assert_close(twin(torch.stack([x, y])), torch.stack([first(x), second(y)]))
 
 
 @pytest.mark.parametrize("script", [sac, td3])
