@@ -78,8 +78,9 @@ class Args:
     """CPU threads per run; a sweep gains more from several runs side by side"""
     compile: bool = True
     """compile the updates when learning starts, where a C++ compiler is at hand"""
-    matmul_precision: Literal["highest", "high", "medium"] = "highest"
-    """PyTorch's precision of float32 products, raised to highest where accuracy is lost"""
+    matmul_precision: Literal["highest", "high", "medium", "bf16"] = "highest"
+    """PyTorch's precision of float32 products, raised to highest where accuracy is lost; bf16:
+    the updates' products in bfloat16, whatever it loses"""
 
     learning_rate: float = 3e-4
     """learning rate of the optimizer"""
@@ -298,25 +299,28 @@ def ppo_gradient(agent, batch, args):
     return {name: value * scale for name, value in gradient.items()}, curves
 
 
-def updater(gradient_function, optimizer, compile):
+def updater(gradient_function, optimizer, args):
     """Return a function of the same arguments that takes one optimizer step; it returns the curves.
 
     The gradient is compiled at the first call, when learning starts, if a probe compiles here.
     """
 
+    bf16 = args.matmul_precision == "bf16"
+
     @functools.cache
     def choose():
         try:
-            if compile:
+            if args.compile:
                 torch.compile(torch.neg)(torch.zeros(8))
                 return torch.compile(gradient_function, fullgraph=True, dynamic=False)
         except Exception as error:  # no C++ compiler, no Python headers, ...
             print("not compiled:", str(error).strip().partition("\n")[0])
         return gradient_function
 
-    def update(*args):
-        gradient, curves = choose()(*args)
+    def update(*arguments):
         parameters = optimizer.param_groups[0]["params"]
+        with torch.autocast(parameters[0].device.type, torch.bfloat16, bf16):
+            gradient, curves = choose()(*arguments)
         for parameter, value in zip(parameters, gradient.values(), strict=True):
             parameter.grad = value
         optimizer.step()
@@ -342,6 +346,8 @@ def evaluate(policy, env, episodes):
 
 def use_matmul_precision(precision, device):
     """Set the precision of float32 products, but "highest" where accuracy is lost; return it."""
+    if precision == "bf16":
+        return precision
     torch.set_float32_matmul_precision(precision)
     a, b = torch.randn(2, 256, 256, generator=torch.Generator().manual_seed(0)).to(device)
     exact = a.double() @ b.double()
@@ -566,7 +572,7 @@ def train(args, stop=lambda: False):
     agent, rollout = Agent(env).requires_grad_(False).to(device), Rollout(args.num_steps, env)
     observation_stats, return_stats = Normalizer(observation.shape), Normalizer(())
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
-    update = updater(ppo_gradient, optimizer, args.compile)
+    update = updater(ppo_gradient, optimizer, args)
     log = RunLog(run_dir, args, env)
     minibatch_size = args.num_steps // args.num_minibatches
     iterations = args.total_timesteps // args.num_steps

@@ -77,8 +77,9 @@ class Args:
     """CPU threads per run; a sweep gains more from several runs side by side"""
     compile: bool = True
     """compile the updates when learning starts, where a C++ compiler is at hand"""
-    matmul_precision: Literal["highest", "high", "medium"] = "medium"
-    """PyTorch's precision of float32 products, raised to highest where accuracy is lost"""
+    matmul_precision: Literal["highest", "high", "medium", "bf16"] = "medium"
+    """PyTorch's precision of float32 products, raised to highest where accuracy is lost; bf16:
+    the updates' products in bfloat16, whatever it loses"""
 
     buffer_size: int = 1_000_000
     """transitions in the replay buffer"""
@@ -296,25 +297,28 @@ def actor_gradient(actor, critic, observations):
     return gradient, {"actor_loss": actor_loss}
 
 
-def updater(gradient_function, optimizer, compile):
+def updater(gradient_function, optimizer, args):
     """Return a function of the same arguments that takes one optimizer step; it returns the curves.
 
     The gradient is compiled at the first call, when learning starts, if a probe compiles here.
     """
 
+    bf16 = args.matmul_precision == "bf16"
+
     @functools.cache
     def choose():
         try:
-            if compile:
+            if args.compile:
                 torch.compile(torch.neg)(torch.zeros(8))
                 return torch.compile(gradient_function, fullgraph=True, dynamic=False)
         except Exception as error:  # no C++ compiler, no Python headers, ...
             print("not compiled:", str(error).strip().partition("\n")[0])
         return gradient_function
 
-    def update(*args):
-        gradient, curves = choose()(*args)
+    def update(*arguments):
         parameters = optimizer.param_groups[0]["params"]
+        with torch.autocast(parameters[0].device.type, torch.bfloat16, bf16):
+            gradient, curves = choose()(*arguments)
         for parameter, value in zip(parameters, gradient.values(), strict=True):
             parameter.grad = value
         optimizer.step()
@@ -340,6 +344,8 @@ def evaluate(policy, env, episodes):
 
 def use_matmul_precision(precision, device):
     """Set the precision of float32 products, but "highest" where accuracy is lost; return it."""
+    if precision == "bf16":
+        return precision
     torch.set_float32_matmul_precision(precision)
     a, b = torch.randn(2, 256, 256, generator=torch.Generator().manual_seed(0)).to(device)
     exact = a.double() @ b.double()
@@ -572,8 +578,8 @@ def train(args, stop=lambda: False):
     critic_optimizer = torch.optim.Adam(critic.parameters(), lr=args.learning_rate, fused=True)
     actor_optimizer = torch.optim.Adam(actor.parameters(), lr=args.learning_rate, fused=True)
     buffer, log = ReplayBuffer(args.buffer_size, env), RunLog(run_dir, args, env)
-    update_critic = updater(critic_gradient, critic_optimizer, args.compile)
-    update_actor = updater(actor_gradient, actor_optimizer, args.compile)
+    update_critic = updater(critic_gradient, critic_optimizer, args)
+    update_actor = updater(actor_gradient, actor_optimizer, args)
 
     # RESUME: between two episodes an environment carries over no more than its generator
     state = {"actor": actor, "critic": critic, "buffer": buffer, "log": log}
