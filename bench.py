@@ -204,8 +204,9 @@ def child_split(folder, algo, stored, first, last, clock, *flags):
         elif step >= last:
             clock.switch("env")
             ms = {phase: 1e3 * s / (step - first) for phase, s in clock.seconds.items()}
-            precision = script.torch.get_float32_matmul_precision()
-            finish(ms=ms, peak=peak_rate(script.torch), precision=precision, sizes=sizes)
+            precision = script.use_matmul_precision(args.matmul_precision, "cpu")
+            peak = peak_rate(script.torch, precision)
+            finish(ms=ms, peak=peak, precision=precision, sizes=sizes)
 
     script = load(folder, algo, stored, mark)
     args = script.tyro.cli(script.Args, args=flags)
@@ -220,11 +221,11 @@ def child_split(folder, algo, stored, first, last, clock, *flags):
     script.train(args)
 
 
-def peak_rate(torch):
-    """The fastest product, in GFLOP/s, at the float32 precision that the run has set."""
-    rate = 0.0
+def peak_rate(torch, precision):
+    """The fastest product, in GFLOP/s, at the precision of the run."""
+    rate, dtype = 0.0, torch.bfloat16 if precision == "bf16" else torch.float32
     for n in (256, 512, 1024):
-        a, b, out = torch.randn(3, n, n)
+        a, b, out = torch.randn(3, n, n).to(dtype)
         for _ in range(20 * (1024 // n) ** 2):
             start = time.perf_counter()
             torch.mm(a, b, out=out)

@@ -302,7 +302,6 @@ def updater(gradient_function, optimizer, args):
 
     The gradient is compiled at the first call, when learning starts, if a probe compiles here.
     """
-
     bf16 = args.matmul_precision == "bf16"
 
     @functools.cache

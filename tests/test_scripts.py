@@ -425,6 +425,11 @@ def test_compiled_and_plain_updates_agree(algorithm, tmp_path, capsys, monkeypat
     assert {f"{name}_gradient" for name in updates.split()} <= set(graphs)
     torch.testing.assert_close(policy(compiled), policy(plain), rtol=1e-4, atol=1e-5)
 
+    rough = run(algorithm, tmp_path / "bf16", matmul_precision="bf16", compile=True, **short)
+    assert json.loads((rough / "config.json").read_text())["matmul_precision"] == "bf16"
+    exact, rough = (torch.cat([x.flatten() for x in policy(r).values()]) for r in (plain, rough))
+    assert 1e-5 < (rough - exact).norm() / exact.norm() < 0.1
+
 
 @each_script
 def test_no_compiler_means_plain_updates(algorithm, tmp_path, capsys, monkeypatch):

@@ -556,6 +556,23 @@ def test_ppo_starts_from_orthogonal_weights():
     assert not agent.actor_logstd.any()
 
 
+@pytest.mark.parametrize("script", [sac, td3, ppo])
+@pytest.mark.parametrize("precision", ["highest", "bf16"])
+def test_only_bf16_computes_products_in_bfloat16(script, precision):
+    args = script.Args(matmul_precision=precision, compile=False)
+    network = nn.Linear(3, 2).requires_grad_(False)
+    optimizer = torch.optim.Adam(network.parameters(), lr=0.5, fused=True)
+
+    def gradient_function(x):
+        return {"weight": torch.ones(2, 3), "bias": torch.ones(2)}, {"product": network(x)}
+
+    before = network.bias.clone()
+    curves = script.updater(gradient_function, optimizer, args)(torch.ones(4, 3))
+    expected = {"highest": torch.float32, "bf16": torch.bfloat16}[precision]
+    assert curves["product"].dtype == expected
+    torch.testing.assert_close(network.bias, before - 0.5)  # Adam's first step, in float32
+
+
 # PARTS
 
 
