@@ -357,10 +357,10 @@ def use_matmul_precision(precision, device):
 
 @contextlib.contextmanager
 def writing(path):
-    """Turn what the operating system says into one line that names the file."""
+    """Turn what the operating system (or torch.save) says into one line that names the file."""
     try:
         yield
-    except OSError as error:
+    except (OSError, RuntimeError) as error:
         fail(f"cannot write {path}: {error}", code=1)
 
 
@@ -368,14 +368,13 @@ def write_file(path, write):
     """Write a file whole or not at all: a kill or a full disk leaves the previous one."""
     temporary = path.with_suffix(".tmp")
     try:
-        with open(temporary, "wb") as file:
+        with writing(path), open(temporary, "wb") as file:
             write(file)
             file.flush()
             os.fsync(file.fileno())
-        temporary.replace(path)
-    except (OSError, RuntimeError) as error:
+            temporary.replace(path)
+    finally:
         temporary.unlink(missing_ok=True)
-        fail(f"cannot write {path}: {error}", code=1)
 
 
 def write_json(path, value):

@@ -428,7 +428,7 @@ def test_compiled_and_plain_updates_agree(algorithm, tmp_path, capsys, monkeypat
     rough = run(algorithm, tmp_path / "bf16", matmul_precision="bf16", compile=True, **short)
     assert json.loads((rough / "config.json").read_text())["matmul_precision"] == "bf16"
     exact, rough = (torch.cat([x.flatten() for x in policy(r).values()]) for r in (plain, rough))
-    assert 1e-5 < (rough - exact).norm() / exact.norm() < 0.1
+    assert 1e-5 < (rough - exact).abs().max() < 0.05
 
 
 @each_script
