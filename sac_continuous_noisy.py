@@ -80,7 +80,7 @@ class Args:
     """compile the updates when learning starts, where a C++ compiler is at hand"""
     matmul_precision: Literal["highest", "high", "medium", "bf16"] = "medium"
     """PyTorch's precision of float32 products, raised to highest where accuracy is lost; bf16:
-    the updates' products in bfloat16, whatever it loses"""
+    the updates under torch.autocast in bfloat16, whatever accuracy they lose"""
 
     buffer_size: int = 1_000_000
     """transitions in the replay buffer"""
@@ -97,7 +97,7 @@ class Args:
     q_lr: float = 1e-3
     """learning rate of the Q-functions and of the temperature"""
     policy_frequency: int = 2
-    """steps between two policy updates, each made up for by as many updates"""
+    """every so many steps the policy is updated, as many times"""
     target_network_frequency: int = 1
     """steps between two updates of the target networks"""
     alpha: float = 0.2
@@ -149,14 +149,14 @@ def mlp(linear, inputs, outputs):
 
 
 def in_numpy(network, observation):
-    """Evaluate an mlp for one observation; acting takes a fifth of the time that PyTorch takes."""
+    """Evaluate an mlp for one observation; for one, NumPy is several times faster than PyTorch."""
     w1, b1, w2, b2, w3, b3 = (parameter.cpu().numpy() for parameter in network.parameters())
     hidden = np.maximum(w1 @ np.asarray(observation, np.float32) + b1, 0)
     return w3 @ np.maximum(w2 @ hidden + b2, 0) + b3
 
 
 class TwinLinear(nn.Module):
-    """Two nn.Linear as one batched product, -> (2, B, outputs)."""
+    """Two nn.Linear at once, in one batched product: -> (2, B, outputs)."""
 
     def __init__(self, inputs, outputs):
         super().__init__()
@@ -189,7 +189,7 @@ class Actor(nn.Module):
 
     def __init__(self, env):
         super().__init__()
-        low, high = torch.tensor(env.action_space.low), torch.tensor(env.action_space.high)
+        low, high = torch.Tensor(env.action_space.low), torch.Tensor(env.action_space.high)
         self.network = mlp(nn.Linear, env.observation_space.shape[0], 2 * len(low))
         self.register_buffer("action_scale", (high - low) / 2)
         self.register_buffer("action_bias", (high + low) / 2)
@@ -216,7 +216,7 @@ class Actor(nn.Module):
 def load_policy(run_dir, env):
     """Return the policy of a finished run."""
     actor = Actor(env).requires_grad_(False)
-    actor.load_state_dict(torch.load(Path(run_dir, "policy.pt"), weights_only=True))
+    actor.load_state_dict(torch.load(Path(run_dir, "policy.pt"), "cpu", weights_only=True))
     return actor.policy
 
 
@@ -249,9 +249,8 @@ class ReplayBuffer:
         """Draw (s, a, r, s', terminated) uniformly: float32 tensors with batch_size rows."""
         oldest = self.position - self.size
         i = (oldest + rng.integers(self.size, size=batch_size)) % self.rows
-        arrays = [getattr(self, name).take(i, axis=0) for name in self.ARRAYS]
-        arrays.insert(3, self.observations.take((i + 1) % self.rows, axis=0))
-        batch = [torch.from_numpy(array) for array in arrays]
+        batch = [torch.from_numpy(getattr(self, name).take(i, axis=0)) for name in self.ARRAYS]
+        batch.insert(3, torch.from_numpy(self.observations.take((i + 1) % self.rows, axis=0)))
         for b, row in enumerate(i.tolist()):
             if row in self.final:
                 batch[3][b] = self.final[row]
@@ -317,23 +316,24 @@ def temperature_gradient(actor, log_alpha, observations, noise, target_entropy):
 def updater(gradient_function, optimizer, args):
     """Return a function of the same arguments that takes one optimizer step; it returns the curves.
 
-    The gradient is compiled at the first call, when learning starts, if a probe compiles here.
+    The gradient is in the order of the optimizer's parameters. Its function is compiled at the
+    first call, when learning starts, if torch.compile works on this machine.
     """
-    bf16 = args.matmul_precision == "bf16"
+    parameters = optimizer.param_groups[0]["params"]
+    device, bf16 = parameters[0].device, args.matmul_precision == "bf16"
 
     @functools.cache
     def choose():
         try:
             if args.compile:
-                torch.compile(torch.neg)(torch.zeros(8))
+                torch.compile(torch.neg)(torch.zeros(8, device=device))
                 return torch.compile(gradient_function, fullgraph=True, dynamic=False)
         except Exception as error:  # no C++ compiler, no Python headers, ...
             print("not compiled:", str(error).strip().partition("\n")[0])
         return gradient_function
 
     def update(*arguments):
-        parameters = optimizer.param_groups[0]["params"]
-        with torch.autocast(parameters[0].device.type, torch.bfloat16, bf16):
+        with torch.autocast(device.type, torch.bfloat16, bf16):
             gradient, curves = choose()(*arguments)
         for parameter, value in zip(parameters, gradient.values(), strict=True):
             parameter.grad = value
@@ -360,9 +360,7 @@ def evaluate(policy, env, episodes):
 
 def use_matmul_precision(precision, device):
     """Set the precision of float32 products, but "highest" where accuracy is lost; return it."""
-    if precision == "bf16":
-        return precision
-    torch.set_float32_matmul_precision(precision)
+    torch.set_float32_matmul_precision("highest" if precision == "bf16" else precision)
     a, b = torch.randn(2, 256, 256, generator=torch.Generator().manual_seed(0)).to(device)
     exact = a.double() @ b.double()
     if torch.norm(a @ b - exact) > 1e-6 * torch.norm(exact):  # TF32; bf16 on a CPU with AMX
@@ -596,7 +594,7 @@ def train(args, stop=lambda: False):
     buffer, log = ReplayBuffer(args.buffer_size, env), RunLog(run_dir, args, env)
     update_critic = updater(critic_gradient, critic_optimizer, args)
     update_actor = updater(actor_gradient, actor_optimizer, args)
-    update_temperature = updater(temperature_gradient, alpha_optimizer, args)
+    update_alpha = updater(temperature_gradient, alpha_optimizer, args)
 
     # RESUME: between two episodes an environment carries over no more than its generator
     state = {"actor": actor, "critic": critic, "target": target, "temperature": temperature}
@@ -632,13 +630,12 @@ def train(args, stop=lambda: False):
             batch = [tensor.to(device) for tensor in buffer.sample(args.batch_size, rng)]
             curves = update_critic(actor, critic, target, log_alpha, batch, noise(), args.gamma)
 
-            # LEARN: actor and temperature; a delay is made up for by as many updates
+            # LEARN: actor and temperature, as many times as steps have passed
             delayed = global_step % args.policy_frequency == 0
             for _ in range(args.policy_frequency if delayed else 0):
                 curves |= update_actor(actor, critic, log_alpha, batch[0], noise())
                 if args.autotune:
-                    arguments = (actor, log_alpha, batch[0], noise(), target_entropy)
-                    curves |= update_temperature(*arguments)
+                    curves |= update_alpha(actor, log_alpha, batch[0], noise(), target_entropy)
 
             # LEARN: target
             if global_step % args.target_network_frequency == 0:

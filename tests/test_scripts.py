@@ -301,6 +301,13 @@ def test_observations_of_any_box_and_module_names(algorithm, tmp_path):
     assert env.action_space.contains(act(env.reset()[0]))
 
 
+@each_script
+def test_networks_are_float32_where_actions_are_float64(algorithm, tmp_path):
+    saved = policy(run(algorithm, tmp_path, env_id="toy_envs:DoubleAction-v0"))
+    networks = {name: x for name, x in saved.items() if "stats" not in name}
+    assert {x.dtype for x in networks.values()} == {torch.float32}
+
+
 @pytest.mark.parametrize(
     ("env_id", "observations", "actions", "horizon"),
     [
@@ -425,6 +432,8 @@ def test_compiled_and_plain_updates_agree(algorithm, tmp_path, capsys, monkeypat
     assert {f"{name}_gradient" for name in updates.split()} <= set(graphs)
     torch.testing.assert_close(policy(compiled), policy(plain), rtol=1e-4, atol=1e-5)
 
+    if algorithm == "PPO":
+        return  # too small for bfloat16 to be an option
     rough = run(algorithm, tmp_path / "bf16", matmul_precision="bf16", compile=True, **short)
     assert json.loads((rough / "config.json").read_text())["matmul_precision"] == "bf16"
     exact, rough = (torch.cat([x.flatten() for x in policy(r).values()]) for r in (plain, rough))
