@@ -151,15 +151,19 @@ def panels(environments, labels):
 
 
 def curves_figure(study, noise):
-    """Draw learning curves: mean over seeds, one line per noise rate, shaded standard deviation."""
+    """Draw learning curves: mean over seeds, one line per noise rate, shaded standard deviation.
+
+    There is a panel for each environment in which this noise was tried.
+    """
     configs = [config for config in study.returns if config[0] in ("", noise)]
     unit, word = (1e6, "millions") if study.steps[-1] >= 1e6 else (1e3, "thousands")
     x, every = study.steps / unit, max(1, len(study.steps) // 8)
-    counts = [np.isfinite(study.final(config)).sum(axis=0) for config in configs]
+    counts = np.stack([np.isfinite(study.final(config)).sum(axis=0) for config in configs])
+    tried = np.flatnonzero(counts[[config[0] == noise for config in configs]].any(axis=0))
     labels = [f"p = {c[1]}" if c[0] else "no noise" for c in configs]
-    labels = [f"{label} ({count(n)})" for label, n in zip(labels, counts, strict=True)]
-    fig, axes, add_legend = panels(study.environments, labels)
-    for (e, ax), (i, config) in product(enumerate(axes), enumerate(configs)):
+    labels = [f"{a} ({count(n)})" for a, n in zip(labels, counts[:, tried], strict=True)]
+    fig, axes, add_legend = panels([study.environments[e] for e in tried], labels)
+    for (e, ax), (i, config) in product(zip(tried, axes, strict=True), enumerate(configs)):
         curves = study.returns[config][:, :, e]
         curves = curves[:, np.isfinite(curves[-1])]
         mean = curves.mean(axis=1) if curves.size else np.full(len(x), np.nan)

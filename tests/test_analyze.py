@@ -733,6 +733,12 @@ def test_figures_have_labels_units_and_n(sweep):
     assert band.min() == pytest.approx(-40 * 1.8 - 1.8 * np.sqrt(200 / 3))  # one sample std
     cells = [text.get_text() for text in drawn["heatmap_SAC"].axes[0].texts]
     assert cells == ["-89", "+32", "-19"]
+
+    [study] = studies  # an environment without this noise has no panel
+    for config, returns in study.returns.items():
+        returns[:, :, 0] = np.nan if config[0] == "RandomEarlyTermination(50)" else 1.0
+    _, fig, _ = analyze_report.curves_figure(study, "RandomEarlyTermination(50)")
+    assert [ax.get_title() for ax in fig.axes] == ["Pusher-v5"]
     labels = [text.get_text() for text in drawn["intervals_SAC"].axes[0].get_yticklabels()]
     assert labels[-1] == f"{SCALE}, p = 0.05 (n = 4)" and "-" not in labels[-1]
 
