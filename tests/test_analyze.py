@@ -868,6 +868,16 @@ def test_one_baseline_run_is_enough_for_a_report(tmp_path, capsys):
     assert "Finished runs: 1." in capsys.readouterr().out
 
 
+def test_committed_results_are_those_of_the_committed_runs(tmp_path):
+    results = Path(analyze.__file__).parent / "results"
+    analyze.main(analyze.Args(results / "runs", tmp_path, results / "paper"))
+    committed = {path.name for path in results.iterdir() if path.is_file()}
+    assert committed - {"README.md"} == {path.name for path in tmp_path.iterdir()}
+    for path in results.glob("*.csv"):
+        tables = [pd.read_csv(folder / path.name) for folder in (results, tmp_path)]
+        pd.testing.assert_frame_equal(*tables, rtol=1e-6)
+
+
 def test_help_names_every_option():
     command = [sys.executable, analyze.__file__, "--help"]
     text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
