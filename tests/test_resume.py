@@ -19,6 +19,7 @@ import resource
 import runpy
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -80,8 +81,22 @@ def options(algorithm, runs_dir, env_id="Hopper-v5", noise=NOISE, rates=RATES, *
     return words
 
 
+def wait_for_a_later_name(words):
+    """Let a new file of events be the last one by name, which is the order TensorBoard reads in.
+
+    Its name has the second, the host and the process number, compared as text. Only processes that
+    start within a second of one another, as these do, can be in the wrong order.
+    """
+    runs_dir = Path(words[words.index("--runs-dir") + 1])
+    last = max((path.name for path in runs_dir.glob("*/events.*")), default="")
+    process = f"{socket.gethostname()}.{os.getpid()}"
+    while last > f"events.out.tfevents.{int(time.time())}.{process}":
+        time.sleep(0.05)
+
+
 def train(algorithm, words, episodes=math.inf):
     """Train in this process, stopped after a number of episodes; return what train() does."""
+    wait_for_a_later_name(words)
     module, ended = script(algorithm), itertools.count(1)
     return module.train(tyro.cli(module.Args, args=words), stop=lambda: next(ended) >= episodes)
 
@@ -164,6 +179,7 @@ def limit_files(file_size, name, *args, **kwargs):
 def child(algorithm, words, stdout, stderr, moments):
     os.dup2(stdout.fileno(), 1)
     os.dup2(stderr.fileno(), 2)
+    wait_for_a_later_name(words)
     tqdm.set_lock(threading.RLock())  # a kill would leave the default one's semaphore behind
     for moment in moments:
         at(*moment)
