@@ -878,6 +878,21 @@ def test_committed_results_are_those_of_the_committed_runs(tmp_path):
         pd.testing.assert_frame_equal(*tables, rtol=1e-6)
 
 
+def test_committed_runs_had_the_noise_that_their_names_say():
+    """Each wrapper acted as often as a binomial sample at its rate would, up to 4 deviations."""
+    folders = sorted((Path(analyze.__file__).parent / "results" / "runs").iterdir())
+    assert folders
+    for folder in folders:
+        args = json.loads((folder / "config.json").read_text())["args"]
+        result = json.loads((folder / "result.json").read_text())
+        names = [text.partition("(")[0] for text in args["noise"]]
+        assert list(result["noise_applied"]) == names, folder
+        counts = result["noise_applied"].values()
+        for rate, (applied, calls) in zip(args["noise_rate"], counts, strict=True):
+            deviation = (calls * rate * (1 - rate)) ** 0.5
+            assert abs(applied - calls * rate) <= 4 * deviation, (folder, applied, calls)
+
+
 def test_help_names_every_option():
     command = [sys.executable, analyze.__file__, "--help"]
     text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
