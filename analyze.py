@@ -41,7 +41,7 @@ RESAMPLES = 2000
 COVERAGE = {3: 92, 5: 95, 10: 94}
 KEYS = ["algorithm", "environment", "noise", "noise_rate"]
 PAPER_SEEDS = {"SAC": 5, "TD3": 5, "PPO": 10}
-PAPER_ENVIRONMENTS = 5
+PAPER_ENVIRONMENTS, PAPER_STEPS = 5, 1_000_000
 
 
 @dataclass
@@ -79,7 +79,9 @@ def read_config(folder):
         "episodes": int(args["eval_episodes"]),
         "total": int(args["total_timesteps"]),
         "settings": json.dumps(settings, sort_keys=True),
-        "versions": config["versions"] | {"matmul precision": config.get("matmul_precision")},
+        "versions": config["versions"]
+        | {"matmul precision": config.get("matmul_precision")}
+        | {"git commit": str(config.get("git_commit"))[:10]},
     }
 
 
@@ -124,7 +126,7 @@ def read_runs(runs_dir):
             if not np.isclose(returns[-1], result["final_return_mean"], rtol=1e-3, atol=1e-3):
                 raise ValueError("eval.csv and result.json disagree on the final return")
             row |= {"status": "finished", "steps": steps, "returns": returns}
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
             row["reason"] = " ".join(f"{type(error).__name__}: {error}".split())
     runs = pd.DataFrame(rows, columns=COLUMNS["runs"].split(), dtype=object)
     for base, group in runs.groupby("base"):
@@ -137,18 +139,20 @@ def read_runs(runs_dir):
 def labels(base, group):
     """Name each run's algorithm so that runs with different settings never share a row.
 
-    It is the plain name (SAC) unless runs differ in settings or in the version of one environment;
-    then it says what differs (SAC [total_timesteps=100000]).
+    It is the plain name (SAC) unless runs differ in settings, or there is a newer version of the
+    environment; then it says what differs (SAC [total_timesteps=100000]).
     """
     settings = {text: json.loads(text) for text in set(group["settings"])}
     names = sorted(set().union(*settings.values()))
     names = [n for n in names if len({str(values.get(n)) for values in settings.values()}) > 1]
-    environments = set(group["environment"])
-    several = len(environments) > len({split_version(env)[0] for env in environments})
+    newest = {}
+    for env, version in map(split_version, group["environment"]):
+        newest[env] = max(newest.get(env, ""), version, key=lambda text: int(text or 0))
     result = []
     for text, env in zip(group["settings"], group["environment"], strict=True):
         parts = [f"{name}={settings[text].get(name)}" for name in names]
-        parts += [f"environments v{split_version(env)[1]}"] if several else []
+        name, version = split_version(env)
+        parts += [f"environments v{version}"] if version != newest[name] else []
         result.append(base + (f" [{', '.join(parts)}]" if parts else ""))
     return result
 
@@ -168,18 +172,18 @@ def progress(folder):
 
 
 def missing_runs(runs):
-    """List the runs that the grid of what was found would have, and that are not there.
+    """List the seeds that a configuration lacks in an environment and that other runs have.
 
-    Per algorithm the grid is (configurations found) x (environments found) x (seeds found).
+    An environment in which anything was run should have the baseline.
     """
     rows = []
     for algorithm, group in runs[runs["base"].notna()].groupby("algorithm"):
-        configs = {*zip(group["noise"], group["noise_rate"], strict=True), BASELINE}
-        environments, seeds = sorted(set(group["environment"])), sorted(set(group["seed"]))
         found = set(group[[*KEYS[1:], "seed"]].itertuples(index=False, name=None))
-        for env, (noise, rate), seed in product(environments, sorted(configs, key=order), seeds):
-            if (env, noise, rate, seed) not in found:
-                rows.append((algorithm, env, noise, rate, int(seed), "missing", "no run folder"))
+        wanted = {(env, *config) for env, *config, _ in found for config in (config, BASELINE)}
+        wanted = sorted(wanted, key=lambda key: (key[0], order(key[1:])))
+        for key, seed in product(wanted, sorted(set(group["seed"]))):
+            if (*key, seed) not in found:
+                rows.append((algorithm, *key, int(seed), "missing", "no run folder"))
     return pd.DataFrame(rows, columns=[*KEYS, "seed", "status", "reason"])
 
 
@@ -273,28 +277,34 @@ def bootstrap_iqm(scores, baseline=None, resamples=RESAMPLES):
 
     The interval is iqm +- t_{0.975, df} SE (Efron and Tibshirani, 1993, chapter 12): SE is the
     standard deviation of the IQM over stratified bootstrap samples (seeds drawn anew within each
-    environment), and df = sum over envs of (n - 1). With a baseline the scores are improvements in
-    percent over its mean in each environment, and its seeds are resampled too: that mean is an
-    estimate as well.
+    environment), and df = sum over envs of (n - 1). With a baseline it is the IQM of the scores
+    minus that of the baseline, both in percent of the baseline's mean in each environment: zero
+    where the two are alike, skewed or not. The baseline's seeds are resampled too.
 
     scores (seeds x envs), baseline (other seeds x envs) or None -> iqm, low, high.
     """
     rng = np.random.default_rng(0)
-    cells = columns(scores)
-    values = [x[rng.integers(len(x), size=(resamples, len(x)))] for x in cells]
-    if baseline is not None:
-        means = columns(baseline)
-        drawn = [y[rng.integers(len(y), size=(resamples, len(y)))].mean(-1) for y in means]
-        pairs = zip(values, drawn, strict=True)
-        values = [improvement_percent(x, y[:, None]) for x, y in pairs]
-        cells = [improvement_percent(x, y.mean()) for x, y in zip(cells, means, strict=True)]
-    estimate = iqm(np.concatenate(cells))
-    sizes = [len(x) for x in cells] + ([len(y) for y in means] if baseline is not None else [])
-    if min(sizes) < MIN_SEEDS:
-        return estimate, np.nan, np.nan
-    error = iqm(np.concatenate(values, axis=-1)).std(ddof=1)
-    half = stats.t.ppf(0.975, sum(len(x) - 1 for x in cells)) * error
-    return estimate, estimate - half, estimate + half
+
+    def draw(cells):
+        return [x[rng.integers(len(x), size=(resamples, len(x)))] for x in cells]
+
+    def improvement(cells, baseline):
+        means = [y.mean(axis=-1, keepdims=True) for y in baseline]
+        pairs = zip(cells, means, strict=True)
+        return iqm(np.concatenate([improvement_percent(*pair) for pair in pairs], axis=-1))
+
+    def estimate(x, y):
+        if not y:
+            return iqm(np.concatenate(x, axis=-1))
+        return improvement(x, y) - improvement(y, y)
+
+    x, y = columns(scores), [] if baseline is None else columns(baseline)
+    value = estimate(x, y)
+    if min(map(len, x + y)) < MIN_SEEDS:
+        return value, np.nan, np.nan
+    error = estimate(draw(x), draw(y)).std(ddof=1)
+    half = stats.t.ppf(0.975, sum(len(cell) - 1 for cell in x)) * error
+    return value, value - half, value + half
 
 
 def wins(x, y):
@@ -373,10 +383,9 @@ def leave_one_seed_out(finals):
     held_out = []
     for seed in range(finals.shape[1]):
         others = np.delete(finals, seed, axis=1)
-        able = finals[np.isfinite(finals[:, seed]) & np.isfinite(others).any(axis=1)]
-        if len(able):
-            means = np.nanmean(np.delete(able, seed, axis=1), axis=1)
-            held_out.append(able[means.argmax(), seed])
+        able = np.isfinite(finals[:, seed]) & np.isfinite(others).any(axis=1)
+        if able.any():
+            held_out.append(finals[able, seed][np.nanmean(others[able], axis=1).argmax()])
     return np.mean(held_out) if held_out else np.nan
 
 
@@ -461,7 +470,11 @@ def consistency_rows(summary):
 
 
 def split_consistency(consistency):
-    """Return the rows with at least 80 % of the environments, best first, and those with 0 %."""
+    """Return the rows with at least 80 % of the environments, best first, and those with 0 %.
+
+    One environment says nothing about consistency.
+    """
+    consistency = consistency[consistency["environments"] > 1]
     share = consistency["percent_of_environments"]
     by = ["algorithm", "percent_of_environments", "average_improvement_percent"]
     good = consistency[share >= 80].drop(columns="fails_at_every_rate")
@@ -580,11 +593,13 @@ def compare_table(ours, listed, paper, mean, std, number):
             plain["steps_millions"] = plain["steps_millions"].astype(float).round(6)
         return list(plain.itertuples(index=False, name=None))
 
-    ours, paper = ours.assign(key=key(ours)), paper.assign(key=key(paper))
-    ours = ours[ours["key"].isin({*key(listed), *paper["key"]})]
+    # `key` unites runs that differ in settings or versions, and only one of them may be listed
+    listed = pd.MultiIndex.from_frame(ours[keys]).isin(pd.MultiIndex.from_frame(listed[keys]))
+    ours, paper = ours.assign(key=key(ours), listed=listed), paper.assign(key=key(paper))
+    ours = ours[ours["listed"] | ours["key"].isin(paper["key"])]
     paper = paper.add_prefix("paper_").rename(columns={"paper_key": "key"})
     table = ours.merge(paper, on="key", how="outer")
-    in_ours, in_paper = table["key"].isin(key(listed)), table["key"].isin(paper["key"])
+    in_ours, in_paper = table["listed"].eq(True), table["key"].isin(paper["key"])
     table["listed_by"] = np.select([in_ours & in_paper, in_ours], ["both", "ours"], "paper")
     for name in keys:
         table[name] = table[name].fillna(table[f"paper_{name}"])
@@ -597,8 +612,13 @@ def compare_table(ours, listed, paper, mean, std, number):
     return table.sort_values(keys, kind="stable")[[*names, "difference_se"]]
 
 
-def compare_tables(folder, summary, best, consistency, good, bad, early):
-    """Yield (name, table) for each of the paper's tables found in `folder`."""
+def compare_tables(folder, lengths, summary, best, consistency, good, bad, early):
+    """Yield (name, table) for each of the paper's tables found in `folder`.
+
+    `lengths` has the steps of each algorithm: final returns after fewer steps than the paper's are
+    shown beside them, without a difference.
+    """
+    other = [algorithm for algorithm, steps in lengths.items() if steps != PAPER_STEPS]
     alone = summary[summary["noise"] == ""]  # best.csv holds baselines too: rows of their own here
     average = ("average_improvement_percent", "std_improvement_percent", "environments")
     for pattern, ours, listed, columns in (
@@ -611,6 +631,8 @@ def compare_tables(folder, summary, best, consistency, good, bad, early):
         if not papers:
             continue
         paper = pd.concat(papers, ignore_index=True)
+        if "noise_as_run" not in paper:
+            fail(f"{folder} has no tables of the paper (results/paper has them)")
         paper["noise"] = paper["noise_as_run"]
         paper["noise_rate"] = paper["noise_rate"].map(lambda rate: rate_text([rate]))
         if pattern == "best.csv":
@@ -618,8 +640,10 @@ def compare_tables(folder, summary, best, consistency, good, bad, early):
             baseline = paper.rename(columns={"baseline_mean": "mean", "baseline_std": "std"})
             baseline = baseline.assign(noise=BASELINE[0], noise_rate=BASELINE[1])
             paper = pd.concat([noisy, baseline], ignore_index=True)
-        name = pattern.split(".")[0].rstrip("*")
-        yield f"compare_{name}", compare_table(ours, listed, paper, *columns)
+        table = compare_table(ours, listed, paper, *columns)
+        if "steps_millions" not in table:
+            table.loc[table["algorithm"].isin(other), "difference_se"] = np.nan
+        yield f"compare_{pattern.split('.')[0].rstrip('*')}", table
 
 
 # --------------------------------------------------------------------------------------------- main
@@ -629,31 +653,34 @@ CAPTIONS = {
 final test return, mean \u00b1 sample standard deviation over n seeds. The best of many is chosen
 on the seeds that it is reported on, which flatters it; the leave-one-seed-out columns choose on
 all seeds but one and measure on that one.""",
-    "consistent": """Noise that matches or betters the baseline in at least 80 % of the
+    "consistent": """Noise that matches or betters the baseline in at least 80 % of two or more
 environments: improvement over |baseline|, mean \u00b1 standard deviation over environments; n is
 the smallest number of seeds in any environment.""",
-    "consistently_worse": """Noise that is worse than the baseline in every environment (0 %);
-columns as in the table of consistent noise. Worse at every rate that was tried:""",
+    "consistently_worse": """Noise that is worse than the baseline in each of two or more
+environments (0 %); columns as in the table of consistent noise. Worse at every rate that was
+tried:""",
     "early_performance": """Test return during training, by noise rate (0.00 is the baseline):
 mean \u00b1 sample standard deviation over (n) seeds.""",
     "summary": """Final test return of every configuration: mean \u00b1 sample standard deviation
 over n seeds, improvement over |baseline|, and change of the standard deviation. Steps to
 baseline: the first evaluation at which the mean over seeds reaches the baseline's final mean.""",
     "statistics": f"""IQM: interquartile mean of the final returns over n seeds. Improvement: IQM
-of (return - baseline mean) / |baseline mean| over seeds and environments. [ ]: 95 % intervals
-from a stratified bootstrap over seeds (Student's t times the bootstrap standard error; the
-baseline is resampled too). In simulated samples they held the true IQM in at least
+of (return - baseline mean) / |baseline mean| over seeds and environments, minus that of the
+baseline's own returns. [ ]: 95 % intervals from a stratified bootstrap over seeds (Student's t
+times the bootstrap standard error; the baseline is resampled too). In simulated samples of one
+environment they held the true IQM in at least
 {", ".join(f"{c} % (n = {n})" for n, c in COVERAGE.items())} of the cases. P(improvement):
 probability that a noisy run beats a baseline run, averaged over environments, with Newcombe's
-interval; the next column says whether that interval excludes one half. No interval for n <
-{MIN_SEEDS}. p: exact two-sided Mann-Whitney test, stratified by environment. p adjusted:
-Benjamini-Hochberg over one family, all configurations of an algorithm in one environment, or in
-all of them together. Smallest p adjusted: what one configuration alone could reach at most with
-its number of seeds.""",
-    "missing": """Runs that are in no table and no figure. Missing are those that a full grid of
-the configurations, environments and seeds found for an algorithm would have.""",
+interval; the next column says whether that interval, alone among all in the table, excludes one
+half. No interval for n < {MIN_SEEDS}. p: exact two-sided Mann-Whitney test, stratified by
+environment. p adjusted: Benjamini-Hochberg over one family, all configurations of an algorithm in
+one environment, or in all of them together. Smallest p adjusted: what one configuration alone
+could reach at most with its number of seeds.""",
+    "missing": """Runs that are in no table and no figure. Missing are the seeds that other runs of
+the algorithm have, and baselines.""",
     "compare": """The paper's table (environments v2, 1,000,000 steps) beside ours, with the
-difference in standard errors; listed by: whose table has the row. Ours:""",
+difference in standard errors where the steps are the same; listed by: whose table has the row.
+Ours:""",
 }
 CAPTIONS = {name: " ".join(text.split()) for name, text in CAPTIONS.items()}
 
@@ -682,9 +709,11 @@ def make_tables(studies, compare=None):
         table = summary[summary["algorithm"].isin(same)]
         tables[f"summary_{base}"] = (table, CAPTIONS["summary"])
     if compare:
-        lengths = ", ".join(f"{study.algorithm} {study.steps[-1]:,} steps" for study in studies)
-        for name, table in compare_tables(compare, summary, best, consistency, good, bad, early):
-            tables[name] = (table, f"{CAPTIONS['compare']} {lengths}.")
+        lengths = {study.algorithm: study.steps[-1] for study in studies}
+        caption = ", ".join(f"{algorithm} {steps:,} steps" for algorithm, steps in lengths.items())
+        listed = summary, best, consistency, good, bad, early
+        for name, table in compare_tables(compare, lengths, *listed):
+            tables[name] = (table, f"{CAPTIONS['compare']} {caption}.")
     return tables
 
 

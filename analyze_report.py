@@ -2,6 +2,7 @@
 
 import base64
 import re
+import zlib
 from itertools import product
 
 import jinja2
@@ -17,8 +18,9 @@ TOP = 10  # configurations in the interval plot
 
 
 def slug(text):
-    """Turn a label or a noise into a part of a file name."""
-    return re.sub(r"[^A-Za-z0-9._=+-]+", "_", text).strip("_")
+    """Turn a label or a noise into a part of a file name; a long one is cut and keeps a hash."""
+    name = re.sub(r"[^A-Za-z0-9._=+-]+", "_", text).strip("_")
+    return name if len(name) <= 150 else f"{name[:140]}_{zlib.crc32(name.encode()):08x}"
 
 
 # ------------------------------------------------------------------------------------------- tables
@@ -104,7 +106,7 @@ def figures(studies, tables):
         tested = statistics[(statistics["algorithm"] == study.algorithm) & statistics["p"].notna()]
         summary = tables[f"summary_{study.base}"][0]
         summary = summary[summary["algorithm"] == study.algorithm]
-        if len(tested):
+        if tested["improvement_iqm_percent"].notna().any():
             yield interval_figure(study, tested)
             yield heatmap_figure(study, summary)
         noises = sorted({noise for noise, _ in study.returns if noise})
@@ -116,10 +118,10 @@ def figures(studies, tables):
                 yield ablation_figure(study, summary, variants)
 
 
-def count(numbers):
-    """Spell the numbers of seeds behind a line or a panel: "n = 5", or "n = 3 to 5"."""
+def span(numbers):
+    """Spell the numbers of seeds or environments behind a line or a panel: "5", or "3 to 5"."""
     low, high = min(numbers), max(numbers)
-    return f"n = {low}" if low == high else f"n = {low} to {high}"
+    return f"{low}" if low == high else f"{low} to {high}"
 
 
 def panels(environments, labels):
@@ -161,7 +163,7 @@ def curves_figure(study, noise):
     counts = np.stack([np.isfinite(study.final(config)).sum(axis=0) for config in configs])
     tried = np.flatnonzero(counts[[config[0] == noise for config in configs]].any(axis=0))
     labels = [f"p = {c[1]}" if c[0] else "no noise" for c in configs]
-    labels = [f"{a} ({count(n)})" for a, n in zip(labels, counts[:, tried], strict=True)]
+    labels = [f"{a} (n = {span(n)})" for a, n in zip(labels, counts[:, tried], strict=True)]
     fig, axes, add_legend = panels([study.environments[e] for e in tried], labels)
     for (e, ax), (i, config) in product(zip(tried, axes, strict=True), enumerate(configs)):
         curves = study.returns[config][:, :, e]
@@ -184,8 +186,8 @@ def ablation_figure(study, summary, noises):
     """Draw bars of the final return: a wrapper's parameters side by side, grouped by noise rate."""
     groups = [summary[summary["noise"] == noise] for noise in ["", *noises]]
     rates = sorted({rate for group in groups[1:] for rate in group["noise_rate"]}, key=float)
-    counts = [count(group["n"]) if len(group) else "n = 0" for group in groups]
-    labels = [f"{a} ({n})" for a, n in zip(["no noise", *noises], counts, strict=True)]
+    counts = [span(group["n"]) if len(group) else "0" for group in groups]
+    labels = [f"{a} (n = {n})" for a, n in zip(["no noise", *noises], counts, strict=True)]
     fig, axes, add_legend = panels(study.environments, labels)
     width = 0.8 / len(noises)
     cells = zip(axes, study.environments, strict=True)
@@ -215,7 +217,7 @@ def heatmap_figure(study, summary):
     grid = rows.pivot_table(index="noise", columns="noise_rate", values="improvement_percent")
     grid = grid[sorted(grid.columns, key=lambda rate: [float(r) for r in rate.split(" + ")])]
     width = 1.9 + 0.075 * max(map(len, grid.index)) + 0.7 * grid.shape[1]
-    fig = Figure(figsize=(width, 1.5 + 0.32 * len(grid)), layout="constrained")
+    fig = Figure(figsize=(width, max(2.5, 1.5 + 0.32 * len(grid))), layout="constrained")
     ax = fig.subplots()
     image = ax.imshow(grid, cmap="cividis", vmin=-100, vmax=100, aspect="auto")
     for (i, j), value in np.ndenumerate(grid.to_numpy()):
@@ -225,22 +227,27 @@ def heatmap_figure(study, summary):
     ax.set_xticks(range(grid.shape[1]), grid.columns)
     ax.set_yticks(range(len(grid)), grid.index)
     ax.set_xlabel("noise rate p")
-    ax.set_title(f"{study.algorithm} ({count(rows['n'])} seeds)")
-    fig.colorbar(image, ax=ax, extend="both", label="improvement over the baseline (%)")
-    caption = (
-        f"{study.algorithm}: improvement of the final mean return over the baseline, mean over "
-    )
-    caption += f"{len(set(rows['environment']))} environments; the colors end at \u00b1 100 %."
+    ax.set_title(f"{study.algorithm} ({span(rows['n'])} seeds)")
+    fig.colorbar(image, ax=ax, extend="both", label="improvement (%)")
+    caption = f"{study.algorithm}: improvement of the final mean return over the baseline, mean "
+    caption += f"over environments ({span(rows.groupby(['noise', 'noise_rate']).size())} in a "
+    caption += "cell); the colors end at \u00b1 100 %."
     return f"heatmap_{slug(study.algorithm)}", fig, caption
 
 
 def interval_figure(study, statistics):
-    """Draw the configurations with the highest IQM of the improvement, with their intervals."""
-    scope = "all" if "all" in set(statistics["environment"]) else statistics["environment"].iloc[0]
-    rows = statistics[statistics["environment"] == scope]
+    """Draw the configurations with the highest IQM of the improvement, with their intervals.
+
+    Those of several environments together, or, where there are none, those of each.
+    """
+    together = statistics["environment"] == "all"
+    rows = statistics[together if together.any() else statistics["environments"] == 1]
     rows = rows[rows["environments"] == rows["environments"].max()]  # the same ones for all
-    rows = rows.sort_values("improvement_iqm_percent", kind="stable").tail(TOP)
+    of, rows = len(rows), rows.sort_values("improvement_iqm_percent", kind="stable").tail(TOP)
     labels = [f"{r.noise}, p = {r.noise_rate} (n = {r.n})" for r in rows.itertuples()]
+    if not together.any():
+        pairs = zip(rows["environment"], labels, strict=True)
+        labels = [f"{environment}, {label}" for environment, label in pairs]
     width = 5.5 + 0.07 * max(map(len, labels))
     fig = Figure(figsize=(width, 1.2 + 0.32 * len(rows)), layout="constrained")
     left, right = axes = fig.subplots(1, 2, sharey=True, width_ratios=[3, 2])
@@ -256,12 +263,12 @@ def interval_figure(study, statistics):
     left.set_xlabel("improvement over the baseline, IQM (%)")
     right.set_xlabel("probability of improvement")
     right.set_xlim(-0.02, 1.02)
-    where = "all environments" if scope == "all" else scope
-    caption = f"{study.algorithm}, {where}: the {len(rows)} configurations that improve most, with "
-    caption += (
-        "95 % intervals (none for n < 3); dashed: no improvement. They are chosen on the seeds "
-    )
-    caption += "that are shown, so they look better than they are."
+    where = f"{rows['environments'].iloc[0]:.0f} environments" if together.any() else "each alone"
+    caption = f"{study.algorithm}, {where}: improvement with 95 % intervals (none for n < 3); "
+    caption += "dashed: no improvement."
+    if len(rows) < of:
+        caption += f" The {len(rows)} best of {of} are chosen on the seeds that are shown, so "
+        caption += "they look better than they are."
     return f"intervals_{slug(study.algorithm)}", fig, caption
 
 
