@@ -1,11 +1,11 @@
-# `make demo` and `make test` need Python 3.11 or newer and nothing else: they make .venv first.
+# `make demo` and `make test` need git and Python 3.11 or newer with venv; they make .venv first.
 PYTHON ?= python3
 BIN := .venv/bin
 
 .PHONY: demo test lint clean
 
 demo: $(BIN)/.run
-	./benchmark.sh demo
+	PYTHON=$(BIN)/python ./benchmark.sh demo
 	$(BIN)/python analyze.py --runs-dir runs/demo --out runs/demo/results
 	@echo "The curves: .venv/bin/tensorboard --logdir runs/demo"
 	@echo "The tables and figures: runs/demo/results/report.html"

@@ -105,14 +105,16 @@ class NoiseWrapper(gym.Wrapper, RecordConstructorArgs):
 
     def _mark(self, info: dict) -> dict:
         """Record that the noise acted, in a new dict: the environment may reuse its own."""
-        return {**info, "noise": (*info.get("noise", ()), type(self).__name__)}
+        others = info.get("noise")  # of noise wrappers below, or something of the environment's
+        others = others if isinstance(others, tuple) else ()
+        return {**info, "noise": (*others, type(self).__name__)}
 
 
 class ObservationNoise(NoiseWrapper):
     """Base of the observation wrappers: subclasses define ``_perturb`` on float64 arrays.
 
-    Dtype and shape are kept; integer observations are computed in float64, rounded and clipped to
-    their dtype. The observation space is widened to what noise can reach. The observation of
+    The observation has its space's dtype and shape; integers are computed in float64, rounded and
+    clipped to their dtype. The space is widened to what noise can reach. The observation of
     ``reset()`` is perturbed like any other.
     """
 
@@ -139,7 +141,7 @@ class ObservationNoise(NoiseWrapper):
     def _observe(self, observation: np.ndarray, info: dict) -> tuple[np.ndarray, dict]:
         if self._acts():
             noisy = self._perturb(np.asarray(observation, np.float64))
-            return _cast(noisy, observation.dtype), self._mark(info)
+            return _cast(noisy, self.observation_space.dtype), self._mark(info)
         return observation, info
 
     def _widen(self, reach: Callable[[np.ndarray], Sequence]) -> None:
@@ -558,8 +560,11 @@ def make_noisy(env: gym.Env, noises: Sequence[str], rates: Sequence[float]) -> g
     <RandomNormalNoisyReward<RecordEpisodeStatistics<CartPoleEnv<CartPole-v1>>>>
 
     Raises:
-        ValueError: as :func:`canonical_noises`, or an observation space that is not a Box.
+        ValueError: as :func:`canonical_noises`, an observation space that is not a Box, or an
+            environment that has a RecordEpisodeStatistics already.
     """
+    if env.has_wrapper_attr("return_queue"):
+        raise ValueError("make_noisy adds RecordEpisodeStatistics itself: take it off this env")
     pairs = _pair(noises, rates)
     dynamics = [pair for pair in pairs if pair[0].wrapper is RandomEarlyTermination]
     for noise, rate in dynamics:

@@ -46,7 +46,7 @@ LOG_STD_MIN, LOG_STD_MAX = -5, 2
 
 @dataclass
 class Args:
-    """Command-line arguments; names and defaults are CleanRL's and the paper's (Appendix A.2)."""
+    """Command-line arguments; the algorithm's are CleanRL's and the paper's (Appendix A.2)."""
 
     exp_name: str = Path(__file__).stem
     """the name of this experiment, part of the run folder's name"""
@@ -112,12 +112,15 @@ def fail(message, code=2):
     raise SystemExit(code)
 
 
-def check(args, at_least_0, at_least_1, at_most_1):
-    """Return the arguments with their noise in canonical notation, or fail."""
-    for name in (at_least_0 + at_least_1 + at_most_1).split():
-        low, high = int(name in at_least_1.split()), 1 if name in at_most_1.split() else 2**63
-        if not low <= (value := getattr(args, name)) <= high:
-            fail(f"--{name.replace('_', '-')} must be from {low} to {high:g}, not {value}")
+def check(args, ranges):
+    """Return the arguments with their noise in canonical notation, or fail.
+
+    ranges: {(low, high): "the names of the arguments that must be from low to high"}
+    """
+    for (low, high), names in ranges.items():
+        for name in names.split():
+            if not low <= (value := getattr(args, name)) <= high:
+                fail(f"--{name.replace('_', '-')} must be from {low} to {high:g}, not {value}")
     if args.cuda and not torch.cuda.is_available():
         fail("--cuda: PyTorch finds no GPU; leave it out to run on the CPU")
     try:
@@ -133,9 +136,10 @@ def make_env(env_id, **kwargs):
         env = gym.make(env_id, disable_env_checker=True, **kwargs)
     except Exception as error:  # an environment's constructor may raise anything
         fail(f"--env-id {env_id}: {error}")
-    for name, space in (("observation", env.observation_space), ("action", env.action_space)):
-        if not isinstance(space, gym.spaces.Box):
-            fail(f"--env-id {env_id}: choose one whose {name} space is a Box, not {space}")
+    spaces = ("observation", env.observation_space, "fiu"), ("action", env.action_space, "f")
+    for name, space, kinds in spaces:
+        if not isinstance(space, gym.spaces.Box) or space.dtype.kind not in kinds:
+            fail(f"--env-id {env_id}: take one whose {name} space is a Box of floats, not {space}")
     if len(env.action_space.shape) != 1:
         fail(f"--env-id {env_id}: actions must be one-dimensional, not {env.action_space}")
     flat = len(env.observation_space.shape) == 1
@@ -412,12 +416,13 @@ def open_run(args, algorithm, precision):
     if (path := run_dir / "config.json").exists():
         old = json.loads(path.read_text())["args"]
         free = ("runs_dir", "overwrite", "torch_threads", "compile", "checkpoint_frequency")
-        differ = [f"{k} {old.get(k)}, not {new[k]}" for k in new if old.get(k) != new[k]]
-        if differ := [text for text in differ if text.split()[0] not in free]:
-            fail(f"{run_dir} holds a run with {'; '.join(differ)}; --overwrite replaces it")
+        differ = [k for k in new if k not in free and old.get(k) != new[k]]
+        if differ := "; ".join(f"{k} {old.get(k)}, not {new[k]}" for k in differ):
+            fail(f"{run_dir} holds a run with {differ}; --overwrite replaces it")
         return run_dir, lock
     versions = {module.__name__: module.__version__ for module in (torch, gym, mujoco, np)}
-    git = ["/bin/sh", "-c", 'git -C "$0" rev-parse --verify HEAD', Path(__file__).parent]
+    git = 'git -C "$0" describe --always --dirty --abbrev=40 --exclude="*"'
+    git = ["/bin/sh", "-c", git, Path(__file__).parent]
     commit = subprocess.run(git, capture_output=True, text=True).stdout.strip() or None
     config = {"algorithm": algorithm, "args": new, "matmul_precision": precision}
     versions["python"] = sys.version.split()[0]
@@ -538,13 +543,13 @@ class RunLog:
             raise ValueError(f"{self.csv} is shorter than it was")
         vars(self).update(state)
 
-    def finish(self, policy):
+    def finish(self, step, policy):
         """Write policy.pt and, last of all, result.json; the checkpoint has served."""
         total, seconds = self.args.total_timesteps, self.state_dict()["seconds"]
         result = {"final_return_mean": self.mean, "final_return_std": self.std}
         result |= {"final_return_n": self.args.eval_episodes, "total_timesteps": total}
         result |= {"train_return_mean_last_100": np.mean(self.returns) if self.returns else None}
-        result |= {"steps_per_second": total / seconds, "wall_time_seconds": seconds}
+        result |= {"steps_per_second": step / seconds, "wall_time_seconds": seconds}
         counts = {name: [w.times_applied, w.opportunities] for name, w in self.noise.items()}
         fractions = {name: w.applied_fraction for name, w in self.noise.items()}
         result |= {"noise_applied_fraction": fractions, "noise_applied": counts}
@@ -556,13 +561,11 @@ class RunLog:
 
 def train(args, stop=lambda: False):
     """Train one agent; return False if stop(), asked whenever an episode ends, ended it early."""
-    args = check(
-        args,
-        at_least_0="seed eval_frequency learning_starts policy_lr q_lr alpha ",
-        at_least_1="total_timesteps eval_episodes checkpoint_frequency torch_threads buffer_size "
-        "batch_size policy_frequency target_network_frequency ",
-        at_most_1="gamma tau",
-    )
+    ranges = {(0, 1): "gamma tau"}
+    ranges[0, 2**63] = "seed eval_frequency learning_starts policy_lr q_lr alpha"
+    ranges[1, 2**63] = """total_timesteps eval_episodes checkpoint_frequency torch_threads
+        buffer_size batch_size policy_frequency target_network_frequency"""
+    args = check(args, ranges)
     env = make_noisy(make_env(args.env_id), args.noise, args.noise_rate)
     test_env = make_env(args.env_id)  # never sees noise
     if not np.isfinite([env.action_space.low, env.action_space.high]).all():
@@ -631,11 +634,11 @@ def train(args, stop=lambda: False):
             curves = update_critic(actor, critic, target, log_alpha, batch, noise(), args.gamma)
 
             # LEARN: actor and temperature, as many times as steps have passed
-            delayed = global_step % args.policy_frequency == 0
-            for _ in range(args.policy_frequency if delayed else 0):
-                curves |= update_actor(actor, critic, log_alpha, batch[0], noise())
-                if args.autotune:
-                    curves |= update_alpha(actor, log_alpha, batch[0], noise(), target_entropy)
+            if global_step % args.policy_frequency == 0:
+                for _ in range(args.policy_frequency):
+                    curves |= update_actor(actor, critic, log_alpha, batch[0], noise())
+                    if args.autotune:
+                        curves |= update_alpha(actor, log_alpha, batch[0], noise(), target_entropy)
 
             # LEARN: target
             if global_step % args.target_network_frequency == 0:
@@ -661,7 +664,7 @@ def train(args, stop=lambda: False):
                 saved_step = global_step
             observation, _ = env.reset()
 
-    log.finish(actor.state_dict())
+    log.finish(global_step, actor.state_dict())
     return True
 
 

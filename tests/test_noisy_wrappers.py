@@ -775,6 +775,35 @@ def test_integer_observations_are_rounded_and_clipped():
     assert 0 in got[:, 1] and 255 in got[:, 2:] and len(np.unique(got)) > 50
 
 
+@pytest.mark.parametrize("given", [np.array([1, 2, 3]), [1, 2, 3], np.array([1.0, 2.0, 3.0])])
+def test_noise_has_the_dtype_of_the_space_whatever_the_environment_returns(given):
+    """Rounding to the integers that an environment happens to return would undo the noise."""
+    space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
+    env = GenericEnv(space, reset=lambda env: (given, {}))
+    env = RandomNormalNoisyObservation(env, 1.0, 0.1)
+    _, noise = streams(RandomNormalNoisyObservation, 0)
+    expected = [1, 2, 3] + noise.normal(0, 0.1, 3)
+    got = env.reset(seed=0)[0]
+    assert got.dtype == np.float32
+    np.testing.assert_array_equal(got, expected.astype(np.float32))
+
+
+def test_an_environments_own_info_of_noise_gives_way():
+    env = GenericEnv(gym.spaces.Box(-1, 1, (3,)), reset=lambda env: (np.zeros(3), {"noise": 0.3}))
+    assert env.reset()[1] == {"noise": 0.3}
+    env = RandomNormalNoisyObservation(RandomDropoutObservation(env, 1.0, 0.5), 1.0, 0.1)
+    names = ("RandomDropoutObservation", "RandomNormalNoisyObservation")
+    assert env.reset()[1]["noise"] == names
+
+
+def test_statistics_are_recorded_once():
+    env = gym.wrappers.RecordEpisodeStatistics(gym.make("CartPole-v1"))
+    with pytest.raises(ValueError, match="RecordEpisodeStatistics"):
+        make_noisy(env, [], [])
+    with pytest.raises(ValueError, match="RecordEpisodeStatistics"):
+        make_noisy(RandomNormalNoisyReward(env, 0.1, 1.0), [], [])
+
+
 @pytest.mark.parametrize("dtype", [np.int64, np.uint64])
 def test_wide_integers_do_not_overflow(dtype):
     limits = np.iinfo(dtype)

@@ -199,9 +199,11 @@ def test_run_folder(algorithm, tmp_path, capsys):
         "mujoco": mujoco.__version__,
         "numpy": np.__version__,
     }
-    git = ["git", "-C", ROOT, "rev-parse", "HEAD"]
-    commit = subprocess.run(git, capture_output=True, text=True).stdout.strip() or None
-    assert config["git_commit"] == commit
+    commit, changes = (
+        subprocess.run(["git", "-C", ROOT, *words], capture_output=True, text=True).stdout.strip()
+        for words in (["rev-parse", "HEAD"], ["status", "--porcelain", "--untracked-files=no"])
+    )
+    assert config["git_commit"] == (commit + "-dirty" * bool(changes) or None)
 
     rows = evaluations(run_dir)
     assert [row[:2] for row in rows] == [(s, i) for s in (20, 40, 60) for i in range(3)]
@@ -367,6 +369,7 @@ def test_arguments_that_scripts_share_have_one_meaning():
     """Defaults and help differ only where CleanRL's defaults do."""
     pattern = re.compile(r'^    (\w+): (.+?) = (.+)\n    """([^"]+)"""', re.M)
     per_algorithm = {"eval_frequency", "learning_starts", "matmul_precision", "policy_frequency"}
+    per_algorithm.add("total_timesteps")
     meanings = {}
     for script in SCRIPTS.values():
         documented = pattern.findall(inspect.getsource(script.Args))
@@ -464,6 +467,8 @@ BAD = [  # arguments, what the message names, of which scripts
     ({"env_id": "CartPole-v1"}, "Discrete(2)", SCRIPTS),
     ({"env_id": "toy_envs:DiscreteAction-v0"}, "action space is a Box", SCRIPTS),
     ({"env_id": "toy_envs:DictObservation-v0"}, "observation space is a Box", SCRIPTS),
+    ({"env_id": "toy_envs:IntegerAction-v0"}, "action space is a Box of floats", SCRIPTS),
+    ({"env_id": "toy_envs:BooleanObservation-v0"}, "observation space is a Box", SCRIPTS),
     ({"env_id": "toy_envs:Unbounded-v0"}, "bounded actions", OFF_POLICY_ONLY),
     ({"noise": ("RandomNoise(1)",), "noise_rate": (0.1,)}, "RandomMixupObservation", SCRIPTS),
     ({"noise": ("RandomUniformScaleReward(0.5)",), "noise_rate": (0.1,)}, "high", SCRIPTS),
