@@ -223,7 +223,7 @@ def heatmap_figure(study, summary):
     for (i, j), value in np.ndenumerate(grid.to_numpy()):
         if np.isfinite(value):
             ink = "black" if value > 0 else "white"
-            ax.text(j, i, f"{value:+.0f}", ha="center", va="center", color=ink, fontsize=8)
+            ax.text(j, i, f"{round(value):+d}", ha="center", va="center", color=ink, fontsize=8)
     ax.set_xticks(range(grid.shape[1]), grid.columns)
     ax.set_yticks(range(len(grid)), grid.index)
     ax.set_xlabel("noise rate p")

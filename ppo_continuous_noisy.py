@@ -389,7 +389,7 @@ def open_run(args, algorithm, precision):
         fail(f"{run_dir} is in use by another process")
     except OSError as error:
         fail(f"--runs-dir: {error}")
-    for path in run_dir.glob("[!.]*" if args.overwrite else "*.tmp"):
+    for path in filter(Path.is_file, run_dir.glob("[!.]*" if args.overwrite else "*.tmp")):
         path.unlink()
     if (path := run_dir / "config.json").exists():
         old = json.loads(path.read_text())["args"]

@@ -394,7 +394,7 @@ def open_run(args, algorithm, precision):
         fail(f"{run_dir} is in use by another process")
     except OSError as error:
         fail(f"--runs-dir: {error}")
-    for path in run_dir.glob("[!.]*" if args.overwrite else "*.tmp"):
+    for path in filter(Path.is_file, run_dir.glob("[!.]*" if args.overwrite else "*.tmp")):
         path.unlink()
     if (path := run_dir / "config.json").exists():
         old = json.loads(path.read_text())["args"]
@@ -576,7 +576,8 @@ def train(args, stop=lambda: False):
     targets = [*target_actor.parameters(), *target_critic.parameters()]
     critic_optimizer = torch.optim.Adam(critic.parameters(), lr=args.learning_rate, fused=True)
     actor_optimizer = torch.optim.Adam(actor.parameters(), lr=args.learning_rate, fused=True)
-    buffer, log = ReplayBuffer(args.buffer_size, env), RunLog(run_dir, args, env)
+    capacity = min(args.buffer_size, args.total_timesteps)
+    buffer, log = ReplayBuffer(capacity, env), RunLog(run_dir, args, env)
     update_critic = updater(critic_gradient, critic_optimizer, args)
     update_actor = updater(actor_gradient, actor_optimizer, args)
 

@@ -651,7 +651,9 @@ def test_a_folder_of_another_configuration_is_refused_until_overwritten(
     path.write_bytes(b"damaged")
     refused(algorithm, words, capsys)
     free = ["--checkpoint-frequency", "90", "--torch-threads", "1"]  # not part of the identity
+    (path.parent / "somebody's folder").mkdir()
     assert train(algorithm, [*words, "--overwrite", *free])
+    (path.parent / "somebody's folder").rmdir()
     assert_finished(path.parent)
     assert outcome(path.parent) == alone(algorithm)
     line = refused(algorithm, [*words, "--gamma", "0.5"], capsys)  # finished: likewise

@@ -114,6 +114,13 @@ def test_a_seed_gives_one_eval_csv(algorithm, tmp_path):
     torch.testing.assert_close(policy(first), policy(again), rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("algorithm", ["SAC", "TD3"])
+def test_a_buffer_takes_no_more_memory_than_the_run_fills(algorithm, tmp_path):
+    enough, huge = (run(algorithm, tmp_path / str(n), buffer_size=n) for n in (60, 10**15))
+    assert (enough / "eval.csv").read_bytes() == (huge / "eval.csv").read_bytes()
+    torch.testing.assert_close(policy(enough), policy(huge), rtol=0, atol=0)
+
+
 @each_script
 def test_the_test_environment_is_clean(algorithm, tmp_path):
     script = SCRIPTS[algorithm]
