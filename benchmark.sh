@@ -61,13 +61,13 @@ run_one() {
   asked=
   [ ! -e "$1/result.json" ] || return 0
   export OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 PYTHONUNBUFFERED=1
-  echo "# $(date '+%F %T') $(hostname): $2"
+  echo "# $(date '+%F %T') $HOSTNAME: $2"
   bash -c "exec $2" 2>&1 &
   local child=$! status=0
   trap : TERM INT
   trap '[ -n "$asked" ] || kill -TERM "$child" || true; asked=1' USR1
   while kill -0 "$child" 2>/dev/null; do wait "$child" && status=0 || status=$?; done
-  echo "# $(date '+%F %T') $(hostname): exit=$status"
+  echo "# $(date '+%F %T') $HOSTNAME: exit=$status"
   return "$status"
 }
 
@@ -85,7 +85,10 @@ case ${1:-} in # how the executors call this script: run-one and run-logged SWEE
     trap : TERM INT USR1
     run_one "$3" "$4" | { trap '' TERM INT USR1 && { cat || cat >/dev/null; }; } || exit 1
     exit ;;
-  run-logged) run_one "$3" "$4" >>"$(log_of "$3")" || exit 1 && exit ;;
+  run-logged) # exit status 255 ends xargs, if the sweep that started it was killed
+    sweep=${2%-*} && { kill -0 "${sweep##*-}" 2>/dev/null || exit 255; }
+    run_one "$3" "$4" >>"$(log_of "$3")" || exit 1
+    exit ;;
   slurm-task) slurm_task "$2" "$3" ;;
   "" | -h | --help) usage || true; exit ;;
 esac
@@ -113,13 +116,16 @@ done
 [[ $jobs =~ ^([1-9][0-9]*)?$ ]] || fail "--jobs must be a number greater than 0, not '$jobs'"
 [ "$executor" = parallel ] || [ -z "$sshlogin$remote_dir" ] ||
   fail "--sshlogin and --remote-dir belong to --executor parallel"
+[ "$executor" = slurm ] || [ -z "$slurm_args$wait" ] ||
+  fail "--slurm-args and --wait belong to --executor slurm"
 
 if [ -z "${PYTHON:-}" ]; then
   if [ -x .venv/bin/python ]; then PYTHON=.venv/bin/python; else PYTHON=python; fi
 fi
 export PYTHON
-"$PYTHON" -c "import gymnasium" 2>/dev/null ||
-  fail "'$PYTHON' cannot import gymnasium: set PYTHON, or install requirements.txt into .venv"
+"$PYTHON" -c "import sys, importlib.util as u; sys.exit(not all(map(u.find_spec, sys.argv[1:])))" \
+  gymnasium mujoco torch tyro tensorboard 2>/dev/null ||
+  fail "'$PYTHON' lacks a package: set PYTHON, or install requirements.txt into .venv"
 if [ $view = status ]; then exec "$PYTHON" grid.py status "${grid[@]}"; fi
 lines=$("$PYTHON" grid.py list "${grid[@]}") || exit $?
 todo=$(awk -F'\t' -v OFS='\t' '$2 == "todo" {print $1, $3}' <<<"$lines")
@@ -133,19 +139,22 @@ if [ "$executor" = parallel ]; then
     fail "--executor parallel needs GNU parallel (Debian: apt-get install parallel)"
 elif [ "$executor" = slurm ]; then
   command -v sbatch >/dev/null || fail "--executor slurm needs sbatch, on a Slurm cluster"
+else
+  command -v xargs >/dev/null || fail "--executor local needs xargs (Debian: findutils)"
 fi
 if [ "$count" -eq 0 ]; then exec "$PYTHON" grid.py report "${grid[@]}"; fi
 
 first=${lines%%$'\t'*}
-sweep=$(hostname)-$$-$(date +%Y%m%d%H%M%S)
+sweep=$HOSTNAME-$$-$(date +%Y%m%d%H%M%S)
 logs=${first%/*}/logs list=${first%/*}/logs/lines-$sweep.tsv
 mkdir -p "$logs" || fail "--runs-dir: cannot write to ${first%/*}"
 printf '%s\n' "$todo" >"$list"
 
-run_local() {
+run_local() { # nproc obeys OMP_NUM_THREADS, which is about the threads of one process
+  cores=$(env -u OMP_NUM_THREADS -u OMP_THREAD_LIMIT nproc 2>/dev/null) ||
+    cores=$(getconf _NPROCESSORS_ONLN)
   tr '\t\n' '\0\0' <"$list" |
-    xargs -0 -n 2 -P "${jobs:-$(nproc 2>/dev/null || getconf _NPROCESSORS_ONLN)}" \
-      ./benchmark.sh run-logged "$sweep"
+    xargs -0 -n 2 -P "${jobs:-$cores}" ./benchmark.sh run-logged "$sweep"
 }
 stop_local() { kill -TERM -- "-$group"; } # xargs ends at once, the runs after their checkpoint
 
@@ -199,7 +208,9 @@ run_slurm() { # the arrays are over when squeue answers and does not name them
 stop_slurm() { scancel "${ids[@]}"; }
 
 if [ "$executor" = slurm ]; then
-  ids=() && submit
+  ids=()
+  trap '[ -z "${ids[*]}" ] || scancel "${ids[@]}"; exit 130' INT TERM HUP
+  submit
   [ -n "$wait" ] || exit 0
 else
   trap 'rm -f "$list"' EXIT
@@ -211,9 +222,9 @@ fi
 stopped=0
 stop() { # EXIT_STATUS
   if [ "$executor" = parallel ] && [ "$stopped" -ne 0 ]; then kill -TERM -- "-$group"; fi
-  [ "$stopped" -ne 0 ] || echo "stopping: every run writes a checkpoint first" >&2
-  stopped=$1
   "stop_$executor" || true
+  [ "$stopped" -ne 0 ] || echo "stopping: every run writes a checkpoint first" >&2 || true
+  stopped=$1
 }
 
 # The executor has a process group of its own, so that one signal to it reaches every run once.
@@ -221,6 +232,7 @@ set -m
 "run_$executor" &
 group=$! watch=''
 set +m
+trap '' PIPE # whoever reads what this prints may leave first
 trap 'stop 130' INT
 trap 'stop 143' TERM HUP
 [ ! -t 2 ] || { "$PYTHON" grid.py watch "${grid[@]}" & watch=$!; }

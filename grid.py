@@ -123,8 +123,11 @@ def parse_args(argv):
 
 def seeds(text):
     """Read a seed, "3", or a range of seeds, "1-5"."""
-    first, _, last = text.partition("-")
-    return range(int(first), int(last or first) + 1)
+    match = re.fullmatch(r"(\d+)(?:-(\d+))?", text)
+    values = match and range(int(match[1]), int(match[2] or match[1]) + 1)
+    if not values:
+        raise argparse.ArgumentTypeError(f"{text!r} is no seed, as 3, and no range, as 1-5")
+    return values
 
 
 def check(args):
@@ -144,6 +147,10 @@ def check(args):
         name = word.partition("=")[0].removeprefix("--").replace("_", "-")
         if word.startswith("--") and name in OURS:
             fail(f"--{name} is part of the grid: it has an option of its own, before the --")
+        if word.startswith("--") and name == "overwrite":
+            fail("--overwrite would start interrupted runs afresh: delete their folders instead")
+    if not re.fullmatch(r"[^-\t\n][^\t\n]*", args.runs_dir):
+        fail("--runs-dir must be a path without tabs and newlines that begins with no dash")
 
 
 def preset_pairs(preset, algorithm, env_id):
@@ -222,7 +229,7 @@ def check_extra(runs):
         python, script, *args = command
         code = read.format(script.removesuffix(".py"))
         if subprocess.run([python, "-c", code, *args], stdout=subprocess.DEVNULL).returncode:
-            fail(f"{script} does not accept the arguments after --")
+            fail(f"{script} does not accept the arguments after --, or cannot be imported")
 
 
 def is_done(run):
@@ -230,7 +237,11 @@ def is_done(run):
     path = run.folder / "result.json"
     if not path.exists():
         return False
-    if (steps := json.loads(path.read_text())["total_timesteps"]) != run.total_timesteps:
+    try:
+        steps = json.loads(path.read_text())["total_timesteps"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        fail(f"cannot read {path} ({type(error).__name__}: {error}); delete the run's folder")
+    if steps != run.total_timesteps:
         fail(f"{run.folder} holds a finished run of {steps} steps; choose another --runs-dir")
     return True
 
@@ -241,8 +252,9 @@ def look(run, now, fresh):
     done = is_done(run)
     if log.exists():
         with open(log, "rb") as file:
-            age = now - os.fstat(file.fileno()).st_mtime
-            file.seek(max(0, os.fstat(file.fileno()).st_size - 8192))
+            stat = os.fstat(file.fileno())
+            age = now - stat.st_mtime
+            file.seek(max(0, stat.st_size - 8192))
             lines = file.read().decode(errors="replace").splitlines()
     end = END.fullmatch(lines[-1]) if lines else None
     found = [match for match in map(PROGRESS.match, lines) if match]
@@ -303,7 +315,8 @@ def main(argv):
         if args.extra and not all(done):
             check_extra(runs)
         for run, over in zip(runs, done, strict=True):
-            print(run.folder, "done" if over else "todo", shlex.join(run.command), sep="\t")
+            folder = f"{run.folder.parent}/{run.folder.name}"  # with a slash, for --runs-dir . too
+            print(folder, "done" if over else "todo", shlex.join(run.command), sep="\t")
         return 0
     parent = os.getppid()
     while args.view == "watch":

@@ -529,7 +529,63 @@ def test_a_finished_run_of_another_length_is_not_taken_for_done(tmp_path):
     (folder / "result.json").write_text('{"total_timesteps": 20}')
     result = run(*grid)
     assert result.code == 2 and "holds a finished run of 20 steps" in result.err
+    for damaged in ("", "{}", "[]"):
+        (folder / "result.json").write_text(damaged)
+        result = run("status", *grid)
+        assert result.code == 2 and f"cannot read {folder}/result.json" in result.err
+        assert result.err.count("\n") == 1
     assert not (tmp_path / "logs").exists()
+
+
+def test_runs_may_be_in_the_projects_own_folder(tmp_path):
+    project = tmp_path / "project"
+    project.mkdir()
+    for path in (*ROOT.glob("*.py"), ROOT / "benchmark.sh", ROOT / "results"):
+        (project / path.name).symlink_to(path)
+    (project / "benchmark.sh").unlink()
+    shutil.copy(ROOT / "benchmark.sh", project)  # it works in the folder that it is in
+    grid = [*GRID, "--total-timesteps", "400", "--runs-dir", ".", *CHEAP]
+    result = run(*grid, cwd=project)
+    assert result.code == 0, result.out + result.err
+    assert "3 done" in result.out and len(list(project.glob("*/result.json"))) == 3
+    assert len(list(project.glob("logs/*.log"))) == 3
+
+
+def test_openmps_threads_do_not_limit_the_number_of_runs(tmp_path):
+    (tmp_path / "xargs").write_text('#!/bin/sh\necho "$@" >"$(dirname "$0")/arguments"\n')
+    (tmp_path / "xargs").chmod(0o755)
+    env = ENV | {"PATH": f"{tmp_path}:{PATH}", "OMP_NUM_THREADS": "1"}
+    run(*GRID, "--runs-dir", tmp_path / "runs", env=env)
+    cores = len(os.sched_getaffinity(0))
+    assert f"-P {cores} " in (tmp_path / "arguments").read_text()
+
+
+def test_a_sweep_whose_reader_has_left_still_stops_its_runs(tmp_path):
+    grid = [*FOREVER, "--runs-dir", tmp_path, *ON_SIGNAL]
+    runs = folders(*GRID, *grid)
+    sweep = start(*GRID, "--jobs", "2", *grid)
+    wait_for(lambda: is_training(runs[0]) and is_training(runs[1]))
+    sweep.stdout.close()
+    sweep.stderr.close()  # as a closed terminal
+    sweep.send_signal(signal.SIGHUP)
+    sweep.wait(timeout=60)
+    assert not processes(tmp_path)
+    assert all((folder / "checkpoint.pt").exists() for folder in runs[:2])
+    assert not runs[2].exists()
+
+
+def test_a_killed_sweep_starts_no_more_runs(tmp_path):
+    grid = [*FOREVER, "--runs-dir", tmp_path, *ON_SIGNAL]
+    runs = folders(*GRID, *grid)
+    sweep = start(*GRID, "--jobs", "1", *grid)
+    wait_for(lambda: is_training(runs[0]))
+    sweep.kill()
+    sweep.wait()
+    [pid] = processes("sac_continuous_noisy.py", tmp_path)
+    os.kill(pid, signal.SIGTERM)  # the run that the sweep has left behind
+    engine = ["pgrep", "-f", f"run-logged .*-{sweep.pid}-"]
+    wait_for(lambda: subprocess.run(engine, stdout=subprocess.DEVNULL).returncode)
+    assert (runs[0] / "checkpoint.pt").exists() and not runs[1].exists()
 
 
 @pytest.mark.parametrize(
@@ -542,8 +598,13 @@ def test_a_finished_run_of_another_length_is_not_taken_for_done(tmp_path):
         ("custom --noises RandomNormalNoisyReward(1)", "custom needs --noises and --noise-rates"),
         ("best --envs Ant-v5", "the paper has no best noise for sac on Ant-v5"),
         ("demo --envs Nope-v5", "--envs Nope-v5: "),
-        ("demo --seeds 2-1", "the grid is empty"),
-        ("demo --seeds x", "--seeds: invalid seeds value: 'x'"),
+        ("demo --seeds 1 2-1", "--seeds: '2-1' is no seed, as 3, and no range, as 1-5"),
+        ("demo --seeds x", "--seeds: 'x' is no seed"),
+        ("demo --seeds 1-", "--seeds: '1-' is no seed"),
+        ("demo --runs-dir=-x", "--runs-dir must be a path"),
+        ("demo --slurm-args --time=1:00", "--slurm-args and --wait belong to --executor slurm"),
+        ("demo --wait", "--slurm-args and --wait belong to --executor slurm"),
+        ("demo -- --overwrite", "--overwrite would start interrupted runs afresh"),
         ("demo --algos", "--algos: expected at least one argument"),
         ("demo --total-timesteps 0", "--total-timesteps must be greater than 0, not 0"),
         ("demo --executor cloud", "unknown executor 'cloud'; choose local, parallel or slurm"),
