@@ -240,12 +240,13 @@ def interval_figure(study, statistics):
 
     Those of several environments together, or, where there are none, those of each.
     """
-    together = statistics["environment"] == "all"
-    rows = statistics[together if together.any() else statistics["environments"] == 1]
+    all_rows = statistics[statistics["environment"] == "all"]
+    together = len(all_rows) > 0
+    rows = all_rows if together else statistics
     rows = rows[rows["environments"] == rows["environments"].max()]  # the same ones for all
     of, rows = len(rows), rows.sort_values("improvement_iqm_percent", kind="stable").tail(TOP)
     labels = [f"{r.noise}, p = {r.noise_rate} (n = {r.n})" for r in rows.itertuples()]
-    if not together.any():
+    if not together:
         pairs = zip(rows["environment"], labels, strict=True)
         labels = [f"{environment}, {label}" for environment, label in pairs]
     width = 5.5 + 0.07 * max(map(len, labels))
@@ -263,7 +264,7 @@ def interval_figure(study, statistics):
     left.set_xlabel("improvement over the baseline, IQM (%)")
     right.set_xlabel("probability of improvement")
     right.set_xlim(-0.02, 1.02)
-    where = f"{rows['environments'].iloc[0]:.0f} environments" if together.any() else "each alone"
+    where = f"{rows['environments'].iloc[0]:.0f} environments" if together else "each alone"
     caption = f"{study.algorithm}, {where}: improvement with 95 % intervals (none for n < 3); "
     caption += "dashed: no improvement."
     if len(rows) < of:

@@ -86,7 +86,8 @@ case ${1:-} in # how the executors call this script: run-one and run-logged SWEE
     run_one "$3" "$4" | { trap '' TERM INT USR1 && { cat || cat >/dev/null; }; } || exit 1
     exit ;;
   run-logged) # exit status 255 ends xargs, if the sweep that started it was killed
-    sweep=${2%-*} && { kill -0 "${sweep##*-}" 2>/dev/null || exit 255; }
+    driver=${2%-*} # the sweep's name without its time: HOST-PROCESS
+    kill -0 "${driver##*-}" 2>/dev/null || exit 255
     run_one "$3" "$4" >>"$(log_of "$3")" || exit 1
     exit ;;
   slurm-task) slurm_task "$2" "$3" ;;

@@ -143,11 +143,11 @@ def check(args):
             fail(f"--envs {env_id}: {error}")
     if args.preset == "custom" and bool(args.noises) != bool(args.noise_rates):
         fail("custom needs --noises and --noise-rates, or neither of them for the baselines only")
-    for word in args.extra:
+    for word in (word for word in args.extra if word.startswith("--")):
         name = word.partition("=")[0].removeprefix("--").replace("_", "-")
-        if word.startswith("--") and name in OURS:
+        if name in OURS:
             fail(f"--{name} is part of the grid: it has an option of its own, before the --")
-        if word.startswith("--") and name == "overwrite":
+        if name == "overwrite":
             fail("--overwrite would start interrupted runs afresh: delete their folders instead")
     if not re.fullmatch(r"[^-\t\n][^\t\n]*", args.runs_dir):
         fail("--runs-dir must be a path without tabs and newlines that begins with no dash")
