@@ -56,7 +56,7 @@ def command(algorithm, *options, **kwargs):
     path = os.pathsep.join([str(ROOT), str(Path(__file__).parent)])
     line = [sys.executable, SCRIPTS[algorithm].__file__, *map(str, options)]
     env = os.environ | {"PYTHONPATH": path}
-    return subprocess.run(line, capture_output=True, text=True, env=env, timeout=120, **kwargs)
+    return subprocess.run(line, capture_output=True, text=True, env=env, timeout=240, **kwargs)
 
 
 def flags(args):
