@@ -161,6 +161,15 @@ def test_summary_by_hand(sweep):
     assert np.isnan(bad["steps_to_baseline"])
 
 
+def test_the_baseline_reaches_its_own_final_mean():
+    """The mean of one test's returns and of a row of a table may round differently."""
+    rising = np.arange(4)[:, None, None] * 1000
+    curves = rising + np.random.default_rng(1).normal(0, 100, (4, 10, 100))
+    for e in range(100):
+        final_mean, _, _ = analyze.mean_std(curves[-1][:, e])
+        assert analyze.steps_to_reach(curves[..., e], [10, 20, 30, 40], final_mean) == 40
+
+
 def test_best_by_hand(sweep):
     table = sweep.tables["best"]
     assert list(table.columns) == analyze.COLUMNS["best"].split()
