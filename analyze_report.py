@@ -162,8 +162,10 @@ def curves_figure(study, noise):
     x, every = study.steps / unit, max(1, len(study.steps) // 8)
     counts = np.stack([np.isfinite(study.final(config)).sum(axis=0) for config in configs])
     tried = np.flatnonzero(counts[[config[0] == noise for config in configs]].any(axis=0))
-    labels = [f"p = {c[1]}" if c[0] else "no noise" for c in configs]
-    labels = [f"{a} (n = {span(n)})" for a, n in zip(labels, counts[:, tried], strict=True)]
+    labels = []  # a line counts in the panels that have it
+    for (name, rate), n in zip(configs, counts[:, tried], strict=True):
+        seeds = span(n[n > 0]) if n.any() else 0
+        labels.append(f"{f'rate {rate}' if name else 'no noise'} (n = {seeds})")
     fig, axes, add_legend = panels([study.environments[e] for e in tried], labels)
     for (e, ax), (i, config) in product(zip(tried, axes, strict=True), enumerate(configs)):
         curves = study.returns[config][:, :, e]
@@ -245,7 +247,7 @@ def interval_figure(study, statistics):
     rows = all_rows if together else statistics
     rows = rows[rows["environments"] == rows["environments"].max()]  # the same ones for all
     of, rows = len(rows), rows.sort_values("improvement_iqm_percent", kind="stable").tail(TOP)
-    labels = [f"{r.noise}, p = {r.noise_rate} (n = {r.n})" for r in rows.itertuples()]
+    labels = [f"{r.noise}, rate {r.noise_rate} (n = {r.n})" for r in rows.itertuples()]
     if not together:
         pairs = zip(rows["environment"], labels, strict=True)
         labels = [f"{environment}, {label}" for environment, label in pairs]

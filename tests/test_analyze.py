@@ -794,8 +794,8 @@ def test_without_a_common_configuration_each_environment_has_its_interval(tmp_pa
     figure, caption = captions["intervals_SAC"]
     labels = [text.get_text() for text in figure.axes[0].get_yticklabels()]
     assert sorted(labels) == [
-        f"Hopper-v5, {SCALE}, p = 0.10 (n = 3)",
-        f"Walker2d-v5, {ENDING}, p = 0.10 (n = 3)",
+        f"Hopper-v5, {SCALE}, rate 0.10 (n = 3)",
+        f"Walker2d-v5, {ENDING}, rate 0.10 (n = 3)",
     ]
     assert "best" not in caption and "(1 in a cell)" in captions["heatmap_SAC"][1]
 
@@ -824,8 +824,8 @@ def test_figures_have_labels_units_and_n(sweep):
     curves = drawn["curves_SAC_RandomUniformScaleReward_0.5_1.5"]
     assert [text.get_text() for text in curves.legends[0].get_texts()] == [
         "no noise (n = 4)",
-        "p = 0.05 (n = 4)",
-        "p = 0.20 (n = 4)",
+        "rate 0.05 (n = 4)",
+        "rate 0.20 (n = 4)",
     ]
     hopper, pusher = curves.axes
     assert hopper.get_title() == "Hopper-v5" and hopper.get_xlabel() == "training steps (thousands)"
@@ -842,8 +842,12 @@ def test_figures_have_labels_units_and_n(sweep):
         returns[:, :, 0] = np.nan if config[0] == "RandomEarlyTermination(50)" else 1.0
     _, fig, _ = analyze_report.curves_figure(study, "RandomEarlyTermination(50)")
     assert [ax.get_title() for ax in fig.axes] == ["Pusher-v5"]
+    study.returns[SCALE, "0.05"][:, :, 0] = np.nan  # nor has a rate that was not tried a line
+    _, fig, _ = analyze_report.curves_figure(study, SCALE)
+    legend = [text.get_text() for text in fig.legends[0].get_texts()]
+    assert legend[1] == "rate 0.05 (n = 4)" and len(fig.axes) == 2
     labels = [text.get_text() for text in drawn["intervals_SAC"].axes[0].get_yticklabels()]
-    assert labels[-1] == f"{SCALE}, p = 0.05 (n = 4)" and "-" not in labels[-1]
+    assert labels[-1] == f"{SCALE}, rate 0.05 (n = 4)" and "-" not in labels[-1]
 
 
 def test_ablation_bars_stand_side_by_side(tmp_path):
