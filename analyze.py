@@ -495,6 +495,8 @@ def early_rows(study):
     noises = sorted({noise for noise, _ in study.returns if noise})
     for (e, env), noise in product(enumerate(study.environments), noises):
         configs = [config for config in study.returns if config[0] in ("", noise)]
+        if not any(np.isfinite(study.final(c)[:, e]).any() for c in configs if c[0]):
+            continue  # not tried here: the baseline alone would be no comparison
         for i, config in product(places[places >= 0], configs):
             mean, std, n = mean_std(study.returns[config][i, :, e])
             row = dict(zip(KEYS, (study.algorithm, env, noise, config[1]), strict=True))
@@ -581,7 +583,8 @@ def family_notes(statistics):
 def compare_table(ours, listed, paper, mean, std, number):
     """Set the paper's figures beside ours for every row that `paper` or `listed` has.
 
-    `ours` holds every configuration; `mean`, `std` and `number` name its columns. Rows match by
+    `ours` holds every configuration, `listed` those of our own table, or None: all of them, but
+    shown only where the paper has them, too; `mean`, `std` and `number` name its columns. Rows match by
     algorithm, environment without version, noise as run, rate and step. The difference is in
     standard errors: (ours - paper) / sqrt(std^2 / n + paper_std^2 / paper_n).
     """
@@ -595,9 +598,12 @@ def compare_table(ours, listed, paper, mean, std, number):
             plain["steps_millions"] = plain["steps_millions"].astype(float).round(6)
         return list(plain.itertuples(index=False, name=None))
 
-    # `key` unites runs that differ in settings or versions, and only one of them may be listed
-    listed = pd.MultiIndex.from_frame(ours[keys]).isin(pd.MultiIndex.from_frame(listed[keys]))
-    ours, paper = ours.assign(key=key(ours), listed=listed), paper.assign(key=key(paper))
+    ours, paper = ours.assign(key=key(ours), listed=True), paper.assign(key=key(paper))
+    if listed is None:
+        ours = ours[ours["key"].isin(paper["key"])]
+    else:  # `key` unites runs that differ in settings or versions, and only one may be listed
+        rows = pd.MultiIndex.from_frame(listed[keys])
+        ours["listed"] = pd.MultiIndex.from_frame(ours[keys]).isin(rows)
     ours = ours[ours["listed"] | ours["key"].isin(paper["key"])]
     paper = paper.add_prefix("paper_").rename(columns={"paper_key": "key"})
     table = ours.merge(paper, on="key", how="outer")
@@ -627,7 +633,7 @@ def compare_tables(folder, lengths, summary, best, consistency, good, bad, early
         ("best.csv", summary, pd.concat([alone, best]), ("mean", "std", "n")),
         ("consistent.csv", consistency, good, average),
         ("consistently_worse.csv", consistency, bad, average),
-        ("early_performance*.csv", early, early.head(0), ("mean", "std", "n")),
+        ("early_performance*.csv", early, None, ("mean", "std", "n")),
     ):
         papers = [pd.read_csv(path) for path in sorted(Path(folder).glob(pattern))]
         if not papers:

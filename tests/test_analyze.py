@@ -259,6 +259,14 @@ def test_early_performance_of_long_runs_is_every_200_000_steps(tmp_path):
     assert table["std"].isna().all()  # one seed has no standard deviation
 
 
+def test_early_performance_needs_a_run_with_noise(tmp_path):
+    for env in ("Hopper-v5", "Pusher-v5"):
+        write_run(tmp_path / "runs", range(5), env=env)
+    write_run(tmp_path / "runs", range(5), env="Pusher-v5", noise=SCALE, rate=0.5)
+    table = run(tmp_path)["early_performance"]
+    assert set(table["environment"]) == {"Pusher-v5"} and len(table) == 10
+
+
 def test_statistics_by_hand(sweep):
     table = sweep.tables["statistics"]
     assert list(table.columns) == analyze.COLUMNS["statistics"].split()
@@ -751,6 +759,8 @@ def test_compare_sets_the_paper_beside_ours(tmp_path):
     early = tables["compare_early_performance"]
     half = row(early, environment="Hopper-v5", noise_rate="0.05", steps_millions=0.4)
     assert half["paper_mean"] == 2863 and half["n"] == 5 and np.isfinite(half["difference_se"])
+    assert half["listed_by"] == "both"
+    assert set(early[early["mean"].isna()]["listed_by"]) == {"paper"}
     assert len(early) == 75  # the paper's rows
     consistent = tables["compare_consistent"]
     assert len(consistent[consistent["listed_by"] != "ours"]) == 29
