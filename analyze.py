@@ -584,9 +584,9 @@ def compare_table(ours, listed, paper, mean, std, number):
     """Set the paper's figures beside ours for every row that `paper` or `listed` has.
 
     `ours` holds every configuration, `listed` those of our own table, or None: all of them, but
-    shown only where the paper has them, too; `mean`, `std` and `number` name its columns. Rows match by
-    algorithm, environment without version, noise as run, rate and step. The difference is in
-    standard errors: (ours - paper) / sqrt(std^2 / n + paper_std^2 / paper_n).
+    shown only where the paper has them, too; `mean`, `std` and `number` name its columns. Rows
+    match by algorithm, environment without version, noise as run, rate and step. The difference is
+    in standard errors: (ours - paper) / sqrt(std^2 / n + paper_std^2 / paper_n).
     """
     keys = [name for name in (*KEYS, "steps_millions") if name in paper]
 
