@@ -68,7 +68,7 @@ def rate_text(rates):
 def read_config(folder):
     """Read what identifies a run from its config.json."""
     config = json.loads((folder / "config.json").read_text())
-    args = config["args"]
+    args, commit = config["args"], str(config.get("git_commit"))
     settings = {name: value for name, value in args.items() if name not in NOT_SETTINGS}
     return {
         "base": config["algorithm"],
@@ -81,7 +81,7 @@ def read_config(folder):
         "settings": json.dumps(settings, sort_keys=True),
         "versions": config["versions"]
         | {"matmul precision": config.get("matmul_precision")}
-        | {"git commit": str(config.get("git_commit"))[:10]},
+        | {"git commit": commit[:10] + commit[40:]},  # of 40 digits, perhaps with "-dirty"
     }
 
 
@@ -607,6 +607,8 @@ def compare_table(ours, listed, paper, mean, std, number):
     ours = ours[ours["listed"] | ours["key"].isin(paper["key"])]
     paper = paper.add_prefix("paper_").rename(columns={"paper_key": "key"})
     table = ours.merge(paper, on="key", how="outer")
+    figures = [mean, std, number, f"paper_{mean}", f"paper_{std}"]
+    table[figures] = table[figures].astype(float)  # a table without rows has no types
     in_ours, in_paper = table["listed"].eq(True), table["key"].isin(paper["key"])
     table["listed_by"] = np.select([in_ours & in_paper, in_ours], ["both", "ours"], "paper")
     for name in keys:
@@ -749,13 +751,6 @@ def main(args):
         fail(f"no finished run in {args.runs_dir}")
     tables = make_tables(studies, args.compare)
     tables["missing"] = (missing, CAPTIONS["missing"])
-    args.out.mkdir(parents=True, exist_ok=True)
-    for name, (table, caption) in tables.items():
-        write_table(args.out, name, table, caption)
-    drawn = []
-    for name, figure, caption in figures(studies, tables):
-        write_figure(args.out, name, figure)
-        drawn.append((name, caption))
     overview = [f"Finished runs: {(runs['status'] == 'finished').sum()}."]
     overview += [
         f"{study.algorithm}: {study.steps[-1]:,} steps, seeds: {len(study.seeds)}, environments: "
@@ -763,7 +758,20 @@ def main(args):
         for study in studies
     ]
     overview = " ".join(overview)
-    write_report(args.out, tables, drawn, overview, problems, notes)
+    drawn = []
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+        for name, (table, caption) in tables.items():
+            write_table(args.out, name, table, caption)
+        for name, figure, caption in figures(studies, tables):
+            write_figure(args.out, name, figure)
+            drawn.append((name, caption))
+        write_report(args.out, tables, drawn, overview, problems, notes)
+    except OSError as error:
+        fail(f"--out: {error}")
+    old = sorted(path.name for path in args.out.glob("*.csv") if path.stem not in tables)
+    if old:
+        notes.append(f"{args.out} also holds an earlier analysis, not renewed: {', '.join(old)}")
     print(f"{overview}\n\n{text_table('best', tables['best'][0])}\n\n{tables['best'][1]}\n")
     for note in family_notes(tables["statistics"][0]) + notes:
         print(f"note: {note}")

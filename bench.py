@@ -510,8 +510,12 @@ def parse(argv):
     if bool(options.against_cleanrl) != bool(options.cleanrl_python):
         fail("--against-cleanrl and --cleanrl-python go together")
     for name in ("cleanrl_python", "against_sbx"):
-        if (value := getattr(options, name)) and not shutil.which(value):
-            fail(f"--{name.replace('_', '-')}: {value} is not a program")
+        if value := getattr(options, name):
+            if not (found := shutil.which(value)):
+                fail(f"--{name.replace('_', '-')}: {value} is not a program")
+            setattr(options, name, os.path.abspath(found))  # the runs have a folder of their own
+    if options.json and not options.json.parent.is_dir():
+        fail(f"--json: there is no folder {options.json.parent}")
     files = {"cleanrl": "cleanrl/sac_continuous_action.py", "checkout": "sac_continuous_noisy.py"}
     for name, file in files.items():
         if (path := getattr(options, f"against_{name}")) and not (path / file).is_file():

@@ -143,6 +143,8 @@ def check(args):
             fail(f"--envs {env_id}: {error}")
     if args.preset == "custom" and bool(args.noises) != bool(args.noise_rates):
         fail("custom needs --noises and --noise-rates, or neither of them for the baselines only")
+    if {"-h", "--help"} & set(args.extra):
+        fail("--help after the -- would start nothing: ask the script itself")
     for word in (word for word in args.extra if word.startswith("--")):
         name = word.partition("=")[0].removeprefix("--").replace("_", "-")
         if name in OURS:

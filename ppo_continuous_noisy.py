@@ -391,8 +391,12 @@ def open_run(args, algorithm, precision):
         fail(f"--runs-dir: {error}")
     for path in filter(Path.is_file, run_dir.glob("[!.]*" if args.overwrite else "*.tmp")):
         path.unlink()
-    if (path := run_dir / "config.json").exists():
-        old = json.loads(path.read_text())["args"]
+    path = run_dir / "config.json"
+    if any(run_dir.glob("*.json")) or (run_dir / "checkpoint.pt").exists():
+        try:
+            old = json.loads(path.read_text())["args"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            fail(f"cannot read {path} ({type(error).__name__}: {error}); --overwrite starts afresh")
         free = ("runs_dir", "overwrite", "torch_threads", "compile", "checkpoint_frequency")
         differ = [k for k in new if k not in free and old.get(k) != new[k]]
         if differ := "; ".join(f"{k} {old.get(k)}, not {new[k]}" for k in differ):

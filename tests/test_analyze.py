@@ -728,7 +728,35 @@ def test_paths_threads_and_evaluation_steps_do_not_split_rows(tmp_path, capsys):
     assert notes[0] in printed and notes[0] in (tmp_path / "results/report.html").read_text()
 
 
+def test_changed_code_is_another_commit(tmp_path):
+    commit = "0123456789abcdef0123456789abcdef01234567"
+    for seed, changed in ((1, ""), (2, "-dirty")):
+        write_run(tmp_path, [1], seed=seed, folder=f"a{seed}")
+        path = tmp_path / f"a{seed}/config.json"
+        config = json.loads(path.read_text()) | {"git_commit": commit + changed}
+        path.write_text(json.dumps(config))
+    _, [note] = analyze.make_studies(analyze.read_runs(tmp_path))
+    assert "different git commit" in note and "0123456789-dirty (n = 1)" in note
+
+
+def test_what_an_earlier_analysis_left_is_said(tmp_path, capsys):
+    write_run(tmp_path / "runs", [1])
+    run(tmp_path)
+    assert "earlier analysis" not in capsys.readouterr().out
+    (tmp_path / "results/summary_TD3.csv").touch()
+    analyze.main(analyze.Args(runs_dir=tmp_path / "runs", out=tmp_path / "results"))
+    assert "earlier analysis, not renewed: summary_TD3.csv\n" in capsys.readouterr().out
+
+
 # ------------------------------------------------------------------------------ comparing, drawing
+
+
+def test_baselines_alone_stand_beside_the_papers(tmp_path):
+    write_run(tmp_path / "runs", [10])
+    tables = run(tmp_path, compare=Path(analyze.__file__).parent / "results/paper")
+    base = row(tables["compare_best"], algorithm="SAC", environment="Hopper-v5", noise="")
+    assert base["mean"] == 10 and base["paper_mean"] == 2928 and base["listed_by"] == "both"
+    assert len(tables["compare_consistent"]) == 29
 
 
 def test_compare_sets_the_paper_beside_ours(tmp_path):
@@ -980,6 +1008,16 @@ def test_nothing_to_analyze_is_an_error(case, tmp_path, capsys):
     assert error.value.code == 2 and not (tmp_path / "results").exists()
     assert printed.err.startswith("error: ") and printed.err.count("\n") == 1
     assert ("unfinished" in printed.out) == (case == "none finished")
+
+
+def test_a_folder_that_cannot_be_written_is_an_error(tmp_path, capsys):
+    write_run(tmp_path / "runs", [1])
+    (tmp_path / "results").write_text("a file")
+    with pytest.raises(SystemExit) as error:
+        run(tmp_path)
+    printed = capsys.readouterr().err
+    assert error.value.code == 2 and printed.startswith("error: --out: ")
+    assert printed.count("\n") == 1 and (tmp_path / "results").read_text() == "a file"
 
 
 def test_one_baseline_run_is_enough_for_a_report(tmp_path, capsys):

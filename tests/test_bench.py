@@ -92,6 +92,14 @@ def test_a_program_is_measured_and_its_failure_told(capfd, monkeypatch):
     assert "error: SBX td3: " in capfd.readouterr().err
 
 
+def test_a_relative_interpreter_is_found_from_the_folder_of_a_run(tmp_path, monkeypatch):
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin/python").symlink_to(sys.executable)  # as in a virtual environment
+    monkeypatch.chdir(tmp_path / "bin")
+    options = bench.parse(["--against-sbx", "../bin/python"])
+    assert options.against_sbx == str(tmp_path / "bin/python")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -101,6 +109,7 @@ def test_a_program_is_measured_and_its_failure_told(capfd, monkeypatch):
         ("--core 4096", "--core must be one of"),
         ("--against-cleanrl .", "--against-cleanrl and --cleanrl-python go together"),
         ("--against-cleanrl . --cleanrl-python python3", "--against-cleanrl: there is no"),
+        ("--json no-folder/figures.json", "--json: there is no folder no-folder"),
         ("--against-sbx ./no-python", "--against-sbx: ./no-python is not a program"),
     ],
 )

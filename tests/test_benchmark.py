@@ -615,6 +615,7 @@ def test_a_killed_sweep_starts_no_more_runs(tmp_path):
         ("demo --jobs 0", "--jobs must be a number greater than 0, not '0'"),
         ("demo --jobs", "--jobs needs a value"),
         ("demo --sshlogin host", "--sshlogin and --remote-dir belong to --executor parallel"),
+        ("demo -- --help", "--help after the -- would start nothing"),
         ("demo -- --seed 2", "--seed is part of the grid"),
         ("best --algos sac -- --nope", "sac_continuous_noisy.py does not accept the arguments"),
     ],

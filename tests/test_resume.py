@@ -642,6 +642,17 @@ def test_a_checkpoint_without_its_eval_csv_is_refused(algorithm, stopped, capsys
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_checkpoint_without_its_configuration_is_refused(algorithm, stopped, capsys):
+    words, path = stopped
+    config = path.with_name("config.json")
+    for text in ("", "{}", "[]"):
+        config.write_text(text)
+        assert "config.json" in refused(algorithm, words, capsys)
+    config.unlink()
+    assert "config.json" in refused(algorithm, words, capsys)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_a_folder_of_another_configuration_is_refused_until_overwritten(
     algorithm, stopped, alone, tmp_path, capsys
 ):
