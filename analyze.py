@@ -607,8 +607,8 @@ def compare_table(ours, listed, paper, mean, std, number):
     ours = ours[ours["listed"] | ours["key"].isin(paper["key"])]
     paper = paper.add_prefix("paper_").rename(columns={"paper_key": "key"})
     table = ours.merge(paper, on="key", how="outer")
-    figures = [mean, std, number, f"paper_{mean}", f"paper_{std}"]
-    table[figures] = table[figures].astype(float)  # a table without rows has no types
+    numbers = [mean, std, number, f"paper_{mean}", f"paper_{std}"]
+    table[numbers] = table[numbers].astype(float)  # a table without rows has no types
     in_ours, in_paper = table["listed"].eq(True), table["key"].isin(paper["key"])
     table["listed_by"] = np.select([in_ours & in_paper, in_ours], ["both", "ours"], "paper")
     for name in keys:
