@@ -598,13 +598,13 @@ def compare_table(ours, listed, paper, mean, std, number):
             plain["steps_millions"] = plain["steps_millions"].astype(float).round(6)
         return list(plain.itertuples(index=False, name=None))
 
-    ours, paper = ours.assign(key=key(ours), listed=True), paper.assign(key=key(paper))
-    if listed is None:
-        ours = ours[ours["key"].isin(paper["key"])]
-    else:  # `key` unites runs that differ in settings or versions, and only one may be listed
+    ours, paper = ours.assign(key=key(ours)), paper.assign(key=key(paper))
+    shared = ours["key"].isin(paper["key"])
+    ours["listed"] = shared
+    if listed is not None:  # `key` unites settings and versions, only one of which may be listed
         rows = pd.MultiIndex.from_frame(listed[keys])
         ours["listed"] = pd.MultiIndex.from_frame(ours[keys]).isin(rows)
-    ours = ours[ours["listed"] | ours["key"].isin(paper["key"])]
+    ours = ours[ours["listed"] | shared]
     paper = paper.add_prefix("paper_").rename(columns={"paper_key": "key"})
     table = ours.merge(paper, on="key", how="outer")
     numbers = [mean, std, number, f"paper_{mean}", f"paper_{std}"]

@@ -120,7 +120,7 @@ def figures(studies, tables):
 
 def span(numbers):
     """Spell the numbers of seeds or environments behind a line or a panel: "5", or "3 to 5"."""
-    low, high = min(numbers), max(numbers)
+    low, high = min(numbers, default=0), max(numbers, default=0)
     return f"{low}" if low == high else f"{low} to {high}"
 
 
@@ -162,10 +162,9 @@ def curves_figure(study, noise):
     x, every = study.steps / unit, max(1, len(study.steps) // 8)
     counts = np.stack([np.isfinite(study.final(config)).sum(axis=0) for config in configs])
     tried = np.flatnonzero(counts[[config[0] == noise for config in configs]].any(axis=0))
-    labels = []  # a line counts in the panels that have it
-    for (name, rate), n in zip(configs, counts[:, tried], strict=True):
-        seeds = span(n[n > 0]) if n.any() else 0
-        labels.append(f"{f'rate {rate}' if name else 'no noise'} (n = {seeds})")
+    labels = [f"rate {c[1]}" if c[0] else "no noise" for c in configs]
+    seeds = [span(n[n > 0]) for n in counts[:, tried]]  # in the panels that have the line
+    labels = [f"{a} (n = {n})" for a, n in zip(labels, seeds, strict=True)]
     fig, axes, add_legend = panels([study.environments[e] for e in tried], labels)
     for (e, ax), (i, config) in product(zip(tried, axes, strict=True), enumerate(configs)):
         curves = study.returns[config][:, :, e]
@@ -188,8 +187,8 @@ def ablation_figure(study, summary, noises):
     """Draw bars of the final return: a wrapper's parameters side by side, grouped by noise rate."""
     groups = [summary[summary["noise"] == noise] for noise in ["", *noises]]
     rates = sorted({rate for group in groups[1:] for rate in group["noise_rate"]}, key=float)
-    counts = [span(group["n"]) if len(group) else "0" for group in groups]
-    labels = [f"{a} (n = {n})" for a, n in zip(["no noise", *noises], counts, strict=True)]
+    seeds = [span(group["n"]) for group in groups]
+    labels = [f"{a} (n = {n})" for a, n in zip(["no noise", *noises], seeds, strict=True)]
     fig, axes, add_legend = panels(study.environments, labels)
     width = 0.8 / len(noises)
     cells = zip(axes, study.environments, strict=True)
