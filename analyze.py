@@ -12,8 +12,6 @@ https://arxiv.org/abs/2305.02882; IQM and probability of improvement are those o
 (2021), https://arxiv.org/abs/2108.13264.
 """
 
-import json
-import re
 import sys
 from dataclasses import dataclass
 from functools import cache, reduce
@@ -27,21 +25,15 @@ import tyro
 from scipy import stats
 from scipy.optimize import brentq
 
+from analyze_compare import compare_tables, read_paper
 from analyze_report import figures, text_table, write_figure, write_report, write_table
+from analyze_runs import BASELINE, KEYS, make_studies, missing_runs, read_runs
 
-BASELINE = ("", "0.00")  # a configuration is (noise, noise_rate), both as text
-EVAL_HEADER = "step,episode,episodic_return,episodic_length\n"
-# Arguments that do not change what is learned; the grids of evaluation steps are intersected.
-NOT_SETTINGS = {"env_id", "seed", "noise", "noise_rate", "runs_dir", "overwrite", "cuda", "compile"}
-NOT_SETTINGS |= {"torch_threads", "checkpoint_frequency", "eval_frequency"}
 MIN_SEEDS = 3  # with fewer there is no interval
 RESAMPLES = 2000
 # Seeds -> percent of simulated samples whose 95 % interval holds the true IQM: the worst of normal,
 # skewed and two-peaked returns, 500 samples each (tests/test_analyze.py::test_coverage).
 COVERAGE = {3: 92, 5: 95, 10: 94}
-KEYS = ["algorithm", "environment", "noise", "noise_rate"]
-PAPER_SEEDS = {"SAC": 5, "TD3": 5, "PPO": 10}
-PAPER_ENVIRONMENTS, PAPER_STEPS = 5, 1_000_000
 
 
 @dataclass
@@ -54,192 +46,6 @@ class Args:
     """where the tables, the figures and report.html go"""
     compare: Path | None = None
     """a folder with the paper's tables as csv (results/paper): adds compare_* tables"""
-
-
-# ------------------------------------------------------------------------------------------ reading
-
-
-def rate_text(rates):
-    """Spell noise rates as the paper does: [] -> "0.00", [0.5, 1] -> "0.50 + 1.00"."""
-    texts = [f"{r:.2f}" if round(r, 2) == r else f"{r:g}" for r in map(float, rates)]
-    return " + ".join(texts) or BASELINE[1]
-
-
-def read_config(folder):
-    """Read what identifies a run from its config.json."""
-    config = json.loads((folder / "config.json").read_text())
-    args, commit = config["args"], str(config.get("git_commit"))
-    settings = {name: value for name, value in args.items() if name not in NOT_SETTINGS}
-    return {
-        "base": config["algorithm"],
-        "environment": args["env_id"],
-        "noise": " + ".join(args["noise"]),
-        "noise_rate": rate_text(args["noise_rate"]),
-        "seed": int(args["seed"]),
-        "episodes": int(args["eval_episodes"]),
-        "total": int(args["total_timesteps"]),
-        "settings": json.dumps(settings, sort_keys=True),
-        "versions": config["versions"]
-        | {"matmul precision": config.get("matmul_precision")}
-        | {"git commit": commit[:10] + commit[40:]},  # of 40 digits, perhaps with "-dirty"
-    }
-
-
-def read_evaluations(folder, episodes, total):
-    """Read eval.csv: the evaluation steps and the mean return over the episodes of each.
-
-    Raises ValueError unless every evaluation is whole, in order, and the last is at step `total`.
-    """
-    text = (folder / "eval.csv").read_text()
-    if not text.startswith(EVAL_HEADER):
-        raise ValueError("eval.csv: unexpected header")
-    if not text.endswith("\n"):
-        raise ValueError("eval.csv: the last line is half-written")
-    if len(text) == len(EVAL_HEADER):
-        raise ValueError("eval.csv: no evaluation")
-    rows = np.loadtxt(folder / "eval.csv", delimiter=",", skiprows=1, ndmin=2, comments=None)
-    if rows.shape[1] != 4 or len(rows) % episodes or not np.isfinite(rows).all():
-        raise ValueError("eval.csv: incomplete or non-numeric lines")
-    step, episode, episodic_return, _ = np.moveaxis(rows.reshape(-1, episodes, 4), 2, 0)
-    if (episode != np.arange(episodes)).any() or (step != step[:, :1]).any():
-        raise ValueError("eval.csv: an evaluation is incomplete")
-    if (np.diff(step[:, 0]) <= 0).any() or step[-1, 0] != total:
-        raise ValueError(f"eval.csv: steps do not ascend to {total}")
-    return step[:, 0].astype(int), episodic_return.mean(axis=1)
-
-
-def read_runs(runs_dir):
-    """Read all run folders; `status` is finished, unfinished, corrupt or duplicate."""
-    rows = []
-    for folder in sorted(path for path in Path(runs_dir).iterdir() if path.is_dir()):
-        if "__" not in folder.name and not (folder / "config.json").exists():
-            continue  # the logs of a sweep, say
-        row = {"run": folder.name, "status": "corrupt"}
-        rows.append(row)
-        try:
-            row |= read_config(folder)
-            if not (folder / "result.json").exists():
-                row |= {"status": "unfinished", "reason": f"no result.json; {progress(folder)}"}
-                continue
-            result = json.loads((folder / "result.json").read_text())
-            steps, returns = read_evaluations(folder, row["episodes"], row["total"])
-            if not np.isclose(returns[-1], result["final_return_mean"], rtol=1e-3, atol=1e-3):
-                raise ValueError("eval.csv and result.json disagree on the final return")
-            row |= {"status": "finished", "steps": steps, "returns": returns}
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
-            row["reason"] = " ".join(f"{type(error).__name__}: {error}".split())
-    runs = pd.DataFrame(rows, columns=COLUMNS["runs"].split(), dtype=object)
-    for base, group in runs.groupby("base"):
-        runs.loc[group.index, "algorithm"] = labels(base, group)
-    twice = (runs["status"] == "finished") & runs.duplicated(["status", *KEYS, "seed"])
-    runs.loc[twice, ["status", "reason"]] = ["duplicate", "same configuration and seed as another"]
-    return runs
-
-
-def labels(base, group):
-    """Name each run's algorithm so that runs with different settings never share a row.
-
-    It is the plain name (SAC) unless runs differ in settings, or there is a newer version of the
-    environment; then it says what differs (SAC [total_timesteps=100000]).
-    """
-    settings = {text: json.loads(text) for text in set(group["settings"])}
-    names = sorted(set().union(*settings.values()))
-    names = [n for n in names if len({str(values.get(n)) for values in settings.values()}) > 1]
-    newest = {}
-    for env, version in map(split_version, group["environment"]):
-        newest[env] = max(newest.get(env, ""), version, key=lambda text: int(text or 0))
-    result = []
-    for text, env in zip(group["settings"], group["environment"], strict=True):
-        parts = [f"{name}={settings[text].get(name)}" for name in names]
-        name, version = split_version(env)
-        parts += [f"environments v{version}"] if version != newest[name] else []
-        result.append(base + (f" [{', '.join(parts)}]" if parts else ""))
-    return result
-
-
-def split_version(environment):
-    """Split "Hopper-v5" into ("Hopper", "5"); an id without a version gives "" for it."""
-    return re.fullmatch(r"(.*?)(?:-v(\d+))?", environment).groups("")
-
-
-def progress(folder):
-    """Say in words how far an unfinished run is."""
-    try:
-        last = (folder / "eval.csv").read_text().rsplit("\n", 2)[-2]
-        return f"evaluated up to step {int(last.split(',')[0]):,}"
-    except (OSError, ValueError, IndexError):
-        return "no evaluation yet"
-
-
-def missing_runs(runs):
-    """List the seeds that a configuration lacks in an environment and that other runs have.
-
-    An environment in which anything was run should have the baseline.
-    """
-    rows = []
-    for algorithm, group in runs[runs["base"].notna()].groupby("algorithm"):
-        found = set(group[[*KEYS[1:], "seed"]].itertuples(index=False, name=None))
-        wanted = {(env, *config) for env, *config, _ in found for config in (config, BASELINE)}
-        wanted = sorted(wanted, key=lambda key: (key[0], order(key[1:])))
-        for key, seed in product(wanted, sorted(set(group["seed"]))):
-            if (*key, seed) not in found:
-                rows.append((algorithm, *key, int(seed), "missing", "no run folder"))
-    return pd.DataFrame(rows, columns=[*KEYS, "seed", "status", "reason"])
-
-
-def order(config):
-    """Sort key of a configuration: by noise, then by rates as numbers; the baseline comes first."""
-    return config[0], [float(rate) for rate in config[1].split(" + ")]
-
-
-@dataclass
-class Study:
-    """The finished runs that may be compared: one algorithm with one set of settings."""
-
-    algorithm: str
-    base: str
-    environments: list
-    seeds: list
-    steps: np.ndarray  # the evaluation steps that all runs share
-    returns: dict  # (noise, noise_rate) -> array (steps x seeds x envs), NaN where there is no run
-
-    def final(self, config):
-        """Return the (seeds x envs) array of final test returns."""
-        return self.returns[config][-1]
-
-
-def make_studies(runs):
-    """Arrange the finished runs into a list of Study, and list in words what had to be cut."""
-    studies, notes = [], []
-    finished = runs[runs["status"] == "finished"]
-    for algorithm, group in finished.groupby("algorithm"):
-        grids = list({steps.tobytes(): steps for steps in group["steps"]}.values())
-        grid = reduce(np.intersect1d, grids)
-        longest = max(map(len, grids))
-        if len(grid) < longest:
-            notes.append(
-                f"{algorithm}: runs differ in their evaluation steps; curves are cut to the "
-                f"{len(grid)} steps that all share (of up to {longest})"
-            )
-        envs, seeds = sorted(set(group["environment"])), sorted(set(group["seed"]))
-        configs = {*zip(group["noise"], group["noise_rate"], strict=True), BASELINE}
-        shape = (len(grid), len(seeds), len(envs))
-        returns = {config: np.full(shape, np.nan) for config in sorted(configs, key=order)}
-        for run in group.itertuples():
-            place = seeds.index(run.seed), envs.index(run.environment)
-            shared = np.isin(run.steps, grid)
-            returns[run.noise, run.noise_rate][:, *place] = run.returns[shared]
-        for env, values in zip(envs, returns[BASELINE][-1].T, strict=True):
-            if np.isnan(values).all():
-                notes.append(f"{algorithm}: no finished baseline on {env}, so no improvement there")
-        for name in sorted(set().union(*group["versions"])):
-            counts = group["versions"].map(lambda v, k=name: str(v.get(k))).value_counts()
-            if len(counts) > 1:
-                found = ", ".join(f"{version} (n = {n})" for version, n in sorted(counts.items()))
-                notes.append(f"{algorithm}: runs with different {name} share rows: {found}")
-        base = group["base"].iloc[0]
-        studies.append(Study(algorithm, base, envs, seeds, grid, returns))
-    return studies, notes
 
 
 # -------------------------------------------------------------- statistics on (seeds x envs) arrays
@@ -401,8 +207,6 @@ def steps_to_reach(curves, steps, target):
 # ------------------------------------------------------------------------------------------- tables
 
 COLUMNS = {
-    "runs": """run status reason base algorithm environment noise noise_rate seed episodes total
-        settings versions steps returns""",
     "summary": """algorithm environment noise noise_rate n mean std n_baseline baseline_mean
         baseline_std improvement_percent std_change_percent steps_to_baseline""",
     "best": """algorithm environment noise noise_rate baseline_mean baseline_std noisy_mean
@@ -580,82 +384,6 @@ def family_notes(statistics):
     return notes
 
 
-def compare_table(ours, listed, paper, mean, std, number):
-    """Set the paper's figures beside ours for every row that `paper` or `listed` has.
-
-    `ours` holds every configuration, `listed` those of our own table, or None: all of them, but
-    shown only where the paper has them, too; `mean`, `std` and `number` name its columns. Rows
-    match by algorithm, environment without version, noise as run, rate and step. The difference is
-    in standard errors: (ours - paper) / sqrt(std^2 / n + paper_std^2 / paper_n).
-    """
-    keys = [name for name in (*KEYS, "steps_millions") if name in paper]
-
-    def key(table):
-        plain = table[keys].assign(algorithm=table["algorithm"].str.split(" [", regex=False).str[0])
-        if "environment" in keys:
-            plain["environment"] = plain["environment"].map(lambda env: split_version(env)[0])
-        if "steps_millions" in keys:
-            plain["steps_millions"] = plain["steps_millions"].astype(float).round(6)
-        return list(plain.itertuples(index=False, name=None))
-
-    ours, paper = ours.assign(key=key(ours)), paper.assign(key=key(paper))
-    shared = ours["key"].isin(paper["key"])
-    ours["listed"] = shared
-    if listed is not None:  # `key` unites settings and versions, only one of which may be listed
-        rows = pd.MultiIndex.from_frame(listed[keys])
-        ours["listed"] = pd.MultiIndex.from_frame(ours[keys]).isin(rows)
-    ours = ours[ours["listed"] | shared]
-    paper = paper.add_prefix("paper_").rename(columns={"paper_key": "key"})
-    table = ours.merge(paper, on="key", how="outer")
-    numbers = [mean, std, number, f"paper_{mean}", f"paper_{std}"]
-    table[numbers] = table[numbers].astype(float)  # a table without rows has no types
-    in_ours, in_paper = table["listed"].eq(True), table["key"].isin(paper["key"])
-    table["listed_by"] = np.select([in_ours & in_paper, in_ours], ["both", "ours"], "paper")
-    for name in keys:
-        table[name] = table[name].fillna(table[f"paper_{name}"])
-    environments = number == "environments"
-    paper_n = PAPER_ENVIRONMENTS if environments else table["paper_algorithm"].map(PAPER_SEEDS)
-    variance = table[std] ** 2 / table[number] + table[f"paper_{std}"] ** 2 / paper_n
-    difference = table[mean] - table[f"paper_{mean}"]
-    table["difference_se"] = difference / np.sqrt(variance.where(variance > 0))
-    names = [*keys, "listed_by", number, mean, std, f"paper_{mean}", f"paper_{std}"]
-    return table.sort_values(keys, kind="stable")[[*names, "difference_se"]]
-
-
-def compare_tables(folder, lengths, summary, best, consistency, good, bad, early):
-    """Yield (name, table) for each of the paper's tables found in `folder`.
-
-    `lengths` has the steps of each algorithm: final returns after fewer steps than the paper's are
-    shown beside them, without a difference.
-    """
-    other = [algorithm for algorithm, steps in lengths.items() if steps != PAPER_STEPS]
-    alone = summary[summary["noise"] == ""]  # best.csv holds baselines too: rows of their own here
-    average = ("average_improvement_percent", "std_improvement_percent", "environments")
-    for pattern, ours, listed, columns in (
-        ("best.csv", summary, pd.concat([alone, best]), ("mean", "std", "n")),
-        ("consistent.csv", consistency, good, average),
-        ("consistently_worse.csv", consistency, bad, average),
-        ("early_performance*.csv", early, None, ("mean", "std", "n")),
-    ):
-        papers = [pd.read_csv(path) for path in sorted(Path(folder).glob(pattern))]
-        if not papers:
-            continue
-        paper = pd.concat(papers, ignore_index=True)
-        if "noise_as_run" not in paper:
-            fail(f"{folder} has no tables of the paper (results/paper has them)")
-        paper["noise"] = paper["noise_as_run"]
-        paper["noise_rate"] = paper["noise_rate"].map(lambda rate: rate_text([rate]))
-        if pattern == "best.csv":
-            noisy = paper.rename(columns={"noisy_mean": "mean", "noisy_std": "std"})
-            baseline = paper.rename(columns={"baseline_mean": "mean", "baseline_std": "std"})
-            baseline = baseline.assign(noise=BASELINE[0], noise_rate=BASELINE[1])
-            paper = pd.concat([noisy, baseline], ignore_index=True)
-        table = compare_table(ours, listed, paper, *columns)
-        if "steps_millions" not in table:
-            table.loc[table["algorithm"].isin(other), "difference_se"] = np.nan
-        yield f"compare_{pattern.split('.')[0].rstrip('*')}", table
-
-
 # --------------------------------------------------------------------------------------------- main
 
 CAPTIONS = {
@@ -695,8 +423,11 @@ Ours:""",
 CAPTIONS = {name: " ".join(text.split()) for name, text in CAPTIONS.items()}
 
 
-def make_tables(studies, compare=None):
-    """Compute every table: a dict of name -> (frame, caption), in the order of the report."""
+def make_tables(studies, paper=None):
+    """Compute every table: a dict of name -> (frame, caption), in the order of the report.
+
+    `paper` has the paper's tables (read_paper), to be set beside ours.
+    """
     summary = frame("summary", (row for study in studies for row in summary_rows(study)))
     best = frame("best", (row for study in studies for row in best_rows(study, summary)))
     consistency = frame("consistency", consistency_rows(summary))
@@ -718,11 +449,11 @@ def make_tables(studies, compare=None):
         same = [study.algorithm for study in studies if study.base == base]
         table = summary[summary["algorithm"].isin(same)]
         tables[f"summary_{base}"] = (table, CAPTIONS["summary"])
-    if compare:
+    if paper:
         lengths = {study.algorithm: study.steps[-1] for study in studies}
         caption = ", ".join(f"{algorithm} {steps:,} steps" for algorithm, steps in lengths.items())
         listed = summary, best, consistency, good, bad, early
-        for name, table in compare_tables(compare, lengths, *listed):
+        for name, table in compare_tables(paper, lengths, *listed):
             tables[name] = (table, f"{CAPTIONS['compare']} {caption}.")
     return tables
 
@@ -737,8 +468,10 @@ def main(args):
     """Read the runs, write tables, figures and report, and print the main table."""
     if not args.runs_dir.is_dir():
         fail(f"no folder {args.runs_dir}")
-    if args.compare and not any(args.compare.glob("*.csv")):
-        fail(f"no csv files in {args.compare}")
+    try:
+        paper = read_paper(args.compare) if args.compare else None
+    except ValueError as error:
+        fail(error)
     runs = read_runs(args.runs_dir)
     studies, notes = make_studies(runs)
     missing = pd.concat([runs[runs["status"] != "finished"], missing_runs(runs)])
@@ -749,7 +482,7 @@ def main(args):
     if not studies:
         print(text_table("missing", missing))
         fail(f"no finished run in {args.runs_dir}")
-    tables = make_tables(studies, args.compare)
+    tables = make_tables(studies, paper)
     tables["missing"] = (missing, CAPTIONS["missing"])
     overview = [f"Finished runs: {(runs['status'] == 'finished').sum()}."]
     overview += [

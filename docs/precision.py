@@ -10,7 +10,7 @@ from scipy import stats
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
-from analyze import read_runs  # noqa: E402
+from analyze_runs import read_runs  # noqa: E402
 
 runs = read_runs(HERE.parent / "results/precision")
 precision = [json.loads(settings)["matmul_precision"] for settings in runs["settings"]]

@@ -15,7 +15,9 @@ from tabulate import tabulate
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
-from analyze import KEYS, PAPER_SEEDS, make_studies, make_tables, read_runs  # noqa: E402
+from analyze import make_tables  # noqa: E402
+from analyze_compare import PAPER_SEEDS, read_paper  # noqa: E402
+from analyze_runs import KEYS, make_studies, read_runs  # noqa: E402
 
 # Training returns of PPO in CleanRL's documentation, mean and standard deviation of three seeds:
 # the first two at commit 2d660b6 (October 2023), the last since commit 35896b1 (November 2023).
@@ -127,7 +129,7 @@ def improvements(table):
 
 
 studies, _ = make_studies(read_runs(HERE / "runs"))
-tables = make_tables(studies, HERE / "paper")
+tables = make_tables(studies, read_paper(HERE / "paper"))
 statistics, summary, early = (
     plain(tables[name][0]) for name in ("statistics", "summary_PPO", "compare_early_performance")
 )

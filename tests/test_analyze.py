@@ -25,6 +25,7 @@ from scipy import stats
 sys.path.insert(0, str(Path(__file__).parent.parent))
 import analyze
 import analyze_report
+import analyze_runs
 
 NAN = float("nan")
 SCALE = "RandomUniformScaleReward(0.5, 1.5)"
@@ -503,8 +504,10 @@ def test_benjamini_hochberg_by_hand_and_its_limit():
 def test_five_against_five_cannot_reach_significance_alone_among_90(tmp_path):
     rng = np.random.default_rng(0)
     returns = {(f"N({i})", "0.05"): rng.normal(0, 1, (1, 5, 1)) for i in range(90)}
-    returns = {analyze.BASELINE: rng.normal(1000, 1, (1, 5, 1))} | returns  # all lose every pair
-    study = analyze.Study("SAC", "SAC", ["Hopper-v5"], [1, 2, 3, 4, 5], np.array([1]), returns)
+    returns = {
+        analyze_runs.BASELINE: rng.normal(1000, 1, (1, 5, 1))
+    } | returns  # all lose every pair
+    study = analyze_runs.Study("SAC", "SAC", ["Hopper-v5"], [1, 2, 3, 4, 5], np.array([1]), returns)
     table = analyze.adjust(analyze.frame("statistics", analyze.statistics_rows(study)))
     assert table["p"].iloc[1] == pytest.approx(2 / 252)
     assert table["smallest_p_adjusted"].iloc[1] == pytest.approx(90 * 2 / 252)
@@ -599,19 +602,19 @@ def test_corrupt_evaluations_are_reported_and_left_out(name, tmp_path):
     text = (folder / "eval.csv").read_text()
     assert CORRUPTIONS[name](text) != text
     (folder / "eval.csv").write_text(CORRUPTIONS[name](text))
-    runs = analyze.read_runs(tmp_path)
+    runs = analyze_runs.read_runs(tmp_path)
     assert list(runs["status"]) == ["finished", "finished", "corrupt"]
     assert runs["reason"].iloc[2].count("\n") == 0 and len(runs["reason"].iloc[2]) > 10
-    (study,), _ = analyze.make_studies(runs)
-    assert study.final(analyze.BASELINE).ravel().tolist() == [51, 52]
-    assert analyze.missing_runs(runs).empty  # it is there, only broken
+    (study,), _ = analyze_runs.make_studies(runs)
+    assert study.final(analyze_runs.BASELINE).ravel().tolist() == [51, 52]
+    assert analyze_runs.missing_runs(runs).empty  # it is there, only broken
 
 
 def test_a_run_that_was_cut_short_is_not_finished(tmp_path):
     folder = write_run(tmp_path, [5, 5, 5])
     text = (folder / "eval.csv").read_text()
     (folder / "eval.csv").write_text(re.sub(r"(?m)^30000,.*\n", "", text))
-    (status,), (reason,) = analyze.read_runs(tmp_path)[["status", "reason"]].T.values
+    (status,), (reason,) = analyze_runs.read_runs(tmp_path)[["status", "reason"]].T.values
     assert status == "corrupt" and "steps do not ascend to 30000" in reason
 
 
@@ -621,7 +624,7 @@ def test_corrupt_json_is_reported_and_left_out(name, text, tmp_path):
     write_run(tmp_path, [1.0], seed=1)
     folder = write_run(tmp_path, [2.0], seed=2)
     (folder / name).unlink() if text is None else (folder / name).write_text(text)
-    runs = analyze.read_runs(tmp_path)
+    runs = analyze_runs.read_runs(tmp_path)
     expected = "unfinished" if (name, text) == ("result.json", None) else "corrupt"
     assert list(runs["status"]) == ["finished", expected]
 
@@ -655,7 +658,7 @@ def test_unfinished_missing_and_duplicate_runs_are_listed(tmp_path, capsys):
 def test_only_the_older_versions_of_an_environment_are_labelled(tmp_path):
     for env in ("Hopper-v5", "Walker2d-v9", "Walker2d-v10", "Ant", "Ant-v4"):
         write_run(tmp_path, [10], env=env)
-    runs = analyze.read_runs(tmp_path).set_index("environment")["algorithm"]
+    runs = analyze_runs.read_runs(tmp_path).set_index("environment")["algorithm"]
     assert runs["Walker2d-v9"] == "SAC [environments v9]"
     assert runs["Ant"] == "SAC [environments v]"
     assert set(runs[["Hopper-v5", "Walker2d-v10", "Ant-v4"]]) == {"SAC"}
@@ -666,7 +669,7 @@ def test_a_noise_is_not_missing_where_nobody_tried_it(tmp_path):
         write_run(tmp_path, [10], env="Hopper-v5", seed=seed)
     write_run(tmp_path, [10], env="Hopper-v5", seed=1, noise=SCALE, rate=0.5)
     write_run(tmp_path, [10], env="Pusher-v5", seed=2, noise=ENDING, rate=0.1)
-    missing = analyze.missing_runs(analyze.read_runs(tmp_path))
+    missing = analyze_runs.missing_runs(analyze_runs.read_runs(tmp_path))
     assert missing[["environment", "noise", "seed"]].to_numpy().tolist() == [
         ["Hopper-v5", SCALE, 2],
         ["Pusher-v5", "", 1],
@@ -700,7 +703,7 @@ def test_runs_that_differ_never_share_a_row(change, label, tmp_path):
         write_run(tmp_path / "runs", [10], seed=seed, folder=f"a{seed}")
         write_run(tmp_path / "runs", [99], seed=seed, folder=f"b{seed}", **change)
         write_run(tmp_path / "runs", [50], seed=seed, folder=f"c{seed}", noise=SCALE, rate=0.1)
-    runs = analyze.read_runs(tmp_path / "runs")
+    runs = analyze_runs.read_runs(tmp_path / "runs")
     assert set(runs["status"]) == {"finished"} and label in set(runs["algorithm"])
     tables = run(tmp_path)
     summary = pd.concat([t for name, t in tables.items() if name.startswith("summary_")])
@@ -717,10 +720,10 @@ def test_paths_threads_and_evaluation_steps_do_not_split_rows(tmp_path, capsys):
     write_run(tmp_path / "runs", [1, 2, 3, 4], seed=1)
     write_run(tmp_path / "runs", [6, 8], seed=2, every=20_000, torch_threads=4, cuda=True)
     write_run(tmp_path / "runs", [1, 2, 3, 5], seed=3, runs_dir="x", versions={"mujoco": "3.14.0"})
-    runs = analyze.read_runs(tmp_path / "runs")
-    (study,), notes = analyze.make_studies(runs)
+    runs = analyze_runs.read_runs(tmp_path / "runs")
+    (study,), notes = analyze_runs.make_studies(runs)
     assert study.algorithm == "SAC" and study.steps.tolist() == [20_000, 40_000]
-    assert study.returns[analyze.BASELINE][:, :, 0].tolist() == [[2, 6, 2], [4, 8, 5]]
+    assert study.returns[analyze_runs.BASELINE][:, :, 0].tolist() == [[2, 6, 2], [4, 8, 5]]
     assert "cut to the 2 steps that all share (of up to 4)" in notes[0]
     assert "different mujoco" in notes[1] and "3.14.0 (n = 1)" in notes[1]
     run(tmp_path)
@@ -735,7 +738,7 @@ def test_changed_code_is_another_commit(tmp_path):
         path = tmp_path / f"a{seed}/config.json"
         config = json.loads(path.read_text()) | {"git_commit": commit + changed}
         path.write_text(json.dumps(config))
-    _, [note] = analyze.make_studies(analyze.read_runs(tmp_path))
+    _, [note] = analyze_runs.make_studies(analyze_runs.read_runs(tmp_path))
     assert "different git commit" in note and "0123456789-dirty (n = 1)" in note
 
 
@@ -826,7 +829,7 @@ def test_without_a_common_configuration_each_environment_has_its_interval(tmp_pa
         for env, noise in (("Hopper-v5", SCALE), ("Walker2d-v5", ENDING)):
             write_run(tmp_path, [seed], env=env, seed=seed)
             write_run(tmp_path, [seed + 1], env=env, seed=seed, noise=noise, rate=0.1)
-    studies, _ = analyze.make_studies(analyze.read_runs(tmp_path))
+    studies, _ = analyze_runs.make_studies(analyze_runs.read_runs(tmp_path))
     drawn = list(analyze_report.figures(studies, analyze.make_tables(studies)))
     captions = {name: (figure, caption) for name, figure, caption in drawn}
     figure, caption = captions["intervals_SAC"]
@@ -850,7 +853,7 @@ def test_odd_sweeps_are_analysed_too(tmp_path):
 
 
 def test_figures_have_labels_units_and_n(sweep):
-    studies, _ = analyze.make_studies(analyze.read_runs(sweep.path / "runs"))
+    studies, _ = analyze_runs.make_studies(analyze_runs.read_runs(sweep.path / "runs"))
     tables = analyze.make_tables(studies)
     drawn = {name: figure for name, figure, _ in analyze_report.figures(studies, tables)}
     assert set(drawn) == {
@@ -895,7 +898,7 @@ def test_ablation_bars_stand_side_by_side(tmp_path):
         write_run(tmp_path, [20 * seed], seed=seed, noise=SCALE, rate=0.05)
         write_run(tmp_path, [30 * seed], seed=seed, noise=other, rate=0.05)
         write_run(tmp_path, [40 * seed], seed=seed, noise=other, rate=0.5)
-    studies, _ = analyze.make_studies(analyze.read_runs(tmp_path))
+    studies, _ = analyze_runs.make_studies(analyze_runs.read_runs(tmp_path))
     drawn = {n: f for n, f, _ in analyze_report.figures(studies, analyze.make_tables(studies))}
     figure = drawn["ablation_SAC_RandomUniformScaleReward"]
     (ax,) = figure.axes
