@@ -4,6 +4,7 @@ import base64
 import re
 import zlib
 from itertools import product
+from pathlib import Path
 
 import jinja2
 import matplotlib
@@ -283,100 +284,6 @@ def write_figure(out, name, fig):
 
 # ------------------------------------------------------------------------------------------- report
 
-PAGE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>Noisy environment augmentation: results</title>
-<style>
-:root { color-scheme: light; }
-* { box-sizing: border-box; }
-body { font: 16px/1.5 system-ui, sans-serif; color: #1a1a1a; background: #fff;
-  max-width: 84rem; margin: 0 auto; padding: 1rem; overflow-wrap: anywhere; }
-h1 { font-size: 1.6rem; line-height: 1.2; } h2 { font-size: 1.25rem; margin-top: 2.5rem; }
-nav a { display: inline-block; margin-right: 1rem; } a { color: #0b4f9c; }
-.alert { border: 2px solid #a11; border-left-width: 10px; padding: .5rem 1rem; }
-.notes { border-left: 10px solid #777; padding: .5rem 1rem; background: #f4f4f4; }
-p.caption { white-space: pre-line; }
-p.caption, figcaption { font-size: .85rem; color: #444; max-width: 60rem; }
-.scroll { overflow: auto; max-height: 75vh; border: 1px solid #ccc; }
-table { border-collapse: collapse; font-size: .85rem; font-variant-numeric: tabular-nums;
-  overflow-wrap: normal; }
-th, td { padding: .3rem .6rem; text-align: left; white-space: nowrap;
-  border-bottom: 1px solid #e2e2e2; }
-th { position: sticky; top: 0; background: #eee; padding: 0; vertical-align: bottom; }
-th button { all: unset; cursor: pointer; padding: .4rem .6rem; font-weight: 600;
-  white-space: normal; min-width: 5rem; box-sizing: border-box; }
-th button:focus-visible { outline: 2px solid #0b4f9c; outline-offset: -2px; }
-th button::after { content: " \\2195"; color: #777; }
-th[aria-sort=ascending] button::after { content: " \\2191"; color: #000; }
-th[aria-sort=descending] button::after { content: " \\2193"; color: #000; }
-td.number { text-align: right; }
-figure { margin: 1.5rem 0; } figure div { overflow-x: auto; }
-figure img { display: block; max-width: 100%; min-width: min(34rem, 100vw * 2); height: auto; }
-summary { cursor: pointer; padding: .4rem 0; }
-</style>
-</head>
-<body>
-<h1>Noisy environment augmentation: results</h1>
-<p>{{ overview }}</p>
-{% if problems %}<p class="alert"><strong>{{ problems }}</strong>
-They are in none of the tables and figures: <a href="#missing">see the list</a>.</p>{% endif %}
-{% for note in notes %}<p class="notes">{{ note }}</p>{% endfor %}
-<nav>
-{% for section in sections %}<a href="#{{ section.id }}">{{ section.title }}</a>{% endfor %}
-</nav>
-{% macro show(table) %}
-{% if table.rows|length > 40 %}<details><summary>{{ table.rows|length }} rows: {{ table.name }}
-</summary>{% endif %}
-<p class="caption">{{ table.caption }}</p>
-{% if table.rows %}<div class="scroll"><table id="{{ table.name }}"><thead><tr>
-{%- for name in table.columns %}<th scope="col"><button type="button">{{ name }}</button></th>
-{%- endfor %}</tr></thead><tbody>
-{% for row in table.rows %}<tr>
-{%- for value in row %}<td>{{ value }}</td>{% endfor %}</tr>
-{% endfor %}</tbody></table></div>{% else %}<p>None.</p>{% endif %}
-{% if table.rows|length > 40 %}</details>{% endif %}
-{% endmacro %}
-{% for section in sections %}
-<section id="{{ section.id }}">
-<h2>{{ section.title }}</h2>
-{% for table in section.tables[:1] %}{{ show(table) }}{% endfor %}
-{% for figure in section.figures %}
-<figure><div><img src="data:image/png;base64,{{ figure.png }}" alt="{{ figure.caption }}"></div>
-<figcaption>{{ figure.caption }}</figcaption></figure>
-{% endfor %}
-{% for table in section.tables[1:] %}{{ show(table) }}{% endfor %}
-</section>
-{% endfor %}
-<script>
-// "1,234.5 \u00b1 6" sorts as 1234.5, text as text, and a dash always comes last.
-const number = text => parseFloat(text.replaceAll(",", ""));
-for (const table of document.querySelectorAll("table")) {
-  const body = table.tBodies[0], heads = [...table.tHead.rows[0].cells];
-  heads.forEach((head, column) => {
-    const text = row => row.cells[column].textContent;
-    const full = [...body.rows].filter(row => text(row) !== "\u2013");
-    const numeric = full.length > 0 && full.every(row => /^-?[0-9]/.test(text(row)));
-    if (numeric) for (const row of body.rows) row.cells[column].className = "number";
-    head.firstChild.addEventListener("click", () => {
-      const [first, second] = numeric ? ["descending", "ascending"] : ["ascending", "descending"];
-      const state = head.getAttribute("aria-sort") === first ? second : first;
-      heads.forEach(other => other.removeAttribute("aria-sort"));
-      head.setAttribute("aria-sort", state);
-      const sign = state === "ascending" ? 1 : -1;
-      const compare = (a, b) => sign * (numeric ? number(text(a)) - number(text(b))
-        : text(a).localeCompare(text(b)));
-      const empty = [...body.rows].filter(row => text(row) === "\u2013");
-      body.append(...full.sort(compare), ...empty);
-    });
-  });
-}
-</script>
-</body>
-</html>
-"""
 SECTIONS = {
     "best": "Best noise",
     "consistent": "Consistent noise",
@@ -410,7 +317,9 @@ def write_report(out, tables, drawn, overview, problems, notes):
         png = base64.b64encode((out / f"{name}.png").read_bytes()).decode()
         entry = {"png": png, "caption": caption}
         sections[FIGURES_OF.get(kind, kind)]["figures"].append(entry)
-    page = jinja2.Environment(autoescape=True, trim_blocks=True).from_string(PAGE)
+    here = jinja2.FileSystemLoader(Path(__file__).parent)
+    pages = jinja2.Environment(loader=here, autoescape=True, trim_blocks=True)
     full = [s for s in sections.values() if s["tables"] or s["figures"]]
+    page = pages.get_template("report.html.jinja")
     html = page.render(sections=full, overview=overview, problems=problems, notes=notes)
     (out / "report.html").write_text(html)
