@@ -340,7 +340,7 @@ def updater(gradient_function, optimizer, args):
         with torch.autocast(device.type, torch.bfloat16, bf16):
             gradient, curves = choose()(*arguments)
         for parameter, value in zip(parameters, gradient.values(), strict=True):
-            parameter.grad = value
+            parameter.grad = value.contiguous()  # other strides are misread by Adam(fused=True)
         optimizer.step()
         return curves
 

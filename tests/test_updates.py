@@ -579,6 +579,24 @@ def test_only_bf16_computes_products_in_bfloat16(script, precision):
     torch.testing.assert_close(network.bias, before - 0.5)  # Adam's first step, in float32
 
 
+@pytest.mark.parametrize("script", [sac, td3, ppo])
+@pytest.mark.parametrize("strides", ["transposed", "expanded"])
+def test_a_gradient_of_any_strides_is_applied_as_it_is(script, strides):
+    """The fused Adam of PyTorch 2.13 reads a gradient's memory as if it were contiguous."""
+    network = nn.Linear(3, 2).requires_grad_(False)
+    fused = torch.optim.Adam(network.parameters(), lr=0.5, fused=True)
+    gradient = {
+        "transposed": torch.tensor([[1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]]).T,
+        "expanded": torch.tensor([[1.0], [-1.0]]).expand(2, 3),
+    }[strides]
+    assert not gradient.is_contiguous()
+    before = network.weight.clone()
+    gradients = {"weight": gradient, "bias": torch.zeros(2)}
+    script.updater(lambda: (gradients, {}), fused, script.Args(compile=False))()
+    # Adam's first step is the learning rate, against the sign of the gradient
+    torch.testing.assert_close(network.weight, before - 0.5 * gradient)
+
+
 # PARTS
 
 
