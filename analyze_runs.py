@@ -6,9 +6,9 @@ different names of the algorithm. Only finished runs (those with a result.json) 
 
 import json
 import re
+from collections import Counter
 from dataclasses import dataclass
 from functools import reduce
-from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -20,20 +20,45 @@ EVAL_HEADER = "step,episode,episodic_return,episodic_length\n"
 # Arguments that do not change what is learned; the grids of evaluation steps are intersected.
 NOT_SETTINGS = {"env_id", "seed", "noise", "noise_rate", "runs_dir", "overwrite", "cuda", "compile"}
 NOT_SETTINGS |= {"torch_threads", "checkpoint_frequency", "eval_frequency"}
-RUN_COLUMNS = ["run", "status", "reason", "base", *KEYS, "seed", "episodes", "total", "settings"]
-RUN_COLUMNS += ["versions", "steps", "returns"]
+RUN_COLUMNS = ["run", "status", "reason", "base", "phase", *KEYS, "seed", "episodes", "total"]
+RUN_COLUMNS += ["settings", "versions", "steps", "returns"]
+FIRST_CONFIRMATION_SEED = 1001  # of `./benchmark.sh choose`: lower seeds are those of its search
 
 
 def rate_text(rates):
-    """Spell noise rates as the paper does: [] -> "0.00", [0.5, 1] -> "0.50 + 1.00"."""
-    texts = [f"{r:.2f}" if round(r, 2) == r else f"{r:g}" for r in map(float, rates)]
+    """Spell noise rates as the paper does: [] -> "0.00", [0.5, 1] -> "0.50 + 1.00".
+
+    A rate that changes during training, "1.0:0.0", becomes "1.00 to 0.00".
+    """
+    texts = []
+    for rate in rates:
+        ends = [float(end) for end in str(rate).split(":")]
+        texts.append(" to ".join(f"{r:.2f}" if round(r, 2) == r else f"{r:g}" for r in ends))
     return " + ".join(texts) or BASELINE[1]
+
+
+def rate_order(text):
+    """Sort key of a text from rate_text: (start, end) of each rate, as numbers."""
+    ends = [[float(end) for end in rate.split(" to ")] for rate in text.split(" + ")]
+    return [(rate[0], rate[-1]) for rate in ends]
+
+
+def order(config):
+    """Sort key of a configuration: by noise, then by rates; the baseline comes first."""
+    noise, rate = config
+    return noise, rate_order(rate)
 
 
 def read_config(folder):
     """Read what identifies a run from its config.json."""
     config = json.loads((folder / "config.json").read_text())
-    args, commit = config["args"], str(config.get("git_commit"))
+    args = config["args"]
+    commit = str(config.get("git_commit"))  # 40 digits, perhaps with "-dirty"
+    versions = {
+        **config["versions"],
+        "matmul precision": config.get("matmul_precision"),
+        "git commit": commit[:10] + commit[40:],
+    }
     settings = {name: value for name, value in args.items() if name not in NOT_SETTINGS}
     return {
         "base": config["algorithm"],
@@ -44,9 +69,7 @@ def read_config(folder):
         "episodes": int(args["eval_episodes"]),
         "total": int(args["total_timesteps"]),
         "settings": json.dumps(settings, sort_keys=True),
-        "versions": config["versions"]
-        | {"matmul precision": config.get("matmul_precision")}
-        | {"git commit": commit[:10] + commit[40:]},  # of 40 digits, perhaps with "-dirty"
+        "versions": versions,
     }
 
 
@@ -73,27 +96,42 @@ def read_evaluations(folder, episodes, total):
     return step[:, 0].astype(int), episodic_return.mean(axis=1)
 
 
+def read_run(folder):
+    """Read one run folder: a dict with some of RUN_COLUMNS."""
+    row = {"run": folder.name}
+    try:
+        row |= read_config(folder)
+        if not (folder / "result.json").exists():
+            reason = f"no result.json; {progress(folder)}"
+            return row | {"status": "unfinished", "reason": reason}
+        result = json.loads((folder / "result.json").read_text())
+        steps, returns = read_evaluations(folder, row["episodes"], row["total"])
+        if not np.isclose(returns[-1], result["final_return_mean"], rtol=1e-3, atol=1e-3):
+            raise ValueError("eval.csv and result.json disagree on the final return")
+        return row | {"status": "finished", "steps": steps, "returns": returns}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        return row | {"status": "corrupt", "reason": reason}
+
+
+def is_run(folder):
+    """Tell run folders from others, such as the logs of a sweep."""
+    return folder.is_dir() and ("__" in folder.name or (folder / "config.json").exists())
+
+
 def read_runs(runs_dir):
-    """Read all run folders; `status` is finished, unfinished, corrupt or duplicate."""
-    rows = []
-    for folder in sorted(path for path in Path(runs_dir).iterdir() if path.is_dir()):
-        if "__" not in folder.name and not (folder / "config.json").exists():
-            continue  # the logs of a sweep, say
-        row = {"run": folder.name, "status": "corrupt"}
-        rows.append(row)
-        try:
-            row |= read_config(folder)
-            if not (folder / "result.json").exists():
-                row |= {"status": "unfinished", "reason": f"no result.json; {progress(folder)}"}
-                continue
-            result = json.loads((folder / "result.json").read_text())
-            steps, returns = read_evaluations(folder, row["episodes"], row["total"])
-            if not np.isclose(returns[-1], result["final_return_mean"], rtol=1e-3, atol=1e-3):
-                raise ValueError("eval.csv and result.json disagree on the final return")
-            row |= {"status": "finished", "steps": steps, "returns": returns}
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
-            row["reason"] = " ".join(f"{type(error).__name__}: {error}".split())
+    """Read all run folders; `status` is finished, unfinished, corrupt or duplicate.
+
+    In a folder of `./benchmark.sh choose` (it has a choice.csv) `phase` is search or confirmation,
+    by the seed; elsewhere it is empty.
+    """
+    runs_dir = Path(runs_dir)
+    rows = [read_run(folder) for folder in sorted(runs_dir.iterdir()) if is_run(folder)]
     runs = pd.DataFrame(rows, columns=RUN_COLUMNS, dtype=object)
+    runs["phase"] = ""
+    if (runs_dir / "choice.csv").exists():
+        fresh = runs["seed"].fillna(0) >= FIRST_CONFIRMATION_SEED
+        runs["phase"] = np.where(fresh, "confirmation", "search")
     for base, group in runs.groupby("base"):
         runs.loc[group.index, "algorithm"] = labels(base, group)
     twice = (runs["status"] == "finished") & runs.duplicated(["status", *KEYS, "seed"])
@@ -105,20 +143,27 @@ def labels(base, group):
     """Name each run's algorithm so that runs with different settings never share a row.
 
     It is the plain name (SAC) unless runs differ in settings, or there is a newer version of the
-    environment; then it says what differs (SAC [total_timesteps=100000]).
+    environment, or noise was chosen; then it says what differs (SAC [total_timesteps=100000]).
     """
     settings = {text: json.loads(text) for text in set(group["settings"])}
-    names = sorted(set().union(*settings.values()))
-    names = [n for n in names if len({str(values.get(n)) for values in settings.values()}) > 1]
-    newest = {}
-    for env, version in map(split_version, group["environment"]):
-        newest[env] = max(newest.get(env, ""), version, key=lambda text: int(text or 0))
+    differing = []
+    for name in sorted(set().union(*settings.values())):
+        if len({str(values.get(name)) for values in settings.values()}) > 1:
+            differing.append(name)
+    versions = [split_version(environment) for environment in group["environment"]]
+    newest = {name: "" for name, _ in versions}
+    for name, version in versions:
+        newest[name] = max(newest[name], version, key=lambda text: int(text or -1))
     result = []
-    for text, env in zip(group["settings"], group["environment"], strict=True):
-        parts = [f"{name}={settings[text].get(name)}" for name in names]
-        name, version = split_version(env)
-        parts += [f"environments v{version}"] if version != newest[name] else []
-        result.append(base + (f" [{', '.join(parts)}]" if parts else ""))
+    for text, (env, version), phase in zip(
+        group["settings"], versions, group["phase"], strict=True
+    ):
+        parts = [f"{name}={settings[text].get(name)}" for name in differing]
+        if version != newest[env]:
+            parts.append(f"environments v{version}")
+        if phase:
+            parts.append(phase)
+        result.append(f"{base} [{', '.join(parts)}]" if parts else base)
     return result
 
 
@@ -137,24 +182,67 @@ def progress(folder):
 
 
 def missing_runs(runs):
-    """List the seeds that a configuration lacks in an environment and that other runs have.
+    """List seeds that a configuration lacks in an environment: those that most others have.
 
-    An environment in which anything was run should have the baseline.
+    That is, at least half of the algorithm's configurations with noise have them, each environment
+    counted apart. An environment in which anything was run should have the baseline with these
+    seeds. The search of `./benchmark.sh choose` gives few noises many seeds: nothing is missing.
     """
     rows = []
     for algorithm, group in runs[runs["base"].notna()].groupby("algorithm"):
-        found = set(group[[*KEYS[1:], "seed"]].itertuples(index=False, name=None))
-        wanted = {(env, *config) for env, *config, _ in found for config in (config, BASELINE)}
-        wanted = sorted(wanted, key=lambda key: (key[0], order(key[1:])))
-        for key, seed in product(wanted, sorted(set(group["seed"]))):
-            if (*key, seed) not in found:
+        if group["phase"].iloc[0] == "search":
+            continue
+        cells = group.groupby(KEYS[1:])["seed"].agg(set).to_dict()
+        noisy = [seeds for (_, *config), seeds in cells.items() if tuple(config) != BASELINE]
+        counts = Counter(seed for seeds in noisy or cells.values() for seed in seeds)
+        expected = {seed for seed, n in counts.items() if 2 * n >= len(noisy or cells)}
+        baselines = {(env, *BASELINE) for env, *_ in cells}
+        for key in sorted(cells.keys() | baselines, key=lambda key: (key[0], order(key[1:]))):
+            for seed in sorted(expected - cells.get(key, set())):
                 rows.append((algorithm, *key, int(seed), "missing", "no run folder"))
     return pd.DataFrame(rows, columns=[*KEYS, "seed", "status", "reason"])
 
 
-def order(config):
-    """Sort key of a configuration: by noise, then by rates as numbers; the baseline comes first."""
-    return config[0], [float(rate) for rate in config[1].split(" + ")]
+def left_out(runs):
+    """List all runs that are in no table: one row per configuration and status.
+
+    Also return a Counter with the number of these runs by status. Seeds are ranges ("1-5, 7"). A
+    run whose config.json cannot be read has a row of its own.
+    """
+    out = pd.concat([runs[runs["status"] != "finished"], missing_runs(runs)], ignore_index=True)
+    rows = []
+    nameless = out["run"].where(out["base"].isna())
+    keys = [out["status"], *(out[name] for name in KEYS), nameless.fillna("")]
+    for (status, *config, _), group in out.groupby(keys, sort=False, dropna=False):
+        rows.append(
+            {
+                "status": status,
+                **dict(zip(KEYS, config, strict=True)),
+                "seeds": ranges(group["seed"].dropna()),
+                "run": few(group["run"].dropna()),
+                "reason": few(group["reason"]),
+            }
+        )
+    return pd.DataFrame(rows, columns=["status", *KEYS, "seeds", "run", "reason"]), Counter(
+        out["status"]
+    )
+
+
+def few(texts):
+    """Join different texts, or give the first and the number of the others."""
+    first, *others = list(dict.fromkeys(texts)) or [""]
+    return f"{first} and {len(others)} more" if len(others) > 1 else ", ".join([first, *others])
+
+
+def ranges(numbers):
+    """Write whole numbers as ranges: [1, 2, 3, 5] -> "1-3, 5"."""
+    parts = []
+    for number in sorted(numbers):
+        if parts and number == parts[-1][1] + 1:
+            parts[-1][1] = number
+        else:
+            parts.append([number, number])
+    return ", ".join(f"{low}" if low == high else f"{low}-{high}" for low, high in parts)
 
 
 @dataclass
@@ -197,11 +285,21 @@ def make_studies(runs):
         for env, values in zip(envs, returns[BASELINE][-1].T, strict=True):
             if np.isnan(values).all():
                 notes.append(f"{algorithm}: no finished baseline on {env}, so no improvement there")
-        for name in sorted(set().union(*group["versions"])):
-            counts = group["versions"].map(lambda v, k=name: str(v.get(k))).value_counts()
-            if len(counts) > 1:
-                found = ", ".join(f"{version} (n = {n})" for version, n in sorted(counts.items()))
-                notes.append(f"{algorithm}: runs with different {name} share rows: {found}")
+        notes += version_notes(algorithm, group["versions"])
         base = group["base"].iloc[0]
         studies.append(Study(algorithm, base, envs, seeds, grid, returns))
     return studies, notes
+
+
+def version_notes(algorithm, versions):
+    """Say in words where runs of one algorithm differ in versions of code or libraries."""
+    notes = []
+    for name in sorted(set().union(*versions)):
+        counts = Counter(str(version.get(name)) for version in versions)
+        if len(counts) > 1:
+            found = ", ".join(f"{version} (n = {n})" for version, n in sorted(counts.items()))
+            what = (
+                "of different code versions" if name == "git commit" else f"with different {name}"
+            )
+            notes.append(f"{algorithm}: some rows average runs {what}: {found}")
+    return notes

@@ -26,6 +26,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 import analyze
 import analyze_report
 import analyze_runs
+import analyze_statistics
 
 NAN = float("nan")
 SCALE = "RandomUniformScaleReward(0.5, 1.5)"
@@ -162,8 +163,8 @@ def test_the_baseline_reaches_its_own_final_mean():
     rising = np.arange(4)[:, None, None] * 1000
     curves = rising + np.random.default_rng(1).normal(0, 100, (4, 10, 100))
     for e in range(100):
-        final_mean, _, _ = analyze.mean_std(curves[-1][:, e])
-        assert analyze.steps_to_reach(curves[..., e], [10, 20, 30, 40], final_mean) == 40
+        final_mean, _, _ = analyze_statistics.mean_std(curves[-1][:, e])
+        assert analyze_statistics.steps_to_reach(curves[..., e], [10, 20, 30, 40], final_mean) == 40
 
 
 def test_best_by_hand(sweep):
@@ -329,7 +330,7 @@ def test_seeds_are_replicates_and_episodes_are_not(tmp_path):
 def test_papers_sign_convention_and_data():
     paper = Path(analyze.__file__).parent / "results/paper"
     best = pd.read_csv(paper / "best.csv")
-    ours = analyze.improvement_percent(best["noisy_mean"], best["baseline_mean"])
+    ours = analyze_statistics.improvement_percent(best["noisy_mean"], best["baseline_mean"])
     np.testing.assert_allclose(
         ours, best["improvement_percent"], atol=0.35
     )  # means have one decimal
@@ -356,14 +357,14 @@ Z = np.array([*Z, [53.2, 92.3, 130.8], [43.6, 115.8, 93.6], [70.8, 150, 112.9]])
 def test_iqm_is_rliables():
     recorded = [(X, 95.32222222222222), (Y, 77.15555555555555), (Z, 85.85454545454544)]
     for scores, iqm in [*recorded, (Z[:, :1], 64.08)]:
-        assert analyze.iqm(scores.ravel()) == pytest.approx(iqm, rel=1e-12)
-        assert analyze.bootstrap_iqm(scores)[0] == pytest.approx(iqm, rel=1e-12)
+        assert analyze_statistics.iqm(scores.ravel()) == pytest.approx(iqm, rel=1e-12)
+        assert analyze_statistics.bootstrap_iqm(scores)[0] == pytest.approx(iqm, rel=1e-12)
 
 
 def test_probability_of_improvement_is_rliables():
     recorded = [(X, Y, 0.72), (Y, X, 0.28), (X, Z, 0.5904761904761905), (X, X, 0.5)]
     for x, y, probability in [*recorded, (X[:, :1], Z[:, :1], 0.8857142857142857)]:
-        p, low, high = analyze.probability_of_improvement(x, y)
+        p, low, high = analyze_statistics.probability_of_improvement(x, y)
         assert p == pytest.approx(probability, rel=1e-12)
         assert 0 <= low < p < high <= 1
 
@@ -376,9 +377,11 @@ def test_the_interval_decides_whether_no_improvement_is_excluded():
 
 def test_a_missing_run_is_not_a_score():
     padded = np.vstack([X, np.full((1, 3), NAN)])
-    assert analyze.bootstrap_iqm(padded, Y) == analyze.bootstrap_iqm(X, Y)
-    assert analyze.probability_of_improvement(padded, Y) == analyze.probability_of_improvement(X, Y)
-    assert analyze.mann_whitney(padded, Y) == analyze.mann_whitney(X, Y)
+    assert analyze_statistics.bootstrap_iqm(padded, Y) == analyze_statistics.bootstrap_iqm(X, Y)
+    assert analyze_statistics.probability_of_improvement(
+        padded, Y
+    ) == analyze_statistics.probability_of_improvement(X, Y)
+    assert analyze_statistics.mann_whitney(padded, Y) == analyze_statistics.mann_whitney(X, Y)
 
 
 @pytest.mark.parametrize(("shift", "envs"), [(0, 1), (1.5, 1), (2.5, 1), (0, 5), (1.5, 5)])
@@ -387,7 +390,7 @@ def test_coverage_of_the_probability_of_improvement(shift, envs):
     truth, inside, trials = stats.norm.cdf(shift / np.sqrt(2)), 0, 400
     for _ in range(trials):
         x, y = rng.normal(shift, 1, (5, envs)), rng.normal(0, 1, (5, envs))
-        _, low, high = analyze.probability_of_improvement(x, y)
+        _, low, high = analyze_statistics.probability_of_improvement(x, y)
         inside += low - 1e-12 <= truth <= high + 1e-12
     assert inside / trials >= 0.9
 
@@ -398,9 +401,11 @@ def test_mann_whitney_is_scipys_exact_test(n, m):
     for shift in 30 * (0, 0.7, 3):
         x, y = rng.normal(shift, 1, (n, 1)), rng.normal(0, 1, (m, 1))
         expected = stats.mannwhitneyu(x[:, 0], y[:, 0], method="exact").pvalue
-        p, smallest = analyze.mann_whitney(x, y)
+        p, smallest = analyze_statistics.mann_whitney(x, y)
         assert p == pytest.approx(expected) and smallest <= p + 1e-12
-    best, smallest = analyze.mann_whitney(np.arange(n)[:, None] + 100, np.arange(m)[:, None])
+    best, smallest = analyze_statistics.mann_whitney(
+        np.arange(n)[:, None] + 100, np.arange(m)[:, None]
+    )
     assert best == pytest.approx(smallest)
 
 
@@ -415,7 +420,7 @@ def test_mann_whitney_over_environments_by_enumeration():
         sums.append(u)
     observed = (x[:, None] > y).sum()
     tails = np.mean(np.array(sums) >= observed), np.mean(np.array(sums) <= observed)
-    p, smallest = analyze.mann_whitney(x, y)
+    p, smallest = analyze_statistics.mann_whitney(x, y)
     assert p == pytest.approx(2 * min(tails)) and smallest == pytest.approx(2 / 400)
 
 
@@ -443,23 +448,23 @@ def test_five_against_five_cannot_reach_significance_alone_among_90(tmp_path):
     assert "comparisons: 90;" in note and "0.0079" in note and "0.71 for one configuration" in note
     assert "only if 15 or more" in note  # 90 * 0.0079 / 0.05 = 14.3
     _, caption = analyze.make_tables([study])["statistics"]
-    assert note in caption and f"{analyze.COVERAGE[5]} % (n = 5)" in caption
+    assert note in caption and f"{analyze_statistics.COVERAGE[5]} % (n = 5)" in caption
 
 
 def test_leave_one_seed_out_by_hand():
     finals = np.array([[10.0, 0, 0], [4, 4, 4], [1, 9, 1]])
     # without seed 0: means 0, 4, 5, so 1; without 1: 5, 4, 1, so 0; without 2: 5, 4, 5, so 0
-    assert analyze.leave_one_seed_out(finals) == pytest.approx(1 / 3)
-    assert np.isnan(analyze.leave_one_seed_out(finals[:, :1]))
+    assert analyze_statistics.leave_one_seed_out(finals) == pytest.approx(1 / 3)
+    assert np.isnan(analyze_statistics.leave_one_seed_out(finals[:, :1]))
     lucky = np.array([[4.0, 4, 4], [100, NAN, NAN]])  # one run has no other seeds to be chosen on
-    assert analyze.leave_one_seed_out(lucky) == 4
+    assert analyze_statistics.leave_one_seed_out(lucky) == 4
 
 
 def test_leave_one_seed_out_sees_through_luck():
     rng = np.random.default_rng(0)
     finals = rng.normal(0, 1, (200, 90, 5))  # 90 configurations that are all the same
     best = np.mean([sweep.mean(axis=1).max() for sweep in finals])
-    held_out = np.mean([analyze.leave_one_seed_out(sweep) for sweep in finals])
+    held_out = np.mean([analyze_statistics.leave_one_seed_out(sweep) for sweep in finals])
     assert best > 1 and abs(held_out) < 0.15
 
 
@@ -571,16 +576,49 @@ def test_unfinished_missing_and_duplicate_runs_are_listed(tmp_path, capsys):
     tables = run(tmp_path)
     missing = tables["missing"].set_index("status")
     assert sorted(missing.index) == ["corrupt", "duplicate", "missing", "unfinished"]
-    assert missing.loc["missing", "seed"] == 2 and missing.loc["missing", "noise"] == SCALE
-    assert missing.loc["unfinished", "seed"] == 3
+    assert missing.loc["missing", "seeds"] == 2 and missing.loc["missing", "noise"] == SCALE
+    assert missing.loc["unfinished", "seeds"] == 3
     assert "50,000" in missing.loc["unfinished", "reason"]
     assert missing.loc["corrupt", "run"] == "Pusher-v5__empty"
     noisy = row(tables["summary_SAC"], environment="Pusher-v5", noise=SCALE, noise_rate="0.05")
     assert noisy["n"] == 2  # seeds 1 and 4
     printed = capsys.readouterr().out
-    assert "WARNING: Runs that do not count: 4 (" in printed and "copy" in printed
+    assert "WARNING: Runs left out: 4 (" in printed and "copy" in printed
     html = (tmp_path / "results/report.html").read_text()
-    assert "do not count: 4 (" in html and "1 missing" in html
+    assert "Runs left out: 4 (" in html and "1 missing" in html
+
+
+def test_runs_left_out_have_one_row_per_configuration(tmp_path):
+    for seed in (1, 2, 3, 5, 6, 8):
+        finished = seed in (1, 8)
+        write_run(tmp_path, [10], seed=seed, finished=finished, noise=SCALE, rate=0.5)
+    write_run(tmp_path, [10], seed=9, folder="damaged__1")
+    write_run(tmp_path, [10], seed=9, folder="damaged__2")
+    for name in ("damaged__1", "damaged__2"):
+        (tmp_path / name / "config.json").write_text("{")
+    table, number = analyze_runs.left_out(analyze_runs.read_runs(tmp_path))
+    assert table[["status", "noise", "seeds"]].fillna("").to_numpy().tolist() == [
+        ["unfinished", SCALE, "2-3, 5-6"],
+        ["corrupt", "", ""],
+        ["corrupt", "", ""],
+        ["missing", "", "1-3, 5-6, 8"],  # the baseline
+    ]
+    assert number == {"unfinished": 4, "corrupt": 2, "missing": 6}
+    assert list(table["run"])[1:3] == ["damaged__1", "damaged__2"]
+    assert "3 more" in table["run"].iloc[0]
+
+
+def test_more_seeds_for_the_baseline_or_for_one_noise_are_nothing_missing(tmp_path):
+    for seed in range(1, 6):
+        write_run(tmp_path, [10], seed=seed)
+        if seed <= 3:
+            write_run(tmp_path, [10], seed=seed, noise=SCALE, rate=0.5)
+            write_run(tmp_path, [10], seed=seed, noise=SCALE, rate=0.2)
+        write_run(tmp_path, [10], seed=seed, noise=ENDING, rate=0.5)
+    assert analyze_runs.missing_runs(analyze_runs.read_runs(tmp_path)).empty
+    write_run(tmp_path, [10], seed=4, noise=SCALE, rate=0.2)  # now two of three noises have it
+    missing = analyze_runs.missing_runs(analyze_runs.read_runs(tmp_path))
+    assert missing[["noise_rate", "seed"]].to_numpy().tolist() == [["0.50", 4]]
 
 
 def test_only_the_older_versions_of_an_environment_are_labelled(tmp_path):
@@ -590,6 +628,10 @@ def test_only_the_older_versions_of_an_environment_are_labelled(tmp_path):
     assert runs["Walker2d-v9"] == "SAC [environments v9]"
     assert runs["Ant"] == "SAC [environments v]"
     assert set(runs[["Hopper-v5", "Walker2d-v10", "Ant-v4"]]) == {"SAC"}
+    for env in ("Grid-v0", "Maze-v0", "Maze-v1"):
+        write_run(tmp_path, [10], env=env)
+    runs = analyze_runs.read_runs(tmp_path).set_index("environment")["algorithm"]
+    assert runs["Grid-v0"] == "SAC" and runs["Maze-v0"] == "SAC [environments v0]"
 
 
 def test_a_noise_is_not_missing_where_nobody_tried_it(tmp_path):
@@ -653,7 +695,9 @@ def test_paths_threads_and_evaluation_steps_do_not_split_rows(tmp_path, capsys):
     assert study.algorithm == "SAC" and study.steps.tolist() == [20_000, 40_000]
     assert study.returns[analyze_runs.BASELINE][:, :, 0].tolist() == [[2, 6, 2], [4, 8, 5]]
     assert "cut to the 2 steps that all share (of up to 4)" in notes[0]
-    assert "different mujoco" in notes[1] and "3.14.0 (n = 1)" in notes[1]
+    assert (
+        "some rows average runs with different mujoco" in notes[1] and "3.14.0 (n = 1)" in notes[1]
+    )
     run(tmp_path)
     printed = capsys.readouterr().out
     assert notes[0] in printed and notes[0] in (tmp_path / "results/report.html").read_text()
@@ -667,7 +711,10 @@ def test_changed_code_is_another_commit(tmp_path):
         config = json.loads(path.read_text()) | {"git_commit": commit + changed}
         path.write_text(json.dumps(config))
     _, [note] = analyze_runs.make_studies(analyze_runs.read_runs(tmp_path))
-    assert "different git commit" in note and "0123456789-dirty (n = 1)" in note
+    assert (
+        "some rows average runs of different code versions" in note
+        and "0123456789-dirty (n = 1)" in note
+    )
 
 
 def test_what_an_earlier_analysis_left_is_said(tmp_path, capsys):
@@ -949,6 +996,51 @@ def test_a_folder_that_cannot_be_written_is_an_error(tmp_path, capsys):
     printed = capsys.readouterr().err
     assert error.value.code == 2 and printed.startswith("error: --out: ")
     assert printed.count("\n") == 1 and (tmp_path / "results").read_text() == "a file"
+
+
+def test_results_go_beside_the_runs_unless_another_analysis_lies_there(tmp_path, capsys):
+    write_run(tmp_path / "runs", [1])
+    analyze.main(analyze.Args(runs_dir=tmp_path / "runs"))
+    assert (tmp_path / "runs/results/report.html").exists()
+    analyze.main(analyze.Args(runs_dir=tmp_path / "runs"))  # its own results are renewed
+
+    (tmp_path / "runs/results/runs").mkdir()
+    before = sorted((tmp_path / "runs/results").iterdir())
+    with pytest.raises(SystemExit) as error:
+        analyze.main(analyze.Args(runs_dir=tmp_path / "runs"))
+    assert error.value.code == 2 and sorted((tmp_path / "runs/results").iterdir()) == before
+    assert "--out" in capsys.readouterr().err
+
+
+def test_results_that_git_tracks_are_not_overwritten_unasked(tmp_path, capsys):
+    write_run(tmp_path, [1])
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results/best.csv").write_text("kept")
+    for command in (["init", "-q"], ["add", "results"]):
+        subprocess.run(["git", "-C", tmp_path, *command], check=True)
+    with pytest.raises(SystemExit) as error:
+        analyze.main(analyze.Args(runs_dir=tmp_path))
+    assert error.value.code == 2 and (tmp_path / "results/best.csv").read_text() == "kept"
+    assert "tracked by git" in capsys.readouterr().err
+    analyze.main(analyze.Args(runs_dir=tmp_path, out=tmp_path / "results"))  # asked for
+
+
+def test_runs_one_folder_deeper_are_pointed_to(tmp_path, capsys):
+    write_run(tmp_path / "runs/demo", [1])
+    with pytest.raises(SystemExit):
+        analyze.main(analyze.Args(runs_dir=tmp_path / "runs"))
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and str(tmp_path / "runs/demo") in error
+    assert not (tmp_path / "runs/results").exists()
+
+
+def test_a_reader_that_stops_early_is_no_error(tmp_path):
+    write_run(tmp_path / "runs", [1])
+    command = f"{sys.executable} {analyze.__file__} --runs-dir {tmp_path}/runs"
+    # The reader is gone before the first line is printed, so the pipe is broken for certain.
+    script = f"set -o pipefail; {command} | true"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True)
+    assert done.stderr == "" and done.returncode == 0
 
 
 def test_one_baseline_run_is_enough_for_a_report(tmp_path, capsys):

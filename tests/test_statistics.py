@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
-import analyze
+import analyze_statistics
 
 
 def two_peaked(rng, shape, share, spread):
@@ -32,14 +32,14 @@ def covered(n, intervals, distributions=DISTRIBUTIONS, trials=500):
     worst = 100.0
     for seed, draw in enumerate(distributions.values()):
         rng = np.random.default_rng(seed)
-        truth = analyze.iqm(draw(rng, 400_000))
+        truth = analyze_statistics.iqm(draw(rng, 400_000))
         low, high = intervals(draw(rng, (trials, n)))
         worst = min(worst, 100 * np.mean((low <= truth) & (truth <= high)))
     return worst
 
 
 def ours(samples):
-    return np.array([analyze.bootstrap_iqm(sample[:, None])[1:] for sample in samples]).T
+    return np.array([analyze_statistics.bootstrap_iqm(sample[:, None])[1:] for sample in samples]).T
 
 
 def scipys(samples, method):
@@ -48,13 +48,13 @@ def scipys(samples, method):
     return done.confidence_interval
 
 
-@pytest.mark.parametrize("n", analyze.COVERAGE)
+@pytest.mark.parametrize("n", analyze_statistics.COVERAGE)
 def test_coverage(n):
     """The caption of the table of statistics says these numbers."""
     measured = covered(n, ours)
-    assert int(measured) == analyze.COVERAGE[n]
+    assert int(measured) == analyze_statistics.COVERAGE[n]
     assert measured >= 92
-    assert int(covered(n, ours, MIXTURES)) == analyze.COVERAGE_OF_MIXTURES[n]
+    assert int(covered(n, ours, MIXTURES)) == analyze_statistics.COVERAGE_OF_MIXTURES[n]
 
 
 @pytest.mark.parametrize("method", ["percentile", "basic", "BCa"])
@@ -69,17 +69,18 @@ def test_coverage_of_the_improvement_over_environments():
     draws = list(DISTRIBUTIONS.values())
     pools = [draw(rng, 400_000) for draw in draws]
     scores = [
-        analyze.improvement_percent(np.stack([1.3 * pool, pool]), pool.mean()) for pool in pools
+        analyze_statistics.improvement_percent(np.stack([1.3 * pool, pool]), pool.mean())
+        for pool in pools
     ]
-    truth = np.subtract(*analyze.iqm(np.concatenate(scores, axis=1)))
+    truth = np.subtract(*analyze_statistics.iqm(np.concatenate(scores, axis=1)))
     inside, inside_fixed, trials = 0, 0, 200
     for _ in range(trials):
         x, y = (np.stack([draw(rng, 5) for draw in draws], axis=1) for _ in range(2))
-        _, low, high = analyze.bootstrap_iqm(1.3 * x, y)
+        _, low, high = analyze_statistics.bootstrap_iqm(1.3 * x, y)
         inside += low <= truth <= high
-        fixed = [analyze.improvement_percent(z, y.mean(axis=0)) for z in (1.3 * x, y)]
-        shift = analyze.iqm(fixed[1].ravel())
-        _, low, high = analyze.bootstrap_iqm(fixed[0])
+        fixed = [analyze_statistics.improvement_percent(z, y.mean(axis=0)) for z in (1.3 * x, y)]
+        shift = analyze_statistics.iqm(fixed[1].ravel())
+        _, low, high = analyze_statistics.bootstrap_iqm(fixed[0])
         inside_fixed += low - shift <= truth <= high - shift
     assert inside / trials >= 0.93
     assert inside_fixed / trials < 0.9
@@ -90,7 +91,9 @@ def test_noise_that_does_nothing_improves_nothing(name):
     """The IQM of skewed returns is not their mean; no improvement must come of that."""
     rng, draw, found = np.random.default_rng(0), (DISTRIBUTIONS | MIXTURES)[name], []
     for _ in range(200):
-        found.append(analyze.bootstrap_iqm(draw(rng, (10, 5)), draw(rng, (10, 5)), resamples=200))
+        found.append(
+            analyze_statistics.bootstrap_iqm(draw(rng, (10, 5)), draw(rng, (10, 5)), resamples=200)
+        )
     estimate, low, high = np.transpose(found)
     assert abs(estimate.mean()) < 3 * estimate.std() / np.sqrt(len(found))
     assert ((low > 0) | (high < 0)).mean() <= 0.08
@@ -103,8 +106,8 @@ def interval_without_the_baselines_seeds(x, y, resamples):
 
     def improvement(x, y):
         means = y.mean(axis=-1, keepdims=True)
-        noisy, baseline = (analyze.improvement_percent(z, means) for z in (x, y))
-        return analyze.iqm(noisy) - analyze.iqm(baseline)
+        noisy, baseline = (analyze_statistics.improvement_percent(z, means) for z in (x, y))
+        return analyze_statistics.iqm(noisy) - analyze_statistics.iqm(baseline)
 
     value = improvement(x[:, 0], y[:, 0])
     half = stats.t.ppf(0.975, len(x) - 1) * improvement(x_drawn, y_drawn).std(ddof=1)
@@ -124,7 +127,7 @@ def test_ten_noisy_seeds_do_not_make_up_for_three_of_the_baseline(
     wrong, wrong_usual = 0, 0
     for _ in range(trials):
         x, y = rng.normal(3000, spread, (10, 1)), rng.normal(3000, spread_baseline, (3, 1))
-        _, low, high = analyze.bootstrap_iqm(x, y, resamples)
+        _, low, high = analyze_statistics.bootstrap_iqm(x, y, resamples)
         wrong += low > 0 or high < 0
         low, high = interval_without_the_baselines_seeds(x, y, resamples)
         wrong_usual += low > 0 or high < 0
@@ -139,11 +142,15 @@ def test_satterthwaites_interval_of_three_seeds_is_welchs():
     """
     x, y = np.array([[10.0], [40.0], [10.0]]), np.array([[0.0], [1.0], [5.0]])
     base = 1e6
-    value, low, high = analyze.bootstrap_iqm(x + base, y + base, resamples=400_000)
+    value, low, high = analyze_statistics.bootstrap_iqm(x + base, y + base, resamples=400_000)
     welch = stats.ttest_ind(x[:, 0], y[:, 0], equal_var=False).confidence_interval(0.95)
     assert value == pytest.approx(100 * 18 / base, rel=1e-4)
     np.testing.assert_allclose([low, high], 100 * np.array(welch) / base, rtol=0.01)
 
 
 def test_seeds_that_are_all_alike_have_an_interval_of_one_point():
-    assert analyze.bootstrap_iqm(np.full((5, 1), 30.0), np.full((3, 1), 20.0)) == (50, 50, 50)
+    assert analyze_statistics.bootstrap_iqm(np.full((5, 1), 30.0), np.full((3, 1), 20.0)) == (
+        50,
+        50,
+        50,
+    )
