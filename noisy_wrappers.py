@@ -1,9 +1,13 @@
-"""Nine Gymnasium wrappers that perturb observations, rewards and episode ends at random.
+"""Gymnasium wrappers that perturb observations, rewards, episode ends and actions at random.
 
-They implement section 3 of Khraishi and Okhrati, "Simple Noisy Environment Augmentation for
-Reinforcement Learning". Every wrapper is ``Wrapper(env, noise_rate, <the paper's parameters>)``:
-with probability p = ``noise_rate`` a step (or an episode) is perturbed, otherwise the data of the
-environment pass through untouched. Wrappers combine by nesting, or with :func:`make_noisy`.
+Nine implement section 3 of Khraishi and Okhrati, "Simple Noisy Environment Augmentation for
+Reinforcement Learning"; RandomNormalNoisyAction is our own. Every wrapper is
+``Wrapper(env, noise_rate, <its parameters>)``: with probability p = ``noise_rate`` a step (or an
+episode) is perturbed, otherwise the data of the environment pass through untouched. Wrappers
+combine by nesting, or with :func:`make_noisy`.
+
+A rate that changes during training is written "start:end": ``"1.0:0.0"`` goes linearly from 1 to 0.
+:func:`set_progress` says how much of the training is done; the next ``reset()`` sets the rate.
 
 On a perturbed step ``info["noise"]`` is the tuple of the names of the wrappers that acted,
 innermost first; on other steps the key is absent.
@@ -19,36 +23,76 @@ initial states are the same with and without noise.
 
 import ast
 import contextlib
+import hashlib
+import importlib
 import inspect
 import math
 import numbers
 import re
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import find_highest_version, get_env_id, parse_env_id
 from gymnasium.utils import RecordConstructorArgs
+from numpy.typing import NDArray
+
+__version__ = "0.2.0"
+
+__all__ = [
+    "WRAPPERS",
+    "Noise",
+    "NoiseWrapper",
+    "ObservationNoise",
+    "RandomDropoutObservation",
+    "RandomEarlyTermination",
+    "RandomMixupObservation",
+    "RandomNormalNoisyAction",
+    "RandomNormalNoisyObservation",
+    "RandomNormalNoisyReward",
+    "RandomUniformNoisyObservation",
+    "RandomUniformNoisyReward",
+    "RandomUniformScaleObservation",
+    "RandomUniformScaleReward",
+    "RewardNoise",
+    "canonical_env_id",
+    "canonical_noises",
+    "make_noisy",
+    "noise_wrappers",
+    "parse_noise",
+    "run_name",
+    "set_progress",
+    "signatures",
+]
+
+Env = gym.Env[Any, Any]
+Info = dict[str, Any]
+Step = tuple[Any, Any, bool, bool, Info]  # observation, reward, terminated, truncated, info
 
 
-class NoiseWrapper(gym.Wrapper, RecordConstructorArgs):
+class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Base of the noise wrappers: the rate, the random streams and the counters.
 
     Attributes:
-        noise_rate: p in [0, 1]; may be assigned at any time. 0 is the bare environment bit for
-            bit, 1 perturbs every time.
+        schedule: the rates at the beginning and at the end of training, both in [0, 1].
+        progress: the fraction of training done; see :func:`set_progress`.
+        parameters: the wrapper's own arguments by name, as its spec records them.
         opportunities: how often the noise might have acted (episodes for early termination).
         times_applied: how often it did.
     """
 
-    def __init__(self, env: gym.Env, noise_rate: float, **parameters: Any):
-        """Raise ValueError unless noise_rate is in [0, 1]; parameters become attributes."""
+    def __init__(self, env: Env, noise_rate: float | str, **parameters: Any):
+        """Raise ValueError unless noise_rate is in [0, 1] or "start:end" of two such rates."""
         gym.Wrapper.__init__(self, env)
-        self.noise_rate = noise_rate
-        RecordConstructorArgs.__init__(self, noise_rate=self.noise_rate, **parameters)
-        self.__dict__.update(parameters)
+        self.schedule = _schedule(noise_rate)
+        self.progress = 0.0
+        self._noise_rate = self.schedule[0]
+        RecordConstructorArgs.__init__(self, noise_rate=_spelled(self.schedule), **parameters)
+        self.parameters = parameters
         self.opportunities = 0
         self.times_applied = 0
         self._position = sum(1 for _ in _noise_layers(env))
@@ -56,20 +100,27 @@ class NoiseWrapper(gym.Wrapper, RecordConstructorArgs):
 
     @property
     def noise_rate(self) -> float:
-        """The probability p of perturbing a step (or an episode)."""
+        """The probability p of perturbing a step (or an episode), as it is now.
+
+        A number may be assigned at any time: it holds at once and for the rest of training. 0 is
+        the bare environment bit for bit, 1 perturbs every time.
+        """
         return self._noise_rate
 
     @noise_rate.setter
     def noise_rate(self, value: float) -> None:
-        self._noise_rate = _number("noise_rate", value, low=0, high=1)
+        rate = _number("noise_rate", value, low=0, high=1)
+        self.schedule = (rate, rate)
+        self._noise_rate = rate
 
     @property
     def applied_fraction(self) -> float:
         """The realised rate, times_applied / opportunities; nan before the first opportunity."""
         return self.times_applied / self.opportunities if self.opportunities else math.nan
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Any, dict]:
-        """Reset the environment; a seed also reseeds the noise."""
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
+        """Reset the environment; a seed also reseeds the noise. The rate follows its schedule."""
+        self._noise_rate = float(np.interp(self.progress, (0.0, 1.0), self.schedule))
         result = self.env.reset(seed=seed, options=options)
         if seed is not None:
             self._seed(seed)
@@ -94,8 +145,9 @@ class NoiseWrapper(gym.Wrapper, RecordConstructorArgs):
     def _seed(self, seed: int | None) -> None:
         name = zlib.crc32(type(self).__name__.encode())
         entropy = None if seed is None else [seed, name, self._position]
-        streams = np.random.SeedSequence(entropy).spawn(2)
-        self._gate, self._noise = map(np.random.default_rng, streams)
+        gate, noise = np.random.SeedSequence(entropy).spawn(2)
+        self._gate = np.random.default_rng(gate)
+        self._noise = np.random.default_rng(noise)
 
     def _acts(self) -> bool:
         acts = self._gate.random() < self._noise_rate
@@ -103,11 +155,13 @@ class NoiseWrapper(gym.Wrapper, RecordConstructorArgs):
         self.times_applied += acts
         return acts
 
-    def _mark(self, info: dict) -> dict:
+    def _mark(self, info: Info) -> Info:
         """Record that the noise acted, in a new dict: the environment may reuse its own."""
-        others = info.get("noise")  # of noise wrappers below, or something of the environment's
-        others = others if isinstance(others, tuple) else ()
-        return {**info, "noise": (*others, type(self).__name__)}
+        name = type(self).__name__
+        below = info.get("noise")
+        if isinstance(below, tuple):  # of noise wrappers; anything else is the environment's own
+            return {**info, "noise": (*below, name)}
+        return {**info, "noise": (name,)}
 
 
 class ObservationNoise(NoiseWrapper):
@@ -118,51 +172,68 @@ class ObservationNoise(NoiseWrapper):
     ``reset()`` is perturbed like any other.
     """
 
-    def __init__(self, env: gym.Env, noise_rate: float, **parameters: Any):
-        """Raise ValueError unless the observation space is a Box of floats or integers."""
+    def __init__(self, env: Env, noise_rate: float | str, **parameters: Any):
+        """Raise ValueError unless observations are a Box of numbers that are no categories."""
         super().__init__(env, noise_rate, **parameters)
         space = env.observation_space
+        flattened = [
+            layer.env.observation_space
+            for layer in _layers(env)
+            if isinstance(layer, gym.wrappers.FlattenObservation)
+        ]
+        if any(_has_categories(part) for part in [space, *flattened]):
+            raise ValueError(
+                f"{type(self).__name__} cannot perturb categories, and this environment observes "
+                "some (a Discrete or MultiDiscrete space): take reward noise, action noise or "
+                "early termination"
+            )
         if not isinstance(space, gym.spaces.Box) or space.dtype.kind not in "fiu":
             raise ValueError(
                 f"{type(self).__name__} needs a Box observation space of floats or integers, got "
                 f"{type(space).__name__}: apply gymnasium.wrappers.FlattenObservation first"
             )
+        self._dtype: np.dtype[Any] = space.dtype
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Any, dict]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and perturb the first observation with probability p."""
         return self._observe(*super().reset(seed=seed, options=options))
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict]:
+    def step(self, action: Any) -> Step:
         """Step the environment and perturb the observation with probability p."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         observation, info = self._observe(observation, info)
         return observation, reward, terminated, truncated, info
 
-    def _observe(self, observation: np.ndarray, info: dict) -> tuple[np.ndarray, dict]:
+    def _observe(self, observation: NDArray[Any], info: Info) -> tuple[NDArray[Any], Info]:
         if self._acts():
             noisy = self._perturb(np.asarray(observation, np.float64))
-            return _cast(noisy, self.observation_space.dtype), self._mark(info)
+            return _cast(noisy, self._dtype), self._mark(info)
         return observation, info
 
-    def _widen(self, reach: Callable[[np.ndarray], Sequence]) -> None:
+    def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
+        raise NotImplementedError
+
+    def _widen(self, reach: Callable[[NDArray[Any]], Sequence[Any]]) -> None:
         """Extend the observation space to what ``reach`` says noise makes of its two bounds."""
         space = self.env.observation_space
+        assert isinstance(space, gym.spaces.Box)
         with np.errstate(over="ignore", invalid="ignore"):
-            bounds = space.low.astype(np.float64), space.high.astype(np.float64)
-            ends = [np.broadcast_to(end, space.shape) for bound in bounds for end in reach(bound)]
-            ends = np.nan_to_num(ends, nan=0.0, posinf=np.inf, neginf=-np.inf)  # 0 * inf is 0 here
-            low = np.minimum(space.low, _cast(ends.min(axis=0), space.dtype))
-            high = np.maximum(space.high, _cast(ends.max(axis=0), space.dtype))
+            ends = [*reach(space.low.astype(np.float64)), *reach(space.high.astype(np.float64))]
+            reached = np.stack([np.broadcast_to(end, space.shape) for end in ends])
+            reached[np.isnan(reached)] = 0.0  # 0 * inf is 0 here
+            low = np.minimum(space.low, _cast(reached.min(axis=0), self._dtype))
+            high = np.maximum(space.high, _cast(reached.max(axis=0), self._dtype))
         self.observation_space = gym.spaces.Box(
-            np.asarray(low), np.asarray(high), dtype=space.dtype
+            np.asarray(low), np.asarray(high), dtype=space.dtype.type
         )
 
 
 class RandomNormalNoisyObservation(ObservationNoise):
     """Adds Gaussian noise to the observation: o + e with e ~ N(loc, scale^2 I) (section 3.1).
 
-    ``scale`` is the paper's sigma, in units of the observation, the same in every dimension;
-    e = ``noise.normal(loc, scale, o.shape)``. noisyenv 0.1.1 takes loc before scale.
+    ``scale`` is the paper's sigma, in units of the observation: one number for all dimensions, or a
+    tuple with one for each of a one-dimensional observation. e = ``noise.normal(loc, scale,
+    o.shape)``. noisyenv 0.1.1 takes loc before scale.
 
     >>> env = RandomNormalNoisyObservation(gym.make("CartPole-v1"), 1.0, 0.1)
     >>> observation, info = env.reset(seed=0)
@@ -172,13 +243,27 @@ class RandomNormalNoisyObservation(ObservationNoise):
     {'noise': ('RandomNormalNoisyObservation',)}
     """
 
-    def __init__(self, env: gym.Env, noise_rate: float, scale: float, *, loc: float = 0.0):
-        """Raise ValueError unless scale >= 0 and both are finite."""
-        parameters = {"scale": _number("scale", scale, low=0), "loc": _number("loc", loc)}
-        super().__init__(env, noise_rate, **parameters)
+    def __init__(
+        self,
+        env: Env,
+        noise_rate: float | str,
+        scale: float | tuple[float, ...],
+        *,
+        loc: float = 0.0,
+    ):
+        """Raise ValueError unless scale >= 0, both are finite and a tuple fits the observation."""
+        self.scale = _scale_or_scales(scale)
+        self.loc = _number("loc", loc)
+        super().__init__(env, noise_rate, scale=self.scale, loc=self.loc)
+        shape = env.observation_space.shape
+        if isinstance(self.scale, tuple) and shape != (len(self.scale),):
+            raise ValueError(
+                f"scale has {len(self.scale)} numbers and the observation has shape {shape}: give "
+                f"one number for all dimensions or one for each, got {scale!r}"
+            )
         self._widen(lambda bound: (-np.inf, np.inf))
 
-    def _perturb(self, observation: np.ndarray) -> np.ndarray:
+    def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
         return observation + self._noise.normal(self.loc, self.scale, observation.shape)
 
 
@@ -193,12 +278,13 @@ class RandomUniformNoisyObservation(ObservationNoise):
     array([ 0.01826801, -0.01052575, -0.1353507 , -0.00589376], dtype=float32)
     """
 
-    def __init__(self, env: gym.Env, noise_rate: float, low: float, high: float):
+    def __init__(self, env: Env, noise_rate: float | str, low: float, high: float):
         """Raise ValueError unless low <= high and both are finite."""
-        super().__init__(env, noise_rate, **_interval(low, high))
+        self.low, self.high = _interval(low, high)
+        super().__init__(env, noise_rate, low=self.low, high=self.high)
         self._widen(lambda bound: (bound + self.low, bound + self.high))
 
-    def _perturb(self, observation: np.ndarray) -> np.ndarray:
+    def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
         return observation + self._noise.uniform(self.low, self.high, observation.shape)
 
 
@@ -216,19 +302,22 @@ class RandomUniformScaleObservation(ObservationNoise):
 
     def __init__(
         self,
-        env: gym.Env,
-        noise_rate: float,
+        env: Env,
+        noise_rate: float | str,
         low: float,
         high: float,
         *,
         per_dimension: bool = False,
     ):
         """Raise ValueError unless low <= high, both are finite and per_dimension is a bool."""
-        parameters = {"per_dimension": _flag("per_dimension", per_dimension)}
-        super().__init__(env, noise_rate, **_interval(low, high), **parameters)
+        self.low, self.high = _interval(low, high)
+        self.per_dimension = _flag("per_dimension", per_dimension)
+        super().__init__(
+            env, noise_rate, low=self.low, high=self.high, per_dimension=self.per_dimension
+        )
         self._widen(lambda bound: (bound * self.low, bound * self.high))
 
-    def _perturb(self, observation: np.ndarray) -> np.ndarray:
+    def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
         size = observation.shape if self.per_dimension else None
         return observation * self._noise.uniform(self.low, self.high, size)
 
@@ -252,26 +341,31 @@ class RandomMixupObservation(ObservationNoise):
     array([ 0.01369617, -0.02302133, -0.04590265, -0.04834723], dtype=float32)
     """
 
-    def __init__(self, env: gym.Env, noise_rate: float, factor: float, *, recursive: bool = False):
+    def __init__(
+        self, env: Env, noise_rate: float | str, factor: float, *, recursive: bool = False
+    ):
         """Raise ValueError unless factor is in [0, 1] and recursive is a bool."""
-        factor = _number("factor", factor, low=0, high=1)
-        super().__init__(env, noise_rate, factor=factor, recursive=_flag("recursive", recursive))
-        self._previous: np.ndarray | None = None
+        self.factor = _number("factor", factor, low=0, high=1)
+        self.recursive = _flag("recursive", recursive)
+        super().__init__(env, noise_rate, factor=self.factor, recursive=self.recursive)
+        self._previous: NDArray[Any] | None = None
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Any, dict]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and forget the last episode."""
         self._previous = None
         return super().reset(seed=seed, options=options)
 
-    def _observe(self, observation: np.ndarray, info: dict) -> tuple[np.ndarray, dict]:
-        received = observation
+    def _observe(self, observation: NDArray[Any], info: Info) -> tuple[NDArray[Any], Info]:
+        returned = observation
         if self._previous is not None:
-            observation, info = super()._observe(observation, info)
+            returned, info = super()._observe(observation, info)
+        remembered = returned if self.recursive else observation
         # A copy: the environment may write its next observation into the same array.
-        self._previous = np.array(observation if self.recursive else received, np.float64)
-        return observation, info
+        self._previous = np.array(remembered, np.float64)
+        return returned, info
 
-    def _perturb(self, observation: np.ndarray) -> np.ndarray:
+    def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
+        assert self._previous is not None
         mixture = self.factor * observation + (1 - self.factor) * self._previous
         low, high = np.minimum(observation, self._previous), np.maximum(observation, self._previous)
         return np.clip(mixture, low, high)  # rounding must not leave the observation space
@@ -289,24 +383,32 @@ class RandomDropoutObservation(ObservationNoise):
     array([0.01369617, 0.        , 0.        , 0.        ], dtype=float32)
     """
 
-    def __init__(self, env: gym.Env, noise_rate: float, keep_prob: float):
+    def __init__(self, env: Env, noise_rate: float | str, keep_prob: float):
         """Raise ValueError unless keep_prob is in [0, 1]."""
-        super().__init__(env, noise_rate, keep_prob=_number("keep_prob", keep_prob, low=0, high=1))
+        self.keep_prob = _number("keep_prob", keep_prob, low=0, high=1)
+        super().__init__(env, noise_rate, keep_prob=self.keep_prob)
         self._widen(lambda bound: (0.0,))
 
-    def _perturb(self, observation: np.ndarray) -> np.ndarray:
+    def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
         return np.where(self._noise.random(observation.shape) < self.keep_prob, observation, 0.0)
 
 
 class RewardNoise(NoiseWrapper):
-    """Base of the reward wrappers: subclasses define ``_perturb`` on the reward, a float."""
+    """Base of the reward wrappers: subclasses define ``_perturb`` on the reward, a number.
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict]:
+    The reward may be an array of one number; perturbed it is a float.
+    """
+
+    def step(self, action: Any) -> Step:
         """Step the environment and perturb the reward with probability p."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         if self._acts():
-            reward, info = self._perturb(reward), self._mark(info)
+            number: Any = reward.item() if isinstance(reward, np.ndarray) else reward
+            reward, info = self._perturb(number), self._mark(info)
         return observation, reward, terminated, truncated, info
+
+    def _perturb(self, reward: float) -> float:
+        raise NotImplementedError
 
 
 class RandomNormalNoisyReward(RewardNoise):
@@ -321,10 +423,11 @@ class RandomNormalNoisyReward(RewardNoise):
     1.1210431182607201
     """
 
-    def __init__(self, env: gym.Env, noise_rate: float, scale: float, *, loc: float = 0.0):
+    def __init__(self, env: Env, noise_rate: float | str, scale: float, *, loc: float = 0.0):
         """Raise ValueError unless scale >= 0 and both are finite."""
-        parameters = {"scale": _number("scale", scale, low=0), "loc": _number("loc", loc)}
-        super().__init__(env, noise_rate, **parameters)
+        self.scale = _number("scale", scale, low=0)
+        self.loc = _number("loc", loc)
+        super().__init__(env, noise_rate, scale=self.scale, loc=self.loc)
 
     def _perturb(self, reward: float) -> float:
         return reward + self._noise.normal(self.loc, self.scale)
@@ -342,9 +445,10 @@ class RandomUniformNoisyReward(RewardNoise):
     0.9380732431402061
     """
 
-    def __init__(self, env: gym.Env, noise_rate: float, low: float, high: float):
+    def __init__(self, env: Env, noise_rate: float | str, low: float, high: float):
         """Raise ValueError unless low <= high and both are finite."""
-        super().__init__(env, noise_rate, **_interval(low, high))
+        self.low, self.high = _interval(low, high)
+        super().__init__(env, noise_rate, low=self.low, high=self.high)
 
     def _perturb(self, reward: float) -> float:
         return reward + self._noise.uniform(self.low, self.high)
@@ -362,9 +466,10 @@ class RandomUniformScaleReward(RewardNoise):
     0.778865122592071
     """
 
-    def __init__(self, env: gym.Env, noise_rate: float, low: float, high: float):
+    def __init__(self, env: Env, noise_rate: float | str, low: float, high: float):
         """Raise ValueError unless low <= high and both are finite."""
-        super().__init__(env, noise_rate, **_interval(low, high))
+        self.low, self.high = _interval(low, high)
+        super().__init__(env, noise_rate, low=self.low, high=self.high)
 
     def _perturb(self, reward: float) -> float:
         return reward * self._noise.uniform(self.low, self.high)
@@ -391,8 +496,8 @@ class RandomEarlyTermination(NoiseWrapper):
 
     def __init__(
         self,
-        env: gym.Env,
-        noise_rate: float,
+        env: Env,
+        noise_rate: float | str,
         low: int | None = None,
         high: int | None = None,
         *,
@@ -400,40 +505,91 @@ class RandomEarlyTermination(NoiseWrapper):
         truncate: bool = False,
     ):
         """Raise ValueError unless 1 <= low <= high are integers, or absent with each_step."""
-        if not _flag("each_step", each_step):
+        self.each_step = _flag("each_step", each_step)
+        self.truncate = _flag("truncate", truncate)
+        if not each_step:
             low = _step_number("low", low)
             high = low if high is None else _step_number("high", high)
             if low > high:
                 raise ValueError(f"low must not exceed high, got low={low}, high={high}")
         elif low is not None or high is not None:
             raise ValueError(f"each_step=True excludes low and high, got low={low}, high={high}")
-        parameters = {"each_step": each_step, "truncate": _flag("truncate", truncate)}
-        # (50, 50) is recorded as (50), so that both spellings are one configuration.
-        super().__init__(env, noise_rate, low=low, high=None if high == low else high, **parameters)
+        self.low = low
         self.high = high
+        super().__init__(
+            env,
+            noise_rate,
+            low=low,
+            high=None if high == low else high,  # (50, 50) and (50) are one configuration
+            each_step=each_step,
+            truncate=truncate,
+        )
         self._steps = 0
         self._last_step: int | None = None
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Any, dict]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and decide when the episode ends."""
         result = super().reset(seed=seed, options=options)
         self._steps = 0
-        if not self.each_step:
-            last_step = self._noise.integers(self.low, self.high, endpoint=True)
+        if self.low is not None and self.high is not None:  # that is, without each_step
+            last_step = int(self._noise.integers(self.low, self.high, endpoint=True))
             self._last_step = last_step if self._acts() else None
         return result
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict]:
+    def step(self, action: Any) -> Step:
         """Step the environment and end the episode if its time has come."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._steps += 1
-        if self._acts() if self.each_step else self._steps == self._last_step:
+        at_last_step = self._steps == self._last_step
+        ends = self._acts() if self.each_step else at_last_step
+        if ends:
             info = self._mark(info)
             if self.truncate:
                 truncated = True
             else:
                 terminated = True
         return observation, reward, terminated, truncated, info
+
+
+class RandomNormalNoisyAction(NoiseWrapper):
+    """Adds Gaussian noise to the action: a + e with e ~ N(loc, scale^2 I). Ours, not the paper's.
+
+    The environment receives a + e clipped to its action space, in the space's dtype; the caller's
+    action is left as it is. ``scale`` and ``loc`` are in units of the action, the same in every
+    dimension; e = ``noise.normal(loc, scale, a.shape)``. Action noise is part of the dynamics.
+
+    >>> env = RandomNormalNoisyAction(gym.make("Pendulum-v1"), 1.0, 0.5)
+    >>> _ = env.reset(seed=0)
+    >>> _, _, _, _, info = env.step(np.zeros(1, np.float32))
+    >>> info
+    {'noise': ('RandomNormalNoisyAction',)}
+    >>> env.unwrapped.last_u  # what the environment received
+    np.float32(-0.34995687)
+    """
+
+    def __init__(self, env: Env, noise_rate: float | str, scale: float, *, loc: float = 0.0):
+        """Raise ValueError unless scale >= 0, both are finite and actions are a Box of floats."""
+        self.scale = _number("scale", scale, low=0)
+        self.loc = _number("loc", loc)
+        super().__init__(env, noise_rate, scale=self.scale, loc=self.loc)
+        space = env.action_space
+        if not isinstance(space, gym.spaces.Box) or space.dtype.kind != "f":
+            raise ValueError(
+                f"RandomNormalNoisyAction needs a Box action space of floats, got {space}"
+            )
+        self._space = space
+
+    def step(self, action: Any) -> Step:
+        """Perturb the action with probability p and step the environment."""
+        if not self._acts():
+            return self.env.step(action)
+        space = self._space
+        noise = self._noise.normal(self.loc, self.scale, space.shape)
+        noisy = np.clip(np.asarray(action, np.float64) + noise, space.low, space.high)
+        observation, reward, terminated, truncated, info = self.env.step(
+            np.asarray(noisy, space.dtype)
+        )
+        return observation, reward, terminated, truncated, self._mark(info)
 
 
 WRAPPERS: dict[str, type[NoiseWrapper]] = {
@@ -448,8 +604,13 @@ WRAPPERS: dict[str, type[NoiseWrapper]] = {
         RandomUniformNoisyReward,
         RandomUniformScaleReward,
         RandomEarlyTermination,
+        RandomNormalNoisyAction,
     )
 }
+# What changes the dynamics acts before an episode's statistics are recorded, in this order.
+_DYNAMICS: tuple[type[NoiseWrapper], ...] = (RandomEarlyTermination, RandomNormalNoisyAction)
+# What gives away Gymnasium's RecordEpisodeStatistics and Stable-Baselines3's Monitor.
+_OF_RECORDERS = ("return_queue", "get_episode_rewards")
 
 
 @dataclass(frozen=True)
@@ -460,10 +621,10 @@ class Noise:
     """
 
     wrapper: type[NoiseWrapper]
-    args: tuple[float, ...] = ()
-    kwargs: tuple[tuple[str, float], ...] = ()
+    args: tuple[Any, ...] = ()
+    kwargs: tuple[tuple[str, Any], ...] = ()
 
-    def __call__(self, env: gym.Env, noise_rate: float) -> NoiseWrapper:
+    def __call__(self, env: Env, noise_rate: float | str) -> NoiseWrapper:
         """Wrap an environment."""
         return self.wrapper(env, noise_rate, *self.args, **dict(self.kwargs))
 
@@ -472,6 +633,19 @@ class Noise:
         arguments = [repr(value) for value in self.args]
         arguments += [f"{name}={value!r}" for name, value in self.kwargs]
         return f"{self.wrapper.__name__}({', '.join(arguments)})"
+
+
+def signatures() -> list[str]:
+    """Return the wrappers with their parameters, as a noise is written.
+
+    >>> signatures()[0]
+    'RandomNormalNoisyObservation(scale, *, loc=0.0)'
+    """
+    found = []
+    for name, wrapper in WRAPPERS.items():
+        parameters = [p.replace(annotation=p.empty) for p in _parameters(wrapper)]
+        found.append(f"{name}{inspect.Signature(parameters)}")
+    return found
 
 
 def parse_noise(text: str) -> Noise:
@@ -483,22 +657,20 @@ def parse_noise(text: str) -> Noise:
     'RandomUniformScaleReward(0.5, 1.5)'
 
     Raises:
-        ValueError: unknown name or bad arguments; the message lists the wrappers.
+        ValueError: unknown name or bad arguments; below the first line, the message lists the
+            wrappers, one on a line.
     """
     try:
-        call = ast.parse(text.strip(), mode="eval").body
-        name = call.func.id
-        args = [ast.literal_eval(arg) for arg in call.args]
-        kwargs = {keyword.arg: ast.literal_eval(keyword.value) for keyword in call.keywords}
-    except (AttributeError, MemoryError, RecursionError, SyntaxError, TypeError, ValueError):
+        name, args, kwargs = _read_call(text)
+    except (MemoryError, RecursionError, SyntaxError, TypeError, ValueError):
         raise _bad_noise(text, "expected Name(number, ..., keyword=value)") from None
     if name not in WRAPPERS:
         raise _bad_noise(text, "unknown name")
-    if len(kwargs) < len(call.keywords):
-        raise _bad_noise(text, "a keyword is repeated")
     wrapper = WRAPPERS[name]
+    # Any length of a tuple is right for some environment: this one has that length.
+    sizes = [len(value) for value in [*args, *kwargs.values()] if isinstance(value, tuple)]
     try:
-        recorded = wrapper(_ProbeEnv(), 1.0, *args, **kwargs)._saved_kwargs
+        recorded = wrapper(_ProbeEnv(max(sizes, default=1)), 1.0, *args, **kwargs).parameters
     except (TypeError, ValueError) as error:
         raise _bad_noise(text, str(error)) from None
     used = [p for p in _parameters(wrapper) if recorded[p.name] != p.default]
@@ -509,100 +681,161 @@ def parse_noise(text: str) -> Noise:
     )
 
 
+def _read_call(text: str) -> tuple[str, list[Any], dict[str, Any]]:
+    """Return the name, the positional and the keyword arguments of a call of literals."""
+    call = ast.parse(text.strip(), mode="eval").body
+    if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name):
+        raise ValueError("not a call of a name")
+    kwargs = {}
+    for keyword in call.keywords:
+        if keyword.arg is None or keyword.arg in kwargs:
+            raise ValueError("an unpacked or repeated keyword")
+        kwargs[keyword.arg] = ast.literal_eval(keyword.value)
+    return call.func.id, [ast.literal_eval(arg) for arg in call.args], kwargs
+
+
 def _bad_noise(text: str, reason: str) -> ValueError:
-    """Return a one-line error that lists the wrappers with their signatures."""
-    signatures = []
-    for wrapper in WRAPPERS.values():
-        plain = [p.replace(annotation=p.empty) for p in _parameters(wrapper)]
-        signatures.append(f"{wrapper.__name__}{inspect.Signature(plain)}")
-    return ValueError(f"bad noise {text!r}: {reason}; valid are {', '.join(signatures)}")
+    return ValueError("\n  ".join([f"bad noise {text!r}: {reason}; valid are", *signatures()]))
 
 
-def _pair(noises: Sequence[str], rates: Sequence[float]) -> list[tuple[Noise, float]]:
+def _pair(noises: Sequence[str], rates: Sequence[float | str]) -> list[tuple[Noise, float | str]]:
     """Parse noises with their rates: without those of rate 0, dynamics noise first."""
-    if len(rates) != len(noises) and not (len(rates) == 1 and noises):
+    if noises and not rates:
+        raise ValueError("--noise needs --noise-rate: one rate for all noises, or one for each")
+    if rates and not noises:
+        raise ValueError("--noise-rate needs --noise: name a noise, or leave the rate out")
+    if len(rates) not in (1, len(noises)):
         raise ValueError(
-            f"give one noise rate for all noises or one for each, got {len(noises)} noises and "
-            f"{len(rates)} noise rates"
+            f"give one noise rate for all noises or one for each: there are {len(noises)} noises "
+            f"and {len(rates)} noise rates"
         )
-    rates = [_number("noise_rate", rate, low=0, high=1) for rate in rates]
-    rates = rates * len(noises) if len(rates) == 1 else rates
-    pairs = [(parse_noise(noise), rate) for noise, rate in zip(noises, rates, strict=True)]
-    pairs = [(noise, rate) for noise, rate in pairs if rate > 0]
-    return sorted(pairs, key=lambda pair: pair[0].wrapper is not RandomEarlyTermination)
+    canonical = [_spelled(_schedule(rate)) for rate in rates]
+    if len(canonical) == 1:
+        canonical = canonical * len(noises)
+    parsed = [parse_noise(noise) for noise in noises]
+    pairs = [(noise, rate) for noise, rate in zip(parsed, canonical, strict=True) if rate != 0]
+    ordered = [pair for wrapper in _DYNAMICS for pair in pairs if pair[0].wrapper is wrapper]
+    return ordered + [pair for pair in pairs if pair[0].wrapper not in _DYNAMICS]
 
 
 def canonical_noises(
-    noises: Sequence[str], rates: Sequence[float]
-) -> tuple[list[str], list[float]]:
+    noises: Sequence[str], rates: Sequence[float | str]
+) -> tuple[list[str], list[float | str]]:
     """Return noises in canonical notation and one rate for each.
 
-    Noises of rate 0 are dropped (they are the baseline) and early termination comes first, where
-    :func:`make_noisy` applies it. One rate serves all noises.
+    Noises of rate 0 are dropped (they are the baseline). Early termination and action noise come
+    first, where :func:`make_noisy` applies them. One rate serves all noises. A rate is a number in
+    [0, 1], or "start:end" of two such numbers, which is a number if they are equal.
 
     >>> canonical_noises(["RandomNormalNoisyReward(1)", "RandomEarlyTermination(50, 50)"], [0.1])
     (['RandomEarlyTermination(50)', 'RandomNormalNoisyReward(1.0)'], [0.1, 0.1])
+    >>> canonical_noises(["RandomNormalNoisyReward(1)"], ["1:0"])
+    (['RandomNormalNoisyReward(1.0)'], ['1.0:0.0'])
 
     Raises:
-        ValueError: a bad noise, a rate outside [0, 1], or numbers of rates and noises that differ.
+        ValueError: a bad noise, a bad rate, or numbers of rates and noises that differ.
     """
     pairs = _pair(noises, rates)
     return [str(noise) for noise, _ in pairs], [rate for _, rate in pairs]
 
 
-def make_noisy(env: gym.Env, noises: Sequence[str], rates: Sequence[float]) -> gym.Env:
+def make_noisy(
+    env: Env,
+    noises: Sequence[str],
+    rates: Sequence[float | str],
+    *,
+    record_statistics: bool = True,
+) -> Env:
     """Stack noises on an environment, around a record of the true returns.
 
-    Early termination is innermost, then ``gymnasium.wrappers.RecordEpisodeStatistics``, then the
-    other noises in the order given, so ``info["episode"]`` has the return before reward noise.
+    Early termination is innermost, then action noise, then
+    ``gymnasium.wrappers.RecordEpisodeStatistics``, then the other noises in the order given, so
+    ``info["episode"]`` has the return before reward noise. ``record_statistics=False`` leaves the
+    record out, for an environment that keeps one itself, such as Stable-Baselines3's Monitor.
 
     >>> make_noisy(gym.make("CartPole-v1").unwrapped, ["RandomNormalNoisyReward(1)"], [0.1])
     <RandomNormalNoisyReward<RecordEpisodeStatistics<CartPoleEnv<CartPole-v1>>>>
 
     Raises:
-        ValueError: as :func:`canonical_noises`, an observation space that is not a Box, or an
-            environment that has a RecordEpisodeStatistics already.
+        ValueError: as :func:`canonical_noises`, a space that a noise cannot work on, or an
+            environment that records its episodes already.
     """
-    if env.has_wrapper_attr("return_queue"):
-        raise ValueError("make_noisy adds RecordEpisodeStatistics itself: take it off this env")
+    if record_statistics and any(env.has_wrapper_attr(name) for name in _OF_RECORDERS):
+        raise ValueError(
+            "this environment records its episodes already (with RecordEpisodeStatistics or "
+            "Monitor): take that off, or use make_noisy(..., record_statistics=False)"
+        )
     pairs = _pair(noises, rates)
-    dynamics = [pair for pair in pairs if pair[0].wrapper is RandomEarlyTermination]
-    for noise, rate in dynamics:
-        env = noise(env, rate)
-    env = gym.wrappers.RecordEpisodeStatistics(env)
-    for noise, rate in pairs[len(dynamics) :]:
-        env = noise(env, rate)
+    for noise, rate in pairs:
+        if noise.wrapper in _DYNAMICS:
+            env = noise(env, rate)
+    if record_statistics:
+        env = gym.wrappers.RecordEpisodeStatistics(env)
+    for noise, rate in pairs:
+        if noise.wrapper not in _DYNAMICS:
+            env = noise(env, rate)
     return env
 
 
-def noise_wrappers(env: gym.Env) -> dict[str, NoiseWrapper]:
+def set_progress(env: Env, fraction: float) -> None:
+    """Say what fraction of training is done, for rates that change; call it before a ``reset()``.
+
+    The rates follow when the next episode begins and never within one; constant rates stay.
+
+    >>> env = RandomNormalNoisyReward(gym.make("CartPole-v1"), "1.0:0.0", 0.1)
+    >>> set_progress(env, 0.25)
+    >>> env.noise_rate
+    1.0
+    >>> _ = env.reset()
+    >>> env.noise_rate
+    0.75
+
+    Raises:
+        ValueError: a fraction that is not in [0, 1].
+    """
+    progress = _number("fraction", fraction, low=0, high=1)
+    for layer in _noise_layers(env):
+        layer.progress = progress
+
+
+def noise_wrappers(env: Env) -> dict[str, NoiseWrapper]:
     """Return an environment's noise wrappers by class name, innermost first.
 
     The second of a class is "ClassName_2", and so on.
     """
     found: dict[str, NoiseWrapper] = {}
+    count: Counter[str] = Counter()
     for layer in reversed(list(_noise_layers(env))):
         name = type(layer).__name__
-        before = sum(type(other) is type(layer) for other in found.values())
-        found[f"{name}_{before + 1}" if before else name] = layer
+        count[name] += 1
+        found[name if count[name] == 1 else f"{name}_{count[name]}"] = layer
     return found
 
 
 def run_name(
-    env_id: str, exp_name: str, noises: Sequence[str], rates: Sequence[float], seed: int
+    env_id: str, exp_name: str, noises: Sequence[str], rates: Sequence[float | str], seed: int
 ) -> str:
     """Return the name of a run's folder, the same for all spellings of one configuration.
 
+    Where it would be too long for a file system, the noises are cut and end in a hash.
+
     >>> run_name("Hopper-v5", "sac", ["RandomUniformScaleReward(.5, 1.5)"], [0.05], seed=1)
     'Hopper-v5__sac__RandomUniformScaleReward_0.5_1.5_p0.05__1'
+    >>> run_name("Hopper-v5", "sac", ["RandomEarlyTermination(50)"], ["1:0"], seed=1)
+    'Hopper-v5__sac__RandomEarlyTermination_50_p1.0to0.0__1'
     >>> run_name("ALE/Pong-v5", "ppo", [], [], seed=1)
     'ALE-Pong-v5__ppo__baseline__1'
     """
-    words = [
-        [*re.split(r"[(), ]+", str(noise))[:-1], f"p{rate}"] for noise, rate in _pair(noises, rates)
-    ]
-    slug = "+".join("_".join(word) for word in words) or "baseline"
-    return f"{_safe(env_id)}__{_safe(exp_name)}__{slug}__{seed}"
+    words = []
+    for noise, rate in _pair(noises, rates):
+        name_and_arguments = re.findall(r"[^(), ]+", str(noise))
+        words.append("_".join([*name_and_arguments, f"p{rate}".replace(":", "to")]))
+    slug = "+".join(words) or "baseline"
+    name = f"{_safe(env_id)}__{_safe(exp_name)}__{slug}__{seed}"
+    if len(name) > 240:  # a file's name has at most 255 bytes
+        short_slug = f"{slug[:100]}_{hashlib.sha256(slug.encode()).hexdigest()[:16]}"
+        name = f"{_safe(env_id)}__{_safe(exp_name)}__{short_slug}__{seed}"
+    return name
 
 
 def _safe(text: str) -> str:
@@ -610,18 +843,60 @@ def _safe(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9._=+-]", lambda match: "-" if match[0] == "/" else "--", text)
 
 
-def _noise_layers(env: gym.Env) -> Iterator[NoiseWrapper]:
-    """Yield an environment's noise wrappers, outermost first."""
+def canonical_env_id(env_id: str) -> str:
+    """Return the id of the environment that ``gymnasium.make(env_id)`` makes, with its version.
+
+    "module:Env-v0" imports the module, which registers the environment, and stays "module:Env-v0".
+
+    >>> canonical_env_id("Hopper")
+    'Hopper-v5'
+
+    Raises:
+        ValueError: an environment that is not registered or a module that cannot be imported.
+    """
+    module, colon, name = env_id.rpartition(":")
+    try:
+        if module:
+            importlib.import_module(module)
+        namespace, base_name, version = parse_env_id(name)
+        if version is None:
+            version = find_highest_version(namespace, base_name)
+        spec = gym.spec(get_env_id(namespace, base_name, version))
+    except Exception as error:  # a module may raise anything
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"there is no environment {env_id!r}: {reason}") from error
+    return f"{module}{colon}{spec.id}"
+
+
+def _layers(env: Env) -> Iterator[gym.Wrapper[Any, Any, Any, Any]]:
+    """Yield an environment's wrappers, outermost first."""
     while isinstance(env, gym.Wrapper):
-        if isinstance(env, NoiseWrapper):
-            yield env
+        yield env
         env = env.env
 
 
-class _ProbeEnv(gym.Env):
-    """Just enough of an environment to construct a wrapper on."""
+def _noise_layers(env: Env) -> Iterator[NoiseWrapper]:
+    """Yield an environment's noise wrappers, outermost first."""
+    for layer in _layers(env):
+        if isinstance(layer, NoiseWrapper):
+            yield layer
 
-    observation_space = gym.spaces.Box(-1.0, 1.0, (1,))
+
+def _has_categories(space: gym.Space[Any]) -> bool:
+    """Return whether a space contains categories, which flattening makes one-hot vectors."""
+    if isinstance(space, gym.spaces.Dict):
+        return any(_has_categories(part) for part in space.values())
+    if isinstance(space, gym.spaces.Tuple):
+        return any(_has_categories(part) for part in space)
+    return isinstance(space, gym.spaces.Discrete | gym.spaces.MultiDiscrete)
+
+
+class _ProbeEnv(gym.Env[Any, Any]):
+    """Just enough of an environment to construct a wrapper on; it observes `size` numbers."""
+
+    def __init__(self, size: int):
+        self.observation_space = gym.spaces.Box(-1.0, 1.0, (size,))
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,))
 
 
 def _parameters(wrapper: type[NoiseWrapper]) -> list[inspect.Parameter]:
@@ -629,7 +904,7 @@ def _parameters(wrapper: type[NoiseWrapper]) -> list[inspect.Parameter]:
     return list(inspect.signature(wrapper.__init__).parameters.values())[3:]
 
 
-def _cast(values: np.ndarray, dtype: np.dtype) -> np.ndarray:
+def _cast(values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
     """Cast float64 values; to an integer dtype they are rounded and clipped to its range."""
     if dtype.kind in "iu":
         info = np.iinfo(dtype)
@@ -649,18 +924,52 @@ def _number(name: str, value: float, low: float = -math.inf, high: float = math.
     return number + 0.0  # -0.0 becomes 0.0
 
 
-def _interval(low: float, high: float) -> dict[str, float]:
+def _schedule(noise_rate: float | str) -> tuple[float, float]:
+    """Return the rates at the beginning and at the end of training."""
+    try:
+        if isinstance(noise_rate, str):
+            start, end = (float(number) for number in noise_rate.split(":"))
+        else:
+            start = end = noise_rate
+        return (
+            _number("noise_rate", start, low=0, high=1),
+            _number("noise_rate", end, low=0, high=1),
+        )
+    except ValueError:
+        raise ValueError(
+            'a noise_rate must be a number in [0, 1], or "start:end" of two such numbers, as '
+            f'"1.0:0.0", got {noise_rate!r}'
+        ) from None
+
+
+def _spelled(schedule: tuple[float, float]) -> float | str:
+    """Return a schedule as it is written: one number, or "start:end" where they differ."""
+    start, end = schedule
+    return start if start == end else f"{start}:{end}"
+
+
+def _interval(low: float, high: float) -> tuple[float, float]:
     low, high = _number("low", low), _number("high", high)
     if low > high:
         raise ValueError(f"low must not exceed high, got low={low}, high={high}")
-    return {"low": low, "high": high}
+    return low, high
 
 
-def _step_number(name: str, value: int) -> int:
-    integer = isinstance(value, numbers.Integral) and not isinstance(value, bool)
-    if not (integer and 1 <= value < 2**63):  # Generator.integers draws 64-bit integers
-        raise ValueError(f"{name} must be an integer in [1, 2**63), got {value!r}")
-    return int(value)
+def _scale_or_scales(value: float | tuple[float, ...] | list[float]) -> float | tuple[float, ...]:
+    """Check one standard deviation for all dimensions, or a tuple (in JSON a list) of them."""
+    if not isinstance(value, tuple | list):
+        return _number("scale", value, low=0)
+    if len(value) < 2:
+        raise ValueError(f"scale must be one number, or a tuple of two or more, got {value!r}")
+    return tuple(_number("every scale", number, low=0) for number in value)
+
+
+def _step_number(name: str, value: int | None) -> int:
+    if isinstance(value, numbers.Integral) and not isinstance(value, bool):
+        number = int(value)
+        if 1 <= number < 2**63:  # Generator.integers draws 64-bit integers
+            return number
+    raise ValueError(f"{name} must be an integer in [1, 2**63), got {value!r}")
 
 
 def _flag(name: str, value: bool) -> bool:

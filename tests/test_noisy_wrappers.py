@@ -26,6 +26,7 @@ from noisy_wrappers import (
     RandomDropoutObservation,
     RandomEarlyTermination,
     RandomMixupObservation,
+    RandomNormalNoisyAction,
     RandomNormalNoisyObservation,
     RandomNormalNoisyReward,
     RandomUniformNoisyObservation,
@@ -37,6 +38,7 @@ from noisy_wrappers import (
     noise_wrappers,
     parse_noise,
     run_name,
+    signatures,
 )
 
 # Derandomized: a failure in CI is a failure on every machine.
@@ -50,6 +52,12 @@ OBSERVATION_CASES = [
         (0.3,),
         {"loc": -0.5},
         lambda g, o, _: o + g.normal(-0.5, 0.3, o.shape),
+    ),
+    (
+        RandomNormalNoisyObservation,
+        ((0.3, 0.0, 2.0),),
+        {},
+        lambda g, o, _: o + g.normal(0, [0.3, 0.0, 2.0]),
     ),
     (RandomUniformNoisyObservation, (-0.2, 0.7), {}, lambda g, o, _: o + g.uniform(-0.2, 0.7, 3)),
     (RandomUniformScaleObservation, (0.5, 1.7), {}, lambda g, o, _: o * g.uniform(0.5, 1.7)),
@@ -84,6 +92,8 @@ NOISES = [
     "RandomEarlyTermination(3, 9)",
     "RandomEarlyTermination(3, 9, truncate=True)",
     "RandomEarlyTermination(each_step=True)",
+    "RandomNormalNoisyAction(0.3)",
+    "RandomNormalNoisyAction(0.3, loc=-0.5)",
 ]
 STEP_NOISES = [text for text in NOISES if not text.startswith("RandomEarlyTermination(3")]
 BOX = gym.spaces.Box(-10.0, 10.0, (3,), np.float64)
@@ -142,6 +152,13 @@ def build(text, env, rate):
     """Build a wrapper from the notation, without the module's parser."""
     name, arguments = text.split("(", 1)
     return eval(f"wrapper(env, rate, {arguments}", {"wrapper": WRAPPERS[name]} | locals())
+
+
+def registered(text):
+    """A registered environment that a noise can work on, and an action."""
+    if "Action" in text:
+        return "Pendulum-v1", np.array([0.5], np.float32)
+    return "CartPole-v1", 0
 
 
 def streams(wrapper, seed, position=0):
@@ -387,7 +404,7 @@ def test_applied_fraction_is_the_rate(text, rate):
     resets = sum(reward is None for _, reward, *_ in steps)
     if "(3" in text:
         opportunities = resets
-    elif "Reward" in text or "Mixup" in text or "each_step" in text:
+    elif "Reward" in text or "Mixup" in text or "each_step" in text or "Action" in text:
         opportunities = len(steps) - resets
     else:
         opportunities = len(steps)
@@ -586,8 +603,9 @@ def test_the_gate_at_the_ends_of_the_unit_interval(text):
 
 
 @pytest.mark.parametrize("text", NOISES)
-@pytest.mark.parametrize("env_id", ["Pendulum-v1", "CartPole-v1", "InvertedPendulum-v5"])
+@pytest.mark.parametrize("env_id", ["Pendulum-v1", None, "InvertedPendulum-v5"])
 def test_rate_zero_is_the_bare_environment(text, env_id):
+    env_id = env_id or registered(text)[0]
     env = gym.make(env_id)
     env.action_space.seed(0)
     action = env.action_space.sample()
@@ -822,25 +840,23 @@ def test_wide_integers_do_not_overflow(dtype):
 @pytest.mark.parametrize(
     "env",
     [
-        lambda: gym.make("CartPole-v1"),
-        lambda: gym.make("Pendulum-v1"),
-        lambda: gym.make("InvertedPendulum-v5"),
-        lambda: GenericEnv(gym.spaces.Box(-6, 5, (2, 3), np.int8)),
-        lambda: GenericEnv(gym.spaces.Box(-5, 5, (), np.float32)),
+        lambda text: gym.make(registered(text)[0]),
+        lambda text: gym.make("Pendulum-v1"),
+        lambda text: gym.make("InvertedPendulum-v5"),
+        lambda text: GenericEnv(gym.spaces.Box(-6, 5, (2, 3), np.int8)),
+        lambda text: GenericEnv(gym.spaces.Box(-5, 5, (), np.float32)),
     ],
     ids=["CartPole", "Pendulum", "InvertedPendulum", "int8", "scalar"],
 )
 def test_check_env(text, env):
-    check_env(build(text, env(), 1.0), skip_render_check=True)
-    check_env(build(text, env(), 0.3), skip_render_check=True)
+    for rate in (1.0, 0.3, "1.0:0.0"):
+        check_env(build(text, env(text), rate), skip_render_check=True)
 
 
 UNSUITABLE_SPACES = [
     gym.spaces.Dict(x=BOX),
     gym.spaces.Tuple((BOX, BOX)),
-    gym.spaces.Discrete(3),
     gym.spaces.MultiBinary(3),
-    gym.spaces.MultiDiscrete([2, 3]),
 ]
 
 
@@ -855,6 +871,28 @@ def test_spaces_other_than_box(text, space):
         build(text, env, 0.1)
     assert type(space).__name__ in str(error.value) and "\n" not in str(error.value)
     build(text, FlattenObservation(env), 0.1)
+
+
+CATEGORIES = [
+    gym.spaces.Discrete(3),
+    gym.spaces.MultiDiscrete([2, 3]),
+    gym.spaces.Dict(x=BOX, kind=gym.spaces.Discrete(3)),
+    gym.spaces.Tuple((BOX, gym.spaces.Dict(kind=gym.spaces.MultiDiscrete([2, 3])))),
+]
+
+
+@pytest.mark.parametrize("space", CATEGORIES, ids=lambda space: type(space).__name__)
+@pytest.mark.parametrize("text", NOISES)
+def test_categories_are_not_perturbed_as_if_they_were_quantities(text, space):
+    env = GenericEnv(space, reset=lambda env: (space.sample(), {}))
+    flat = RandomNormalNoisyReward(gym.wrappers.TimeLimit(FlattenObservation(env), 9), 0.1, 1)
+    if not text.split("(")[0].endswith("Observation"):
+        build(text, flat, 1.0).reset(seed=0)
+        return
+    for unsuitable in (env, flat):
+        with pytest.raises(ValueError, match="cannot perturb categories.*reward noise") as error:
+            build(text, unsuitable, 0.1)
+        assert "\n" not in str(error.value)
 
 
 # Parameters
@@ -945,7 +983,8 @@ def test_limits_of_the_parameters_are_allowed():
 
 @pytest.mark.parametrize("text", NOISES)
 def test_spec_round_trip(text):
-    env = RandomNormalNoisyReward(build(text, gym.make("CartPole-v1"), 0.25), np.float64(0.5), 1)
+    env_id, action = registered(text)
+    env = RandomNormalNoisyReward(build(text, gym.make(env_id), 0.25), np.float64(0.5), 1)
     for spec in (env.spec, gym.envs.registration.EnvSpec.from_json(env.spec.to_json())):
         made = spec.make()
         assert str(made) == str(env)
@@ -954,17 +993,19 @@ def test_spec_round_trip(text):
         assert vars(made.env).keys() == vars(env.env).keys()
         for name in ("low", "high", "scale", "factor", "keep_prob", "recursive", "truncate"):
             assert getattr(made.env, name, None) == getattr(env.env, name, None)
-        assert same(rollout(made, seed=5), rollout(env, seed=5))
+        assert same(rollout(made, 5, action=action), rollout(env, 5, action=action))
 
 
 @pytest.mark.parametrize("text", NOISES)
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
 def test_copies_continue_alike(text, duplicate):
-    env = build(text, gym.make("CartPole-v1"), 0.5)
+    env_id, action = registered(text)
+    env = build(text, gym.make(env_id), 0.5)
     env.reset(seed=2)
-    env.step(0)
+    env.step(action)
     twin = duplicate(env)
-    assert same([env.step(0), *rollout(env)], [twin.step(0), *rollout(twin)])
+    ours = [env.step(action), *rollout(env, action=action)]
+    assert same(ours, [twin.step(action), *rollout(twin, action=action)])
     assert (twin.times_applied, twin.opportunities) == (env.times_applied, env.opportunities)
 
 
@@ -1091,11 +1132,16 @@ def test_canonical_spelling(canonical, spellings):
 def test_bad_notation(text):
     with pytest.raises(ValueError) as error:
         parse_noise(text)
-    message = str(error.value)
-    assert "\n" not in message and repr(text) in message
-    assert all(f"{name}(" in message for name in WRAPPERS)
-    assert "RandomMixupObservation(factor, *, recursive=False)" in message
-    assert "RandomUniformScaleReward(low, high)" in message
+    reason, *lines = str(error.value).split("\n  ")
+    assert "\n" not in reason and repr(text) in reason
+    assert lines == signatures()
+
+
+def test_signatures():
+    assert [text.split("(")[0] for text in signatures()] == list(WRAPPERS)
+    assert "RandomMixupObservation(factor, *, recursive=False)" in signatures()
+    assert "RandomUniformScaleReward(low, high)" in signatures()
+    assert "RandomNormalNoisyAction(scale, *, loc=0.0)" in signatures()
 
 
 def test_the_registry_is_complete():
@@ -1109,6 +1155,7 @@ def test_the_registry_is_complete():
         "RandomUniformNoisyReward",
         "RandomUniformScaleReward",
         "RandomEarlyTermination",
+        "RandomNormalNoisyAction",
     ]
     assert all(issubclass(wrapper, NoiseWrapper) for wrapper in WRAPPERS.values())
     assert {text.split("(")[0] for text in NOISES} == set(WRAPPERS)
@@ -1147,6 +1194,12 @@ def test_canonical_noises():
         ([A], [math.nan]),
         ([A, B], [0.1, 2]),
         (["Nothing(1)"], [0.0]),
+        ([A], ["0.5:"]),
+        ([A], ["1:2"]),
+        ([A], ["a:b"]),
+        ([A], ["0.5"]),
+        ([A], ["1:0.5:0"]),
+        ([A], ["nan:0"]),
     ],
 )
 def test_bad_noises_and_rates(noises, rates):
@@ -1157,7 +1210,9 @@ def test_bad_noises_and_rates(noises, rates):
     ):
         with pytest.raises(ValueError) as error:
             function()
-        assert "\n" not in str(error.value)
+        lines = str(error.value).split("\n  ")
+        assert "\n" not in lines[0]
+        assert lines[1:] == (signatures() if "Nothing" in str(noises) else [])
 
 
 def layers(env):
@@ -1274,7 +1329,10 @@ def test_doctests():
 
 def test_every_public_wrapper_has_a_doctest():
     for wrapper in WRAPPERS.values():
-        assert ">>>" in wrapper.__doc__ and "(section 3." in wrapper.__doc__
+        assert ">>>" in wrapper.__doc__
+        ours = wrapper is RandomNormalNoisyAction
+        assert ("(section 3." in wrapper.__doc__) == (not ours)
+        assert ("Ours, not the paper's." in wrapper.__doc__) == ours
 
 
 def test_import_needs_no_torch():
