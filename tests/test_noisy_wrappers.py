@@ -33,11 +33,13 @@ from noisy_wrappers import (
     RandomUniformNoisyReward,
     RandomUniformScaleObservation,
     RandomUniformScaleReward,
+    canonical_env_id,
     canonical_noises,
     make_noisy,
     noise_wrappers,
     parse_noise,
     run_name,
+    set_progress,
     signatures,
 )
 
@@ -413,6 +415,238 @@ def test_applied_fraction_is_the_rate(text, rate):
     assert env.applied_fraction == pytest.approx(rate, rel=0.05)
 
 
+# Action noise
+
+
+def actions_env(space):
+    """An environment that keeps the actions it receives."""
+
+    def step(env, action):
+        env.received.append(action)
+        return env.draw(), 0.0, False, False, {}
+
+    env = GenericEnv(step=step)
+    env.action_space = space
+    env.received = []
+    return env
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("rate", [0.3, 1.0])
+@pytest.mark.parametrize(
+    ("kwargs", "loc"), [({}, 0.0), ({"loc": 0.5}, 0.5)], ids=["loc=0", "loc=0.5"]
+)
+def test_action_golden(kwargs, loc, rate, dtype):
+    low, high = np.array([-1.0, -0.5]), np.array([1.0, np.inf])
+    bare = actions_env(gym.spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype))
+    env = RandomNormalNoisyAction(bare, rate, 0.4, **kwargs)
+    gate, noise = streams(RandomNormalNoisyAction, seed=7)
+    env.reset(seed=7)
+    rng = np.random.default_rng(0)
+    clipped = 0
+    for t in range(200):
+        action = rng.uniform(-1.5, 1.5, 2).astype(dtype)
+        given = action.copy()
+        action.flags.writeable = False
+        info = env.step(action)[4]
+        received = bare.received[-1]
+        assert np.array_equal(action, given)
+        if gate.random() < rate:
+            unclipped = given + noise.normal(loc, 0.4, 2)
+            expected = np.clip(unclipped, low, high)
+            clipped += np.any(expected != unclipped)
+            assert received.dtype == dtype and received is not action
+            np.testing.assert_allclose(received, expected, rtol=4 * np.finfo(dtype).eps)
+            assert info == {"noise": ("RandomNormalNoisyAction",)}
+        else:
+            assert received is action and info == {}
+        assert env.opportunities == t + 1
+    assert 0 < clipped < env.times_applied
+
+
+def test_action_moments_and_rate():
+    def measure(scale, loc):
+        bare = actions_env(gym.spaces.Box(-np.inf, np.inf, (4,), np.float64))
+        env = RandomNormalNoisyAction(bare, 0.3, scale, loc=loc)
+        env.reset(seed=1)
+        for _ in range(40_000):
+            env.step(np.full(4, 2.0))
+        change = np.array(bare.received) - 2
+        acted = change[(change != 0).any(axis=1)]
+        assert len(acted) / 40_000 == pytest.approx(0.3, rel=0.05)
+        return acted.mean(axis=0), acted.var(axis=0), np.corrcoef(acted.T)
+
+    for scale, loc in [(0.5, 0.0), (0.5, 1.0)]:
+        mean, variance, correlation = measure(scale, loc)
+        np.testing.assert_allclose(mean, loc, atol=0.03)
+        np.testing.assert_allclose(variance, scale**2, rtol=0.06)
+        np.testing.assert_allclose(correlation, np.eye(4), atol=0.05)
+
+
+def test_noisy_actions_stay_in_the_action_space():
+    bare = actions_env(gym.spaces.Box(np.float32([-0.1, 0.3]), np.float32([0.1, 0.7])))
+    env = RandomNormalNoisyAction(bare, 1.0, 1e6)
+    env.reset(seed=0)
+    for _ in range(100):
+        env.step([0.0, 0.5])  # a list is an action, too
+    assert all(action in bare.action_space for action in bare.received)
+    assert {tuple(action) for action in bare.received} == {
+        (low, high) for low in np.float32([-0.1, 0.1]) for high in np.float32([0.3, 0.7])
+    }
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        gym.spaces.Discrete(3),
+        gym.spaces.MultiBinary(2),
+        gym.spaces.Box(-1, 1, (2,), np.int32),
+        gym.spaces.Dict(a=gym.spaces.Box(-1, 1)),
+    ],
+    ids=lambda space: type(space).__name__,
+)
+def test_action_noise_needs_a_box_of_floats(space):
+    with pytest.raises(ValueError, match="needs a Box action space of floats") as error:
+        RandomNormalNoisyAction(actions_env(space), 0.1, 1.0)
+    assert "\n" not in str(error.value)
+
+
+# Rates that change
+
+
+@pytest.mark.parametrize(
+    ("schedule", "rates"),
+    [
+        ("1.0:0.0", [1.0, 0.75, 0.5, 0.0]),
+        ("0:1", [0.0, 0.25, 0.5, 1.0]),
+        ("0.1:0.3", [0.1, 0.15, 0.2, 0.3]),
+        ("0.3:0.3", [0.3, 0.3, 0.3, 0.3]),
+        (0.3, [0.3, 0.3, 0.3, 0.3]),
+    ],
+)
+def test_the_rate_follows_the_progress_at_the_next_reset(schedule, rates):
+    env = gym.wrappers.TimeLimit(RandomNormalNoisyReward(constant_env(), schedule, 1.0), 9)
+    env = RandomDropoutObservation(env, schedule, 0.5)
+    wrappers = list(noise_wrappers(env).values())
+    assert [wrapper.noise_rate for wrapper in wrappers] == [rates[0]] * 2
+    for fraction, rate in zip([0, 0.25, 0.5, 1], rates, strict=True):
+        before = [wrapper.noise_rate for wrapper in wrappers]
+        set_progress(env, fraction)
+        assert [wrapper.noise_rate for wrapper in wrappers] == before
+        env.reset()
+        assert [wrapper.noise_rate for wrapper in wrappers] == [pytest.approx(rate, rel=1e-15)] * 2
+    assert wrappers[0].noise_rate == rates[-1]  # exactly
+
+
+@pytest.mark.parametrize("text", STEP_NOISES)
+def test_a_rate_is_constant_within_an_episode(text):
+    env = build(text, constant_env(), "0:1")
+    for fraction, acts in [(0, False), (1, True), (0, False)]:
+        set_progress(env, fraction)
+        env.reset()
+        for later in (0.3, 1 - fraction, fraction):
+            set_progress(env, later)
+            assert ("noise" in env.step(0)[4]) == acts
+
+
+def test_realised_rate_of_a_schedule():
+    """With episodes of one length, the mean over training is that of the episodes' rates."""
+    env = RandomNormalNoisyObservation(episodes_env([20]), "0.9:0.1", 0.1)
+    rates = []
+    acted = 0
+    for step in range(0, 40_000, 20):
+        set_progress(env, step / 40_000)
+        acted += "noise" in env.reset(seed=3 if step == 0 else None)[1]
+        rates.append(env.noise_rate)
+        acted += sum("noise" in env.step(0)[4] for _ in range(20))
+    assert rates == pytest.approx(np.linspace(0.9, 0.1, 2001)[:-1].tolist())
+    rates = np.repeat(rates, 21)
+    error = math.sqrt(np.sum(rates * (1 - rates))) / len(rates)
+    assert env.applied_fraction == acted / len(rates)
+    assert abs(env.applied_fraction - rates.mean()) < 3 * error
+    assert 3 * error < 0.01  # and the bound sees a rate that stays at either end
+
+
+@pytest.mark.parametrize("text", NOISES)
+def test_a_schedule_draws_what_its_rates_draw(text):
+    """One uniform per opportunity whatever the rate: an episode is that of a constant rate."""
+    fractions = [0.0, 0.5, 0.5, 1.0]
+
+    def episodes(rate, assigned):
+        env = build(text, episodes_env([6]), rate)
+        out = []
+        for episode, fraction in enumerate(fractions):
+            if assigned:
+                env.noise_rate = 0.9 - 0.8 * fraction
+            else:
+                set_progress(env, fraction)
+            out += [(*env.reset(seed=4 if episode == 0 else None),)]
+            out += [env.step(np.zeros(1)) for _ in range(6)]
+        return [(step[0].tobytes(), step[1:]) for step in out], env.state_dict()
+
+    scheduled = episodes("0.9:0.1", assigned=False)
+    assert scheduled == episodes(0.5, assigned=True)
+    assert scheduled[1] != episodes(0.9, assigned=False)[1]
+
+
+@pytest.mark.parametrize("text", NOISES)
+def test_progress_leaves_a_constant_rate_alone(text):
+    constant = build(text, episodes_env([12]), 0.1)
+    expected = rollout(constant, seed=1)
+    for rate in (0.1, "0.1:0.1"):
+        env = build(text, episodes_env([12]), rate)
+        set_progress(env, 0.7)
+        assert same(rollout(env, seed=1), expected)
+        assert env.noise_rate == 0.1
+    scheduled = build(text, episodes_env([12]), "0.9:0.5")
+    scheduled.noise_rate = 0.1  # a number that is assigned replaces the schedule
+    set_progress(scheduled, 1.0)
+    assert same(rollout(scheduled, seed=1), expected)
+
+
+def test_resuming_a_schedule_needs_the_progress_and_the_streams():
+    def make():
+        return make_noisy(episodes_env([5]), [A, B], ["1:0", "0.2:0.6"])
+
+    env = make()
+    set_progress(env, 0.25)
+    rollout(env, seed=8, steps=10)
+    states = [wrapper.state_dict() for wrapper in noise_wrappers(env).values()]
+    set_progress(env, 0.5)
+    expected = rollout(env)
+    resumed = make()
+    for wrapper, state in zip(noise_wrappers(resumed).values(), states, strict=True):
+        wrapper.load_state_dict(state)
+    set_progress(resumed, 0.5)
+    env.unwrapped.episode = resumed.unwrapped.episode = 0
+    assert [step[1:4] for step in rollout(resumed)] == [step[1:4] for step in expected]
+    rates = {name: wrapper.noise_rate for name, wrapper in noise_wrappers(resumed).items()}
+    assert rates == {"RandomNormalNoisyReward": 0.5, "RandomDropoutObservation": 0.4}
+
+
+@pytest.mark.parametrize("fraction", [-0.1, 1.1, math.nan, "0.5", None, True])
+def test_bad_progress(fraction):
+    env = RandomNormalNoisyReward(constant_env(), "1:0", 1.0)
+    with pytest.raises(ValueError, match="fraction"):
+        set_progress(env, fraction)
+    assert env.progress == 0
+
+
+@pytest.mark.parametrize("text", NOISES)
+def test_spec_and_copies_of_a_schedule(text):
+    env_id, action = registered(text)
+    env = build(text, gym.make(env_id), "1:0.25")
+    for spec in (env.spec, gym.envs.registration.EnvSpec.from_json(env.spec.to_json())):
+        made = spec.make()
+        assert (made.spec, made.schedule) == (env.spec, (1.0, 0.25))
+    set_progress(env, 1.0)
+    env.reset(seed=2)
+    for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+        assert (twin.schedule, twin.progress, twin.noise_rate) == ((1.0, 0.25), 1.0, 0.25)
+        assert twin.reset()[0] in twin.observation_space
+        assert twin.noise_rate == 0.25
+
+
 def ks_distance(a, b):
     """The two-sample Kolmogorov-Smirnov statistic."""
     a, b = np.sort(np.ravel(a)), np.sort(np.ravel(b))
@@ -666,6 +900,23 @@ def test_reward_type(wrapper, args, kwargs, formula, reward, kind):
     assert got == pytest.approx(formula(streams(wrapper, 0)[1], float(reward)), rel=1e-6)
 
 
+@pytest.mark.parametrize(("wrapper", "args", "kwargs", "formula"), REWARD_CASES)
+@pytest.mark.parametrize("rate", [0.5, 1.0])
+def test_a_reward_of_shape_one_is_a_number(wrapper, args, kwargs, formula, rate):
+    reward = np.array([1.5], np.float32)
+    env = GenericEnv(step=lambda env, action: (np.zeros(3), reward, False, False, {}))
+    env = wrapper(env, rate, *args, **kwargs)
+    env.reset(seed=0)
+    gate, noise = streams(wrapper, 0)
+    for _ in range(20):
+        got = env.step(0)[1]
+        if gate.random() < rate:
+            assert type(got) is float and got == pytest.approx(formula(noise, 1.5))
+        else:
+            assert got is reward
+    assert reward == 1.5
+
+
 # Spaces
 
 
@@ -814,12 +1065,49 @@ def test_an_environments_own_info_of_noise_gives_way():
     assert env.reset()[1]["noise"] == names
 
 
-def test_statistics_are_recorded_once():
-    env = gym.wrappers.RecordEpisodeStatistics(gym.make("CartPole-v1"))
-    with pytest.raises(ValueError, match="RecordEpisodeStatistics"):
-        make_noisy(env, [], [])
-    with pytest.raises(ValueError, match="RecordEpisodeStatistics"):
-        make_noisy(RandomNormalNoisyReward(env, 0.1, 1.0), [], [])
+class Monitor(gym.Wrapper):
+    """Records episodes as Stable-Baselines3's wrapper of this name does."""
+
+    def reset(self, **kwargs):
+        self.rewards = []
+        return self.env.reset(**kwargs)
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self.rewards.append(reward)
+        if terminated or truncated:
+            info["episode"] = {"r": sum(self.rewards), "l": len(self.rewards), "t": 0.0}
+        return observation, reward, terminated, truncated, info
+
+    def get_episode_rewards(self):
+        return []
+
+
+@pytest.mark.parametrize("recorder", [RecordEpisodeStatistics, Monitor])
+def test_statistics_are_recorded_once(recorder):
+    env = recorder(gym.make("CartPole-v1"))
+    for recorded in (env, RandomNormalNoisyReward(env, 0.1, 1.0)):
+        with pytest.raises(ValueError, match="record_statistics=False") as error:
+            make_noisy(recorded, [], [])
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("recorder", [RecordEpisodeStatistics, Monitor])
+def test_the_record_of_the_environment_is_kept(recorder):
+    env = recorder(gym.wrappers.TimeLimit(constant_env(2.0), 5))
+    env = make_noisy(env, [A, B], [1.0], record_statistics=False)
+    assert layers(env)[-3:] == [recorder.__name__, A.split("(")[0], B.split("(")[0]]
+    env.reset(seed=0)
+    steps = [env.step(0) for _ in range(5)]
+    assert steps[-1][4]["episode"]["r"] == 10.0
+    assert steps[-1][4]["episode"]["l"] == 5
+    assert sum(step[1] for step in steps) != 10.0
+
+
+def test_no_record_where_none_is_wanted():
+    env = make_noisy(constant_env(), [A, C], [0.5], record_statistics=False)
+    assert layers(env) == ["RandomEarlyTermination", "RandomNormalNoisyReward"]
+    assert layers(make_noisy(constant_env(), [], [], record_statistics=False)) == []
 
 
 @pytest.mark.parametrize("dtype", [np.int64, np.uint64])
@@ -963,6 +1251,44 @@ def test_noise_rate_is_writable_and_checked(text):
     for _ in range(9):
         env.step(0)
     assert env.applied_fraction == 1.0
+
+
+SCALES = "RandomNormalNoisyObservation((0.1, 0.2, 0.0), loc=1.0)"
+
+
+@pytest.mark.filterwarnings("ignore:.*WARN")
+def test_a_scale_for_each_dimension():
+    assert str(parse_noise("RandomNormalNoisyObservation(loc=1, scale=(.1, 0.20, -0.0))")) == SCALES
+    env = parse_noise(SCALES)(gym.make("Pendulum-v1"), 1.0)
+    assert env.scale == (0.1, 0.2, 0.0)
+    for spec in (env.spec, gym.envs.registration.EnvSpec.from_json(env.spec.to_json())):
+        assert spec.make().scale == env.scale
+    check_env(env, skip_render_check=True)
+    noises, rates = canonical_noises([SCALES], [0.5])
+    assert noises == [SCALES]
+    name = "E__x__RandomNormalNoisyObservation_0.1_0.2_0.0_loc=1.0_p0.5__1"
+    assert run_name("E", "x", noises, rates, 1) == name
+    others = ["((0.1, 0.2), loc=1)", "(0.1, loc=1)", "((0.1, 0.2, 0), loc=0)", "((0.1, 0.2, 1.0))"]
+    names = {run_name("E", "x", [f"RandomNormalNoisyObservation{o}"], rates, 1) for o in others}
+    assert len(names | {name}) == 5
+
+
+@pytest.mark.parametrize("shape", [(2,), (4,), (3, 1), (1, 3), ()])
+def test_a_scale_for_each_of_other_dimensions(shape):
+    with pytest.raises(ValueError, match="scale has 3 numbers and the observation has") as error:
+        make_noisy(constant_env(shape=shape), [SCALES], [0.5])
+    assert str(shape) in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("scale", [(), (0.1,), (0.1, -0.1, 0.1), (0.1, "1", 0.1), ((1, 2), 3, 4)])
+def test_bad_scales(scale):
+    with pytest.raises(ValueError, match=r"\bscale\b"):
+        RandomNormalNoisyObservation(constant_env(), 0.5, scale)
+    with pytest.raises(ValueError, match=r"\bscale\b"):
+        parse_noise(f"RandomNormalNoisyObservation({scale!r})")
+    for name in ("RandomNormalNoisyReward", "RandomNormalNoisyAction"):
+        with pytest.raises(ValueError, match=r"\bscale\b"):
+            parse_noise(f"{name}((0.1, 0.2))")
 
 
 def test_limits_of_the_parameters_are_allowed():
@@ -1175,6 +1501,16 @@ def test_canonical_noises():
     assert canonical_noises([A, C], [0.5]) == (names, [0.5, 0.5])  # dynamics noise comes first
     assert canonical_noises([A, B, C], [0.5, 0, 1]) == (names, [1.0, 0.5])
     assert canonical_noises([A, B], [0]) == ([], [])
+    assert canonical_noises([A, B], ["0:0", 0.0]) == ([], [])
+    assert canonical_noises([A, C], ["1:0", "0:.5"]) == (names, ["0.0:0.5", "1.0:0.0"])
+    assert canonical_noises([A], ["-0.0:0"]) == ([], [])
+    assert canonical_noises([A], ["0.50:.5"]) == (names[1:], [0.5])
+    assert canonical_noises([A, A], ["1:0"])[1] == ["1.0:0.0", "1.0:0.0"]
+    action = "RandomNormalNoisyAction(1.0)"
+    assert canonical_noises([A, action, C], [0.1, 0.2, 0.3]) == (
+        ["RandomEarlyTermination(9)", action, "RandomNormalNoisyReward(1.0)"],
+        [0.3, 0.2, 0.1],
+    )
     again = canonical_noises([B, A, C], [0.1, 0.2, 0.3])
     assert canonical_noises(*again) == again
     for rate in again[1]:
@@ -1232,6 +1568,9 @@ def test_make_noisy_order():
     for noises in ([A, B, C], [A, C, B], [C, A, B]):
         env = make_noisy(constant_env(), noises, [0.5])
         assert layers(env) == [end, statistics, reward, dropout]
+    env = make_noisy(constant_env(), [A, "RandomNormalNoisyAction(1)", B, C], ["0:1"])
+    assert layers(env) == [end, "RandomNormalNoisyAction", statistics, reward, dropout]
+    assert {wrapper.schedule for wrapper in noise_wrappers(env).values()} == {(0.0, 1.0)}
     env = make_noisy(constant_env(), [B, A, C], [0.1, 0.2, 0.3])
     assert layers(env) == [end, statistics, dropout, reward]
     rates = {name: wrapper.noise_rate for name, wrapper in noise_wrappers(env).items()}
@@ -1285,6 +1624,23 @@ def test_run_names():
         "+RandomUniformNoisyReward_-0.5_1.0_p0.05__3"
     )
 
+    name = run_name("E", "x", [A, C, B], ["1:0", 0.5, "0:.25"], 3)
+    assert name == (
+        "E__x__RandomEarlyTermination_9_p0.5+RandomNormalNoisyReward_1.0_p1.0to0.0"
+        "+RandomDropoutObservation_0.5_p0.0to0.25__3"
+    )
+
+
+def test_long_run_names_fit_into_a_file_system():
+    def name(last):
+        scale = tuple(i / 1000 for i in range(1, 60)) + (last,)
+        return run_name("Humanoid-v5", "sac", [f"RandomNormalNoisyObservation({scale})"], [1], 3)
+
+    assert len(name(0.5)) <= 240 and name(0.5) != name(0.6)
+    assert name(0.5) == name(0.50)
+    assert name(0.5).startswith("Humanoid-v5__sac__RandomNormalNoisyObservation_0.001_0.002_")
+    assert name(0.5).endswith("__3") and re.fullmatch(r"[A-Za-z0-9._=+-]+", name(0.5))
+
 
 @st.composite
 def configurations(draw):
@@ -1302,10 +1658,12 @@ def configurations(draw):
         else:
             most = 1 if "Mixup" in name or "Dropout" in name else 1e16
             arguments = [str(min(draw(few), most))]
+            if name == "RandomNormalNoisyObservation" and draw(st.booleans()):
+                arguments = [str(tuple(draw(st.lists(few, min_size=2, max_size=3))))]
             if "Normal" in name and draw(st.booleans()):
                 arguments.append(f"loc={draw(few)}")
         noises.append(f"{name}({', '.join(arguments)})")
-    rates = [draw(st.sampled_from([0.0, 0.05, 0.5, 1.0])) for _ in noises]
+    rates = [draw(st.sampled_from([0.0, 0.05, 0.5, 1.0, "0:0", "1:0", "0:.5"])) for _ in noises]
     return noises, rates
 
 
@@ -1318,6 +1676,47 @@ def test_names_are_equal_exactly_if_the_configurations_are(one, two):
     assert run_name("Hopper-v5", "sac", *canonical_noises(*one), 1) == names[0]
 
 
+# Names of environments
+
+
+def test_canonical_env_id():
+    toy = "toy_envs:Tiny-v0"
+    for env_id, canonical in [
+        ("Hopper", "Hopper-v5"),
+        ("Hopper-v5", "Hopper-v5"),
+        ("Hopper-v4", "Hopper-v4"),
+        ("Pendulum", "Pendulum-v1"),
+        ("phys2d/CartPole", "phys2d/CartPole-v1"),
+        (toy, toy),
+        ("toy_envs:Tiny", toy),
+    ]:
+        assert canonical_env_id(env_id) == canonical
+        assert canonical_env_id(canonical) == canonical
+
+
+@pytest.mark.parametrize(
+    ("env_id", "reason"),
+    [
+        ("Hoper-v5", "Did you mean: `Hopper`"),
+        ("Hopper-v77", "v77"),
+        ("Hopper v5", "Malformed"),
+        ("", "Malformed"),
+        ("no_such_module:Env-v0", "No module named 'no_such_module'"),
+        ("toy_envs:Nothing-v0", "Nothing"),
+        ("broken_module:Env-v0", "a module of two lines"),
+        ("silent_module:Env-v0", "AssertionError"),
+    ],
+)
+def test_unknown_environments(env_id, reason, tmp_path, monkeypatch):
+    (tmp_path / "broken_module.py").write_text('raise RuntimeError("a module of\\ntwo lines")\n')
+    (tmp_path / "silent_module.py").write_text("assert False\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ValueError) as error:
+        canonical_env_id(env_id)
+    message = str(error.value)
+    assert repr(env_id) in message and reason in message and "\n" not in message
+
+
 # The module
 
 
@@ -1325,6 +1724,13 @@ def test_doctests():
     results = doctest.testmod(noisy_wrappers)
     assert results.failed == 0
     assert results.attempted > 20
+
+
+def test_public_names():
+    assert re.fullmatch(r"\d+\.\d+\.\d+", noisy_wrappers.__version__)
+    for name in noisy_wrappers.__all__:
+        assert getattr(noisy_wrappers, name).__doc__
+    assert set(WRAPPERS) < set(noisy_wrappers.__all__)
 
 
 def test_every_public_wrapper_has_a_doctest():
