@@ -41,6 +41,7 @@ from analyze_statistics import (
     probability_of_improvement,
     steps_to_reach,
 )
+from analyze_verdict import power, sentences, verdict
 
 
 @dataclass
@@ -59,17 +60,19 @@ class Args:
 
 COLUMNS = {
     "summary": """algorithm environment noise noise_rate n mean std n_baseline baseline_mean
-        baseline_std improvement_percent std_change_percent steps_to_baseline""",
+        baseline_std improvement_percent p std_change_percent steps_to_baseline""",
     "best": """algorithm environment noise noise_rate baseline_mean baseline_std noisy_mean
-        noisy_std improvement_percent leave_one_seed_out_percent n n_baseline chosen_from
+        noisy_std improvement_percent p p_adjusted leave_one_seed_out_percent n n_baseline
+        chosen_from
         leave_one_seed_out_mean""",
     "consistency": """algorithm noise noise_rate percent_of_environments
-        average_improvement_percent std_improvement_percent environments n fails_at_every_rate""",
+        average_improvement_percent std_improvement_percent p p_adjusted environments n
+        fails_at_every_rate""",
     "early_performance": "algorithm environment noise steps_millions noise_rate mean std n",
-    "statistics": """algorithm environment noise noise_rate environments n n_baseline
-        iqm iqm_low iqm_high improvement_iqm_percent improvement_low improvement_high
-        probability_of_improvement probability_low probability_high excludes_no_improvement
-        p p_adjusted smallest_p smallest_p_adjusted""",
+    "statistics": """algorithm environment noise noise_rate verdict improvement_iqm_percent
+        improvement_low improvement_high p p_adjusted comparisons probability_of_improvement
+        probability_low probability_high environments n n_baseline iqm iqm_low iqm_high
+        detectable_percent seeds_needed smallest_p smallest_p_adjusted""",
 }
 
 
@@ -196,62 +199,93 @@ def against_baseline(x, y):
     p, low, high = probability_of_improvement(x, y)
     names = ("probability_of_improvement", "probability_low", "probability_high")
     row |= zip(names, (p, low, high), strict=True)
-    if np.isfinite(low):
-        verdict = "yes, better" if low > 0.5 else "yes, worse" if high < 0.5 else "no"
-        row["excludes_no_improvement"] = verdict
-    return row | dict(zip(("p", "smallest_p"), mann_whitney(x, y), strict=True))
+    row |= zip(("p", "smallest_p"), mann_whitney(x, y), strict=True)
+    if x.shape[1] == 1:
+        found = power(x[:, 0], y[:, 0], row["improvement_iqm_percent"])
+        row |= zip(("detectable_percent", "seeds_needed"), found, strict=True)
+    return row
 
 
 def adjust(statistics):
-    """Add Benjamini-Hochberg's p per (algorithm, environment), and the smallest one in reach."""
+    """Add Benjamini-Hochberg's p per (algorithm, environment), the smallest in reach, and verdicts.
+
+    The verdict follows the p of the exact test, corrected for all comparisons of the family.
+    """
     tested = statistics[statistics["p"].notna()]
     for _, family in tested.groupby(["algorithm", "environment"]):
         adjusted = stats.false_discovery_control(family["p"].astype(float))
         statistics.loc[family.index, "p_adjusted"] = adjusted
         alone = np.minimum(1, family["smallest_p"].astype(float) * len(family))
         statistics.loc[family.index, "smallest_p_adjusted"] = alone
+        statistics.loc[family.index, "comparisons"] = len(family)
+    statistics["verdict"] = [verdict(row) for _, row in statistics.iterrows()]
     return statistics
 
 
+def with_p(table, statistics):
+    """Fill in the test of every row of a table that compares a noise with the baseline.
+
+    A table without environments has averages over all of them: it gets the test over all.
+    """
+    keys = KEYS
+    if "environment" not in table:
+        keys = [name for name in KEYS if name != "environment"]
+        statistics = statistics[statistics["environment"] == "all"]
+    tests = statistics.set_index(keys)[["p", "p_adjusted"]]
+    found = tests.reindex(pd.MultiIndex.from_frame(table[keys])).set_index(table.index)
+    for name in ("p", "p_adjusted"):
+        if name in table:
+            table[name] = found[name]
+    return table
+
+
 def family_notes(statistics):
-    """Say what the number of seeds can show at all after the Benjamini-Hochberg adjustment."""
+    """Say where the number of seeds is too small to show a difference, if corrected."""
     notes = []
     tested = statistics[statistics["p"].notna()]
+    keys = ["comparisons", "smallest_p"]
     for algorithm, rows in tested.groupby("algorithm"):
-        limits = rows.groupby("environment", sort=False)["smallest_p"].agg(["size", "min"])
-        for (size, smallest), same in limits.reset_index().groupby(["size", "min"], sort=False):
+        best = rows.sort_values("smallest_p", kind="stable").drop_duplicates("environment")
+        best = best.sort_index()
+        for (size, smallest), same in best.groupby(keys, sort=False):
+            where = f"{algorithm}, {', '.join(same['environment'])}"
+            seeds = f"{min(same['n'].min(), same['n_baseline'].min()):.0f} seeds"
             needed = ceil(round(size * smallest / 0.05, 9))
-            if needed <= 1:
-                reach = "a single configuration can reach 0.05"
-            elif needed <= size:
-                reach = f"below 0.05 only if {needed} or more configurations reach it together"
-            else:
-                reach = "no configuration can reach 0.05"
-            notes.append(
-                f"{algorithm}, {', '.join(same['environment'])}: comparisons: {size}; the smallest "
-                f"p that this number of seeds can give is {smallest:.2g}, adjusted "
-                f"{min(1, size * smallest):.2g} for one configuration alone: {reach}."
-            )
+            if smallest > 0.05:
+                notes.append(
+                    f"{where}: with {seeds} no difference can be significant (smallest possible p: "
+                    f"{smallest:.2g})."
+                )
+            elif needed > 1:
+                notes.append(
+                    f"{where}: with {seeds} and {size:.0f} comparisons a difference can be "
+                    f"significant after the correction only if {needed} or more are together "
+                    f"(smallest possible p: {smallest:.2g}, corrected for one alone "
+                    f"{min(1, size * smallest):.2g})."
+                )
     return notes
 
 
 # --------------------------------------------------------------------------------------------- main
 
 CAPTIONS = {
-    "best": """Best noise for each algorithm and environment against the baseline without noise:
-final test return, mean \u00b1 sample standard deviation over n seeds. The best of many is chosen
-on the seeds that it is reported on, which flatters it; the leave-one-seed-out columns choose on
-all seeds but one and measure on that one.""",
+    "best": """Best noise tried for each algorithm and environment, which may be worse than none,
+against the baseline without noise: final test return, mean \u00b1 sample standard deviation over n
+seeds; p: exact Mann-Whitney test, then adjusted for all noises tried there. The best of many is
+chosen on the seeds that it is reported on, which flatters it; the leave-one-seed-out columns choose
+on all seeds but one and measure on that one.""",
     "consistent": """Noise that matches or betters the baseline in at least 80 % of two or more
-environments: improvement over |baseline|, mean \u00b1 standard deviation over environments; n is
-the smallest number of seeds in any environment.""",
+environments: improvement over |baseline|, mean \u00b1 standard deviation over environments; p: the
+exact test over all of them, then adjusted for all configurations (Benjamini-Hochberg); n is the
+smallest number of seeds in any environment.""",
     "consistently_worse": """Noise that is worse than the baseline in each of two or more
 environments (0 %); columns as in the table of consistent noise. Worse at every rate that was
 tried:""",
     "early_performance": """Test return during training, by noise rate (0.00 is the baseline):
 mean \u00b1 sample standard deviation over (n) seeds.""",
     "summary": """Final test return of every configuration: mean \u00b1 sample standard deviation
-over n seeds, improvement over |baseline|, and change of the standard deviation. Steps to
+over n seeds, improvement over |baseline| with the p of the exact Mann-Whitney test, not corrected,
+and change of the standard deviation. Steps to
 baseline: the first evaluation at which the mean over seeds reaches the baseline's final mean.""",
     "statistics": f"""IQM: interquartile mean of the final returns over n seeds. Improvement: IQM
 of (return - baseline mean) / |baseline mean| over seeds and environments, minus that of the
@@ -263,13 +297,15 @@ normal, skewed or 20 % of them in a low peak, but in
 {", ".join(f"{c} % (n = {n})" for n, c in COVERAGE_OF_MIXTURES.items())} where 40 % were in a low
 and narrow peak, as PPO's on HalfCheetah may be. P(improvement):
 probability that a noisy run beats a baseline run, averaged over environments, with Newcombe's
-interval; the next column says whether that interval, alone among all in the table, excludes one
-half. No interval for n < {MIN_SEEDS}. p: exact two-sided Mann-Whitney test, stratified by
+interval. No interval for n < {MIN_SEEDS}. p: exact two-sided Mann-Whitney test, stratified by
 environment. It is the primary test: where an interval says otherwise, p decides. In a full grid
 the rows of all environments together are primary: in one environment five seeds cannot reach 0.05
 after the adjustment. p adjusted: Benjamini-Hochberg over one family, all configurations of an
-algorithm in one environment, or in all of them together. Smallest p adjusted: what one
-configuration alone could reach at most with its number of seeds.""",
+algorithm in one environment, or in all of them together; the verdict is better or worse where it
+is at most 0.05, and perhaps so where only p is. Smallest p adjusted: what one configuration alone
+could reach at most with its number of seeds. Detectable: the improvement that these seeds find at
+the 5 % level, uncorrected, with 80 % power; seeds needed: how many on each side the observed
+improvement takes. Both are for normal returns with the standard deviation of these seeds.""",
     "missing": """Runs that are in no table and no figure, with their seeds. Missing are the seeds
 that at least half of an algorithm's configurations with noise have, and baselines.""",
     "compare": """The paper's table (environments v2, 1,000,000 steps) beside ours, with the
@@ -285,12 +321,18 @@ def make_tables(studies, paper=None):
     `paper` has the paper's tables (read_paper), to be set beside ours.
     """
     summary = frame("summary", (row for study in studies for row in summary_rows(study)))
-    best = frame("best", (row for study in studies for row in best_rows(study, summary)))
-    consistency = frame("consistency", consistency_rows(summary))
-    good, bad = split_consistency(consistency)
+    # The seeds of a search chose the noise, so they cannot judge it.
+    judging = [study for study in studies if study.phase != "search"]
+    judged = summary[summary["algorithm"].isin([study.algorithm for study in judging])]
+    best = frame("best", (row for study in judging for row in best_rows(study, judged)))
+    consistency = frame("consistency", consistency_rows(judged))
     early = frame("early_performance", (row for study in studies for row in early_rows(study)))
-    statistics = frame("statistics", (row for study in studies for row in statistics_rows(study)))
+    statistics = frame("statistics", (row for study in judging for row in statistics_rows(study)))
     statistics = adjust(statistics)
+    summary, judged, best, consistency = (
+        with_p(table, statistics) for table in (summary, judged, best, consistency)
+    )
+    good, bad = split_consistency(consistency)
     failing = bad[bad["fails_at_every_rate"] == "yes"][["algorithm", "noise"]].drop_duplicates()
     failing = "; ".join(f"{noise} ({algorithm})" for algorithm, noise in failing.values) or "none"
     limits = "\n".join(family_notes(statistics))
@@ -308,7 +350,7 @@ def make_tables(studies, paper=None):
     if paper:
         lengths = {study.algorithm: study.steps[-1] for study in studies}
         caption = ", ".join(f"{algorithm} {steps:,} steps" for algorithm, steps in lengths.items())
-        listed = summary, best, consistency, good, bad, early
+        listed = judged, best, consistency, good, bad, early
         for name, table in compare_tables(paper, lengths, *listed):
             tables[name] = (table, f"{CAPTIONS['compare']} {caption}.")
     return tables
@@ -347,8 +389,20 @@ def no_finished_run(runs_dir):
     fail(f"no finished run in {runs_dir}; there are some in {found}: name it with --runs-dir")
 
 
+def shortened(verdicts, lines=15):
+    """Yield the sentences of each algorithm and environment, or the first ones of many."""
+    groups = verdicts.groupby(["algorithm", "environment"], sort=False)["sentence"]
+    if len(groups) == 0:
+        yield "There is no noise to compare with a baseline yet."
+    for (algorithm, environment), group in groups:
+        first = max(1, lines // len(groups))
+        yield from group[:first]
+        if len(group) > first:
+            yield f"({len(group) - first} more for {algorithm}, {environment}: in the report)"
+
+
 def main(args):
-    """Read the runs, write tables, figures and report, and print the main table."""
+    """Read the runs, write tables, figures and report, and print verdicts and main table."""
     if not args.runs_dir.is_dir():
         fail(f"no folder {args.runs_dir}")
     try:
@@ -367,6 +421,7 @@ def main(args):
         no_finished_run(args.runs_dir)
     tables = make_tables(studies, paper)
     tables["missing"] = (missing, CAPTIONS["missing"])
+    verdicts = sentences(studies, tables["statistics"][0])
     overview = [f"Finished runs: {(runs['status'] == 'finished').sum()}."]
     overview += [
         f"{study.algorithm}: {study.steps[-1]:,} steps, seeds: {len(study.seeds)}, environments: "
@@ -382,13 +437,16 @@ def main(args):
         for name, figure, caption in figures(studies, tables):
             write_figure(out, name, figure)
             drawn.append((name, caption))
-        write_report(out, tables, drawn, overview, problems, notes)
+        write_report(out, verdicts, tables, drawn, overview, problems, notes)
     except OSError as error:
         fail(f"--out: {error}")
     old = sorted(path.name for path in out.glob("*.csv") if path.stem not in tables)
     if old:
         notes.append(f"{out} also holds an earlier analysis, not renewed: {', '.join(old)}")
-    print(f"{overview}\n\n{text_table('best', tables['best'][0])}\n\n{tables['best'][1]}\n")
+    for line in shortened(verdicts):
+        print(line)
+    print(f"\n{overview}\n\nBest noise tried (may be worse than none)\n")
+    print(f"{text_table('best', tables['best'][0])}\n\n{tables['best'][1]}\n")
     for note in family_notes(tables["statistics"][0]) + notes:
         print(f"note: {note}")
     if problems:

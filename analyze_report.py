@@ -285,7 +285,7 @@ def write_figure(out, name, fig):
 # ------------------------------------------------------------------------------------------- report
 
 SECTIONS = {
-    "best": "Best noise",
+    "best": "Best noise tried (may be worse than none)",
     "consistent": "Consistent noise",
     "consistently_worse": "Consistently worse",
     "statistics": "Statistics",
@@ -297,8 +297,8 @@ SECTIONS = {
 FIGURES_OF = {"intervals": "best", "heatmap": "consistent", "curves": "early_performance"}
 
 
-def write_report(out, tables, drawn, overview, problems, notes):
-    """Write report.html: one self-contained page with all tables and figures."""
+def write_report(out, verdicts, tables, drawn, overview, problems, notes):
+    """Write report.html: one self-contained page with all verdicts, tables and figures."""
     sections = {key: {"id": key, "title": title} for key, title in SECTIONS.items()}
     for section in sections.values():
         section |= {"tables": [], "figures": []}
@@ -321,5 +321,9 @@ def write_report(out, tables, drawn, overview, problems, notes):
     pages = jinja2.Environment(loader=here, autoescape=True, trim_blocks=True)
     full = [s for s in sections.values() if s["tables"] or s["figures"]]
     page = pages.get_template("report.html.jinja")
-    html = page.render(sections=full, overview=overview, problems=problems, notes=notes)
+    groups = verdicts.groupby(["algorithm", "environment"], sort=False)
+    verdicts = [group[["verdict", "sentence"]].to_dict("records") for _, group in groups]
+    html = page.render(
+        verdicts=verdicts, sections=full, overview=overview, problems=problems, notes=notes
+    )
     (out / "report.html").write_text(html)

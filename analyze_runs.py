@@ -251,6 +251,7 @@ class Study:
 
     algorithm: str
     base: str
+    phase: str  # of `./benchmark.sh choose`: search, confirmation, or empty
     environments: list
     seeds: list
     steps: np.ndarray  # the evaluation steps that all runs share
@@ -286,8 +287,8 @@ def make_studies(runs):
             if np.isnan(values).all():
                 notes.append(f"{algorithm}: no finished baseline on {env}, so no improvement there")
         notes += version_notes(algorithm, group["versions"])
-        base = group["base"].iloc[0]
-        studies.append(Study(algorithm, base, envs, seeds, grid, returns))
+        base, phase = group[["base", "phase"]].iloc[0]
+        studies.append(Study(algorithm, base, phase, envs, seeds, grid, returns))
     return studies, notes
 
 

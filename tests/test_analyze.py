@@ -149,6 +149,7 @@ def test_summary_by_hand(sweep):
     best = row(table, environment="Hopper-v5", noise=SCALE, noise_rate="0.05")
     assert best["mean"] == 145 and best["n_baseline"] == 4 and best["baseline_mean"] == 115
     assert best["improvement_percent"] == pytest.approx(100 * 30 / 115)
+    assert best["p"] == pytest.approx(4 / 70)  # 130 ties 130: U = 15.5 of 16, taken as 15
     assert best["std_change_percent"] == pytest.approx(0)
     assert best["steps_to_baseline"] == 40_000  # 0.8 * 145 = 116 >= 115
     bad = row(table, environment="Pusher-v5", noise=SCALE, noise_rate="0.20")
@@ -178,6 +179,10 @@ def test_best_by_hand(sweep):
     assert pusher["baseline_std"] == pytest.approx(np.sqrt(200 / 3))
     assert pusher["noisy_std"] == pytest.approx(np.sqrt(100 / 3))
     assert pusher["improvement_percent"] == pytest.approx(37.5)
+    # -30 -20 -30 -20 against -50 -40 -30 -40: U = 15 of 16, p = 2 (1 + 1) / 70; the least of three
+    # is 2 / 70 (the noise that ends at -80), then twice 4 / 70
+    assert pusher["p"] == pytest.approx(4 / 70)
+    assert pusher["p_adjusted"] == pytest.approx(4 / 70)
     assert pusher["leave_one_seed_out_mean"] == -25  # the same choice whatever seed is left out
     assert pusher["leave_one_seed_out_percent"] == pytest.approx(37.5)
 
@@ -278,13 +283,13 @@ def test_statistics_by_hand(sweep):
     assert even["improvement_iqm_percent"] == pytest.approx(100 * (107.5 - 115) / 115)
     # 90 wins 0, 100 wins 0.5, 115 wins 2, 155 wins 4 of 4: 6.5 of 16
     assert even["probability_of_improvement"] == pytest.approx(6.5 / 16)
-    assert even["excludes_no_improvement"] == "no"
+    assert even["verdict"] == "no clear difference"
     worst = row(table, environment="Hopper-v5", noise=ENDING)
     assert worst["probability_of_improvement"] == 0 and worst["probability_low"] == 0
     assert (
         0 < worst["probability_high"] < 0.5
     )  # certain about the order of four, not about the rest
-    assert worst["excludes_no_improvement"] == "yes, worse"
+    assert worst["verdict"] == "perhaps worse" and worst["comparisons"] == 3
     assert worst["p"] == pytest.approx(2 / 70) == worst["smallest_p"]  # C(8, 4) = 70
     # Hopper's family of three: 2/70 (ENDING), 4/70 (130 ties 130, taken as U = 15), and the rest
     assert worst["p_adjusted"] == pytest.approx(3 * 2 / 70) == worst["smallest_p_adjusted"]
@@ -369,12 +374,6 @@ def test_probability_of_improvement_is_rliables():
         assert 0 <= low < p < high <= 1
 
 
-def test_the_interval_decides_whether_no_improvement_is_excluded():
-    cases = [(X, Z, "no"), (Z, X, "no"), (X + 200, Y, "yes, better"), (X, Y + 200, "yes, worse")]
-    for x, y, verdict in cases:
-        assert analyze.against_baseline(x, y)["excludes_no_improvement"] == verdict
-
-
 def test_a_missing_run_is_not_a_score():
     padded = np.vstack([X, np.full((1, 3), NAN)])
     assert analyze_statistics.bootstrap_iqm(padded, Y) == analyze_statistics.bootstrap_iqm(X, Y)
@@ -440,13 +439,16 @@ def test_five_against_five_cannot_reach_significance_alone_among_90(tmp_path):
     returns = {
         analyze_runs.BASELINE: rng.normal(1000, 1, (1, 5, 1))
     } | returns  # all lose every pair
-    study = analyze_runs.Study("SAC", "SAC", ["Hopper-v5"], [1, 2, 3, 4, 5], np.array([1]), returns)
+    study = analyze_runs.Study(
+        "SAC", "SAC", "", ["Hopper-v5"], [1, 2, 3, 4, 5], np.array([1]), returns
+    )
     table = analyze.adjust(analyze.frame("statistics", analyze.statistics_rows(study)))
     assert table["p"].iloc[1] == pytest.approx(2 / 252)
     assert table["smallest_p_adjusted"].iloc[1] == pytest.approx(90 * 2 / 252)
     (note,) = analyze.family_notes(table)
-    assert "comparisons: 90;" in note and "0.0079" in note and "0.71 for one configuration" in note
+    assert "with 5 seeds and 90 comparisons" in note and "0.0079" in note
     assert "only if 15 or more" in note  # 90 * 0.0079 / 0.05 = 14.3
+    assert "for one alone 0.71" in note
     _, caption = analyze.make_tables([study])["statistics"]
     assert note in caption and f"{analyze_statistics.COVERAGE[5]} % (n = 5)" in caption
 
@@ -476,7 +478,8 @@ def test_two_seeds_have_no_interval(tmp_path):
     assert list(table["n"]) == [2, 2] and table["iqm"].notna().all()
     intervals = table.filter(regex="_(low|high)$")
     assert intervals.shape[1] == 6 and intervals.isna().all(axis=None)
-    assert table["excludes_no_improvement"].isna().all()
+    assert table["verdict"].iloc[1] == "no clear difference"
+    assert table["smallest_p"].iloc[1] == pytest.approx(1 / 3)
 
 
 # ---------------------------------------------------------------------- which runs count, and where
