@@ -41,7 +41,7 @@ from gymnasium.envs.registration import find_highest_version, get_env_id, parse_
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-__version__ = "0.2.0"
+__version__ = "0.1.0"
 
 __all__ = [
     "WRAPPERS",
@@ -611,6 +611,24 @@ WRAPPERS: dict[str, type[NoiseWrapper]] = {
 _DYNAMICS: tuple[type[NoiseWrapper], ...] = (RandomEarlyTermination, RandomNormalNoisyAction)
 # What gives away Gymnasium's RecordEpisodeStatistics and Stable-Baselines3's Monitor.
 _OF_RECORDERS = ("return_queue", "get_episode_rewards")
+_RECORDED = (
+    "this environment records its episodes already (in info['episode'], as RecordEpisodeStatistics "
+    "and Monitor do): take that off, or use make_noisy(..., record_statistics=False)"
+)
+
+
+class RecordEpisodeStatistics(gym.wrappers.RecordEpisodeStatistics[Any, Any]):
+    """Gymnasium's wrapper, with a clear error if the environment records its episodes itself."""
+
+    def step(self, action: Any) -> Step:
+        """Step the environment; raise ValueError if its info has an "episode" already."""
+        steps = self.episode_lengths
+        try:
+            return super().step(action)
+        except AssertionError as error:
+            if self.episode_lengths == steps:  # it comes from the environment's own step
+                raise
+            raise ValueError(_RECORDED) from error
 
 
 @dataclass(frozen=True)
@@ -751,26 +769,25 @@ def make_noisy(
     Early termination is innermost, then action noise, then
     ``gymnasium.wrappers.RecordEpisodeStatistics``, then the other noises in the order given, so
     ``info["episode"]`` has the return before reward noise. ``record_statistics=False`` leaves the
-    record out, for an environment that keeps one itself, such as Stable-Baselines3's Monitor.
+    record out, for an environment that keeps one itself, such as Stable-Baselines3's Monitor. (A
+    record beneath early termination misses the episodes that are ended.)
 
     >>> make_noisy(gym.make("CartPole-v1").unwrapped, ["RandomNormalNoisyReward(1)"], [0.1])
     <RandomNormalNoisyReward<RecordEpisodeStatistics<CartPoleEnv<CartPole-v1>>>>
 
     Raises:
         ValueError: as :func:`canonical_noises`, a space that a noise cannot work on, or an
-            environment that records its episodes already.
+            environment that records its episodes already; if it shows this only when an episode
+            ends, by an "episode" in its info, the error comes then.
     """
     if record_statistics and any(env.has_wrapper_attr(name) for name in _OF_RECORDERS):
-        raise ValueError(
-            "this environment records its episodes already (with RecordEpisodeStatistics or "
-            "Monitor): take that off, or use make_noisy(..., record_statistics=False)"
-        )
+        raise ValueError(_RECORDED)
     pairs = _pair(noises, rates)
     for noise, rate in pairs:
         if noise.wrapper in _DYNAMICS:
             env = noise(env, rate)
     if record_statistics:
-        env = gym.wrappers.RecordEpisodeStatistics(env)
+        env = RecordEpisodeStatistics(env)
     for noise, rate in pairs:
         if noise.wrapper not in _DYNAMICS:
             env = noise(env, rate)

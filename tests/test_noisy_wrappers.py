@@ -1092,6 +1092,19 @@ def test_statistics_are_recorded_once(recorder):
         assert "\n" not in str(error.value)
 
 
+def test_a_record_that_shows_only_when_the_episode_ends():
+    def step(env, action):
+        assert action is not None
+        return np.zeros(3), 1.0, True, False, {"episode": {"r": 1.0}}
+
+    env = make_noisy(GenericEnv(step=step), [A], [0.5])
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="record_statistics=False"):
+        env.step(0)
+    with pytest.raises(AssertionError):  # an assertion of the environment's own stays what it is
+        env.step(None)
+
+
 @pytest.mark.parametrize("recorder", [RecordEpisodeStatistics, Monitor])
 def test_the_record_of_the_environment_is_kept(recorder):
     env = recorder(gym.wrappers.TimeLimit(constant_env(2.0), 5))
