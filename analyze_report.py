@@ -13,7 +13,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 from tabulate import tabulate
 
+from analyze_runs import rate_order
+
 matplotlib.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
+matplotlib.rcParams["svg.hashsalt"] = "noisy"  # equal figures are equal files
+WIDTH, HEIGHT = 10, 5.5  # inches of every figure; one with many rows is higher
 viridis = matplotlib.colormaps["viridis"]  # ordered by lightness, so it reads in grey
 TOP = 10  # configurations in the interval plot
 
@@ -36,6 +40,12 @@ MERGED = {
     "improvement (IQM) %": ("improvement_iqm_percent", "improvement_low", "improvement_high"),
     "P(improvement)": ("probability_of_improvement", "probability_low", "probability_high"),
 }
+WHOLE = ["n", "n_baseline", "environments", "chosen_from", "steps_to_baseline", "seeds_needed"]
+# Columns that would make a table wider than a page; {name}.csv has them.
+ONLY_CSV = {
+    "best": ["leave_one_seed_out_mean"],
+    "statistics": ["environments", "comparisons", "smallest_p", "smallest_p_adjusted"],
+}
 for _name in ("mean", "average improvement %"):
     MERGED[f"paper: {_name}"] = tuple(f"paper_{column}" for column in MERGED[_name])
 
@@ -52,13 +62,13 @@ def cell(name, value):
         return f"{value:.2f}"
     if name == "steps_millions":
         return f"{value:g}"
-    whole = name in ("n", "n_baseline", "environments", "chosen_from", "steps_to_baseline", "seed")
+    whole = name in WHOLE
     return f"{value:,.0f}" if whole or name == "percent_of_environments" else f"{value:,.1f}"
 
 
 def shown(name, table):
     """Return `table` as a person reads it: all text, related columns in one, rates side by side."""
-    table = table.reset_index(drop=True)
+    table = table.reset_index(drop=True).drop(columns=ONLY_CSV.get(name, []))
     text = pd.DataFrame({c: [cell(c, v) for v in table[c]] for c in table}, dtype=object)
     for title, parts in MERGED.items():
         if parts[-1] in text:
@@ -73,7 +83,7 @@ def shown(name, table):
         text["mean"] += " (" + text.pop("n") + ")"
         keys = ["algorithm", "environment", "noise", "steps_millions"]
         text = text.pivot(index=keys, columns="noise_rate", values="mean").fillna("\u2013")
-        text = text.reset_index()
+        text = text[sorted(text.columns, key=rate_order)].reset_index()
     return text.rename(columns=lambda c: c.replace("_", " ").replace("percent", "%"))
 
 
@@ -109,8 +119,9 @@ def figures(studies, tables):
         summary = summary[summary["algorithm"] == study.algorithm]
         if tested["improvement_iqm_percent"].notna().any():
             yield interval_figure(study, tested)
-            yield heatmap_figure(study, summary)
         noises = sorted({noise for noise, _ in study.returns if noise})
+        if tested["improvement_iqm_percent"].notna().any() and len(noises) > 1:
+            yield heatmap_figure(study, summary)
         for noise in noises or [""]:
             yield curves_figure(study, noise)
         for wrapper in sorted({noise.split("(")[0] for noise in noises}):
@@ -129,13 +140,13 @@ def panels(environments, labels):
     """Make one panel per environment, three in a row, above a legend with as many labels."""
     across = min(3, len(environments))
     down = -(-len(environments) // across)
-    columns = max(1, min(4, int(across * 42 / max(map(len, labels)))))
+    columns = max(1, min(4, int(130 / max(map(len, labels)))))
     legend = 0.2 + 0.2 * -(-len(labels) // columns)
-    width, height = 1.2 + 3 * across, 2.5 * down + legend
-    fig = Figure(figsize=(width, height))
+    height = max(HEIGHT, 2.4 * down + legend)
+    fig = Figure(figsize=(WIDTH, height))
     # Placed by hand: matplotlib's automatic layouts take as long as the drawing itself.
     bottom, top = (legend + 0.45) / height, 1 - 0.3 / height
-    fig.subplots_adjust(0.9 / width, bottom, 1 - 0.15 / width, top, wspace=0.25, hspace=0.45)
+    fig.subplots_adjust(0.9 / WIDTH, bottom, 1 - 0.3 / WIDTH, top, wspace=0.25, hspace=0.45)
     axes = fig.subplots(down, across, squeeze=False).ravel()
     for ax in axes[len(environments) :]:
         ax.remove()
@@ -187,7 +198,7 @@ def curves_figure(study, noise):
 def ablation_figure(study, summary, noises):
     """Draw bars of the final return: a wrapper's parameters side by side, grouped by noise rate."""
     groups = [summary[summary["noise"] == noise] for noise in ["", *noises]]
-    rates = sorted({rate for group in groups[1:] for rate in group["noise_rate"]}, key=float)
+    rates = sorted({rate for group in groups[1:] for rate in group["noise_rate"]}, key=rate_order)
     seeds = [span(group["n"]) for group in groups]
     labels = [f"{a} (n = {n})" for a, n in zip(["no noise", *noises], seeds, strict=True)]
     fig, axes, add_legend = panels(study.environments, labels)
@@ -205,7 +216,7 @@ def ablation_figure(study, summary, noises):
             ax.axhline(rows["mean"].iloc[0], color="black", linewidth=0.6, linestyle=":")
             ax.axhline(0, color="black", linewidth=0.6)
         ax.set_xticks([-1, *range(len(rates))], ["none", *rates])
-        ax.set_xlabel("noise rate p")
+        ax.set_xlabel("noise rate")
     add_legend()
     wrapper = noises[0].split("(")[0]
     caption = f"{study.algorithm}, {wrapper}: final test return by parameters and noise rate. "
@@ -217,23 +228,31 @@ def heatmap_figure(study, summary):
     """Draw the mean improvement over environments, noise x rate, with the numbers in the cells."""
     rows = summary[summary["improvement_percent"].notna()]
     grid = rows.pivot_table(index="noise", columns="noise_rate", values="improvement_percent")
-    grid = grid[sorted(grid.columns, key=lambda rate: [float(r) for r in rate.split(" + ")])]
-    width = 1.9 + 0.075 * max(map(len, grid.index)) + 0.7 * grid.shape[1]
-    fig = Figure(figsize=(width, max(2.5, 1.5 + 0.32 * len(grid))), layout="constrained")
-    ax = fig.subplots()
-    image = ax.imshow(grid, cmap="cividis", vmin=-100, vmax=100, aspect="auto")
+    grid = grid[sorted(grid.columns, key=rate_order)]
+    largest = np.nanmax(np.abs(grid.to_numpy()))
+    limit = int(np.clip(np.ceil(largest), 1, 100))
+    down, across = grid.shape
+    height = max(HEIGHT, 1.4 + 0.3 * down)
+    fig = Figure(figsize=(WIDTH, height))
+    left = 0.4 + 0.075 * max(map(len, grid.index))
+    wide, high = min(1.2 * across, WIDTH - left - 1.5), min(0.8 * down, height - 1.4)  # all cells
+    bottom = height - 0.5 - high
+    ax = fig.add_axes([left / WIDTH, bottom / height, wide / WIDTH, high / height])
+    image = ax.imshow(grid, cmap="cividis", vmin=-limit, vmax=limit, aspect="auto")
     for (i, j), value in np.ndenumerate(grid.to_numpy()):
         if np.isfinite(value):
             ink = "black" if value > 0 else "white"
             ax.text(j, i, f"{round(value):+d}", ha="center", va="center", color=ink, fontsize=8)
-    ax.set_xticks(range(grid.shape[1]), grid.columns)
-    ax.set_yticks(range(len(grid)), grid.index)
-    ax.set_xlabel("noise rate p")
+    ax.set_xticks(range(across), grid.columns)
+    ax.set_yticks(range(down), grid.index)
+    ax.set_xlabel("noise rate")
     ax.set_title(f"{study.algorithm} ({span(rows['n'])} seeds)")
-    fig.colorbar(image, ax=ax, extend="both", label="improvement (%)")
+    bar = fig.add_axes([(left + wide + 0.2) / WIDTH, bottom / height, 0.15 / WIDTH, high / height])
+    extend = "both" if largest > limit else "neither"
+    fig.colorbar(image, cax=bar, extend=extend, label="improvement (%)")
     caption = f"{study.algorithm}: improvement of the final mean return over the baseline, mean "
     caption += f"over environments ({span(rows.groupby(['noise', 'noise_rate']).size())} in a "
-    caption += "cell); the colors end at \u00b1 100 %."
+    caption += f"cell); the colours end at \u00b1 {limit} %."
     return f"heatmap_{slug(study.algorithm)}", fig, caption
 
 
@@ -251,8 +270,7 @@ def interval_figure(study, statistics):
     if not together:
         pairs = zip(rows["environment"], labels, strict=True)
         labels = [f"{environment}, {label}" for environment, label in pairs]
-    width = 5.5 + 0.07 * max(map(len, labels))
-    fig = Figure(figsize=(width, 1.2 + 0.32 * len(rows)), layout="constrained")
+    fig = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
     left, right = axes = fig.subplots(1, 2, sharey=True, width_ratios=[3, 2])
     place = np.arange(len(rows))
     titles = ("improvement (IQM) %", "P(improvement)")
@@ -261,7 +279,7 @@ def interval_figure(study, statistics):
         ax.hlines(place, low, high, color="0.6", linewidth=5)
         ax.plot(middle, place, "|", color="black", markersize=11, markeredgewidth=2)
         ax.axvline(neutral, color="black", linewidth=0.8, linestyle="--")
-        ax.set_ylim(-0.6, len(rows) - 0.4)
+        ax.set_ylim(min(-0.6, len(rows) - 7), len(rows) - 0.4)  # a few rows stay at the top
     left.set_yticks(place, labels)
     left.set_xlabel("improvement over the baseline, IQM (%)")
     right.set_xlabel("probability of improvement")
@@ -276,8 +294,8 @@ def interval_figure(study, statistics):
 
 
 def write_figure(out, name, fig):
-    """Write {name}.png and .pdf without dates, so that equal figures are equal files."""
-    fig.savefig(out / f"{name}.png", dpi=100, metadata={"Software": None})
+    """Write {name}.svg, and .pdf for LaTeX, without dates: equal figures are equal files."""
+    fig.savefig(out / f"{name}.svg", metadata={"Date": None})
     fig.set_layout_engine("none")  # the layout is done
     fig.savefig(out / f"{name}.pdf", metadata={"CreationDate": None})
 
@@ -292,7 +310,7 @@ SECTIONS = {
     "early_performance": "Learning curves",
     "ablation": "Parameters",
     "summary": "All results",
-    "missing": "Missing runs",
+    "missing": "Runs left out",
 }
 FIGURES_OF = {"intervals": "best", "heatmap": "consistent", "curves": "early_performance"}
 
@@ -314,8 +332,8 @@ def write_report(out, verdicts, tables, drawn, overview, problems, notes):
         sections["summary" if key.startswith("summary") else key]["tables"].append(entry)
     for name, caption in drawn:
         kind = name.split("_")[0]
-        png = base64.b64encode((out / f"{name}.png").read_bytes()).decode()
-        entry = {"png": png, "caption": caption}
+        svg = base64.b64encode((out / f"{name}.svg").read_bytes()).decode()
+        entry = {"svg": svg, "caption": caption}
         sections[FIGURES_OF.get(kind, kind)]["figures"].append(entry)
     here = jinja2.FileSystemLoader(Path(__file__).parent)
     pages = jinja2.Environment(loader=here, autoescape=True, trim_blocks=True)

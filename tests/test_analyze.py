@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from html import escape
+from html import escape, unescape
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -507,7 +507,7 @@ def test_a_second_analysis_gives_the_same_bytes(sweep):
     names = sorted(path.name for path in first.iterdir())
     assert names == sorted(path.name for path in second.iterdir())
     kinds = {Path(name).suffix for name in names}
-    assert kinds == {".csv", ".md", ".tex", ".png", ".pdf", ".html"}
+    assert kinds == {".csv", ".md", ".tex", ".svg", ".pdf", ".html"}
     for name in names:
         assert (first / name).read_bytes() == (second / name).read_bytes(), name
 
@@ -827,7 +827,7 @@ def test_odd_sweeps_are_analysed_too(tmp_path):
     write_run(tmp_path / "runs", [1.0], folder="c", noise=SCALE, rate=0.1, **settings)
     tables = run(tmp_path)
     assert tables["summary_SAC"]["improvement_percent"].isna().all()
-    assert len(list((tmp_path / "results").glob("curves_*.png"))) == 2
+    assert len(list((tmp_path / "results").glob("curves_*.svg"))) == 2
 
 
 def test_figures_have_labels_units_and_n(sweep):
@@ -927,7 +927,7 @@ def in_browser(page, script, width, tmp_path):
     with tempfile.TemporaryDirectory() as profile:
         command = [browser(), *flags.split(), f"--user-data-dir={profile}", copy.as_uri()]
         dom = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
-    return json.loads(re.search(r'<pre id="answer">(.*?)</pre>', dom, re.DOTALL)[1])
+    return json.loads(unescape(re.search(r'<pre id="answer">(.*?)</pre>', dom, re.DOTALL)[1]))
 
 
 def test_report_sorts_in_a_browser(sweep, tmp_path):
@@ -943,7 +943,7 @@ def test_report_sorts_in_a_browser(sweep, tmp_path):
     answer = in_browser(sweep.path / "results/report.html", script, 1280, tmp_path)
     value, (_, first), (_, second), (state, improvements), (_, noises) = answer
     assert value == -1234.5
-    means = [float(text.split(" ")[0]) for text in (*first, *second)]
+    means = [float(text.split()[0]) for text in (*first, *second)]
     values = [-80, -55, -40, -25, 25, 115, 115, 145]
     assert means == [*reversed(values), *values]  # numbers: the highest first
     assert improvements[-2:] == ["\u2013", "\u2013"]  # the baselines' dashes come last
@@ -965,6 +965,45 @@ def test_report_has_no_horizontal_overflow(width, sweep, tmp_path):
     inner, needed, images, broken, external = answer
     assert inner == width and needed <= width
     assert images == 4 and broken == 0 and external == 0
+
+
+def test_no_table_of_the_committed_report_scrolls_or_cuts_a_number(tmp_path):
+    script = """
+        document.querySelectorAll("details").forEach(details => details.open = true);
+        const cells = [...document.querySelectorAll("td")];
+        const box = node => node.getBoundingClientRect();
+        const lines = cell => { const range = document.createRange();
+          range.selectNodeContents(cell.querySelector("span") || cell);
+          return new Set([...range.getClientRects()].map(line => line.top)).size; };
+        return [document.documentElement.scrollWidth,
+          [...document.querySelectorAll(".scroll")].filter(node =>
+            node.scrollWidth > node.clientWidth || node.scrollHeight > node.clientHeight).length,
+          cells.filter(cell => box(cell).right > 1280).length,
+          cells.filter(cell => /^-?[0-9,.]+$/.test(cell.textContent) && lines(cell) > 1).length,
+          cells.length];"""
+    page = Path(analyze.__file__).parent / "results/report.html"
+    width, scrolling, outside, broken, cells = in_browser(page, script, 1280, tmp_path)
+    assert width <= 1280 and scrolling == outside == broken == 0 and cells > 500
+
+
+def test_figures_are_of_one_size(sweep):
+    figures = sorted((sweep.path / "results").glob("*.svg"))
+    sizes = {re.search(r'width="([^"]*)" height="([^"]*)"', f.read_text())[0] for f in figures}
+    assert len(figures) == 4 and sizes == {'width="720pt" height="396pt"'}
+
+
+def test_heatmap_colours_fit_the_data(tmp_path):
+    for seed in (1, 2, 3):
+        write_run(tmp_path, [100 + seed], seed=seed)
+        write_run(tmp_path, [112 + seed], seed=seed, noise=SCALE, rate=0.1)
+        write_run(tmp_path, [95 + seed], seed=seed, noise=ENDING, rate=0.1)
+    for factor, limit in ((1, 12), (100, 100)):  # 12 / 102 = 11.8 %; at most 100 %
+        studies, _ = analyze_runs.make_studies(analyze_runs.read_runs(tmp_path))
+        studies[0].returns[SCALE, "0.10"] += 12 * (factor - 1)
+        tables = analyze.make_tables(studies)
+        drawn = {name: figure for name, figure, _ in analyze_report.figures(studies, tables)}
+        image = drawn["heatmap_SAC"].axes[0].images[0]
+        assert image.get_clim() == (-limit, limit)
 
 
 # ------------------------------------------------------------------------------------ command line
@@ -1050,7 +1089,7 @@ def test_one_baseline_run_is_enough_for_a_report(tmp_path, capsys):
     write_run(tmp_path / "runs", [1.0, 2.0])
     tables = run(tmp_path)
     assert tables["best"].empty and row(tables["summary_SAC"], n=1)["mean"] == 2
-    assert (tmp_path / "results/curves_SAC_no_noise.png").exists()
+    assert (tmp_path / "results/curves_SAC_no_noise.svg").exists()
     assert "Finished runs: 1." in capsys.readouterr().out
 
 
