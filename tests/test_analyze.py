@@ -973,7 +973,7 @@ def test_no_table_of_the_committed_report_scrolls_or_cuts_a_number(tmp_path):
         const cells = [...document.querySelectorAll("td")];
         const box = node => node.getBoundingClientRect();
         const lines = cell => { const range = document.createRange();
-          range.selectNodeContents(cell.querySelector("span") || cell);
+          range.selectNodeContents(cell);
           return new Set([...range.getClientRects()].map(line => line.top)).size; };
         return [document.documentElement.scrollWidth,
           [...document.querySelectorAll(".scroll")].filter(node =>
