@@ -26,7 +26,17 @@ import pandas as pd
 import tyro
 from scipy import stats
 
-from analyze_compare import compare_tables, read_paper
+from analyze_compare import PAPER_CONFIGURATIONS, compare_tables, read_paper
+from analyze_luck import (
+    CONSISTENT_PERCENT,
+    DRAWS,
+    LUCKY,
+    SEEDS_TO_RESAMPLE,
+    add_luck_of_best,
+    add_luck_of_consistent,
+    luck_of_study,
+    luck_rows,
+)
 from analyze_report import figures, text_table, write_figure, write_report, write_table
 from analyze_runs import BASELINE, KEYS, left_out, make_studies, read_runs
 from analyze_statistics import (
@@ -62,12 +72,15 @@ COLUMNS = {
     "summary": """algorithm environment noise noise_rate n mean std n_baseline baseline_mean
         baseline_std improvement_percent p std_change_percent steps_to_baseline""",
     "best": """algorithm environment noise noise_rate baseline_mean baseline_std noisy_mean
-        noisy_std improvement_percent p p_adjusted leave_one_seed_out_percent n n_baseline
-        chosen_from
-        leave_one_seed_out_mean""",
+        noisy_std improvement_percent p p_adjusted luck_median_percent luck_95_percent p_luck
+        leave_one_seed_out_percent n n_baseline chosen_from leave_one_seed_out_mean""",
     "consistency": """algorithm noise noise_rate percent_of_environments
-        average_improvement_percent std_improvement_percent p p_adjusted environments n
+        average_improvement_percent std_improvement_percent p p_adjusted p_luck environments n
         fails_at_every_rate""",
+    "luck": """algorithm environments best_beyond_luck configurations
+        consistent consistent_by_luck consistent_by_luck_95 p_consistent consistent_beyond_luck
+        consistently_worse consistently_worse_by_luck consistently_worse_by_luck_95
+        p_consistently_worse consistently_worse_beyond_luck""",
     "early_performance": "algorithm environment noise steps_millions noise_rate mean std n",
     "statistics": """algorithm environment noise noise_rate verdict improvement_iqm_percent
         improvement_low improvement_high p p_adjusted comparisons probability_of_improvement
@@ -137,7 +150,7 @@ def split_consistency(consistency):
     consistency = consistency[consistency["environments"] > 1]
     share = consistency["percent_of_environments"]
     by = ["algorithm", "percent_of_environments", "average_improvement_percent"]
-    good = consistency[share >= 80].drop(columns="fails_at_every_rate")
+    good = consistency[share >= CONSISTENT_PERCENT].drop(columns="fails_at_every_rate")
     good = good.sort_values(by, ascending=[True, False, False], kind="stable")
     highest = share.groupby([consistency["algorithm"], consistency["noise"]]).transform("max")
     bad = consistency.assign(fails_at_every_rate=np.where(highest == 0, "yes", "no"))[share == 0]
@@ -272,15 +285,28 @@ CAPTIONS = {
     "best": """Best noise tried for each algorithm and environment, which may be worse than none,
 against the baseline without noise: final test return, mean \u00b1 sample standard deviation over n
 seeds; p: exact Mann-Whitney test, then adjusted for all noises tried there. The best of many is
-chosen on the seeds that it is reported on, which flatters it; the leave-one-seed-out columns choose
-on all seeds but one and measure on that one.""",
+chosen on the seeds that it is reported on, which flatters it. Luck: the improvement that the best
+of as many configurations would show if none did anything, its median and 95 % quantile; p luck is
+the probability that it is at least as high as the one observed. Leave one seed out values the
+procedure of choosing, not the noise that is named here: it chooses on all seeds but one, measures
+on that one and takes the mean over seeds. It is descriptive: its terms share seeds, so it has no
+interval.""",
     "consistent": """Noise that matches or betters the baseline in at least 80 % of two or more
 environments: improvement over |baseline|, mean \u00b1 standard deviation over environments; p: the
-exact test over all of them, then adjusted for all configurations (Benjamini-Hochberg); n is the
-smallest number of seeds in any environment.""",
+exact test over all of them, then adjusted for all configurations (Benjamini-Hochberg); p luck: the
+probability that the highest average of as many configurations is as high if none does anything; n
+is the smallest number of seeds in any environment.""",
     "consistently_worse": """Noise that is worse than the baseline in each of two or more
-environments (0 %); columns as in the table of consistent noise. Worse at every rate that was
-tried:""",
+environments (0 %); columns as in the table of consistent noise, p luck with the lowest average.
+Worse at every rate that was tried:""",
+    "luck": f"""What luck alone would show. {DRAWS:,} sweeps are drawn in which no noise does
+anything: the baseline and all configurations anew, with their numbers of seeds, from a normal
+distribution with the pooled standard deviation within configurations (from {SEEDS_TO_RESAMPLE}
+seeds of the baseline on with the shape of their returns). By luck: the mean number of rows in the
+tables of consistent and consistently worse noise, and its 95 % quantile; p: the probability of at
+least as many rows as observed. Beyond luck: rows with a p luck of {LUCKY} or less. Configurations
+are those in two or more environments. Where returns have a long tail of high ones the best of many
+is higher by luck than a normal distribution says.""",
     "early_performance": """Test return during training, by noise rate (0.00 is the baseline):
 mean \u00b1 sample standard deviation over (n) seeds.""",
     "summary": """Final test return of every configuration: mean \u00b1 sample standard deviation
@@ -308,9 +334,12 @@ the 5 % level, uncorrected, with 80 % power; seeds needed: how many on each side
 improvement takes. Both are for normal returns with the standard deviation of these seeds.""",
     "missing": """Runs that are in no table and no figure, with their seeds. Missing are the seeds
 that at least half of an algorithm's configurations with noise have, and baselines.""",
+    "compare_luck": f"""The same for the paper's tables: {PAPER_CONFIGURATIONS} configurations in
+each environment. Only means and standard deviations are printed there, so returns are taken as
+normal, with the standard deviation of each baseline, known from 5 seeds (PPO 10).""",
     "compare": """The paper's table (environments v2, 1,000,000 steps) beside ours, with the
 difference in standard errors where the steps are the same; listed by: whose table has the row.
-Ours:""",
+Paper: luck: see the table of luck. Ours:""",
 }
 CAPTIONS = {name: " ".join(text.split()) for name, text in CAPTIONS.items()}
 
@@ -333,6 +362,10 @@ def make_tables(studies, paper=None):
         with_p(table, statistics) for table in (summary, judged, best, consistency)
     )
     good, bad = split_consistency(consistency)
+    lucks = {study.algorithm: luck_of_study(study) for study in judging}
+    best = add_luck_of_best(best, lucks)
+    good, bad = add_luck_of_consistent(good, bad, lucks)
+    luck = frame("luck", luck_rows(lucks, best, good, bad))
     failing = bad[bad["fails_at_every_rate"] == "yes"][["algorithm", "noise"]].drop_duplicates()
     failing = "; ".join(f"{noise} ({algorithm})" for algorithm, noise in failing.values) or "none"
     limits = "\n".join(family_notes(statistics))
@@ -340,6 +373,7 @@ def make_tables(studies, paper=None):
         "best": (best, CAPTIONS["best"]),
         "consistent": (good, CAPTIONS["consistent"]),
         "consistently_worse": (bad, f"{CAPTIONS['consistently_worse']} {failing}."),
+        "luck": (luck, CAPTIONS["luck"]),
         "statistics": (statistics, f"{CAPTIONS['statistics']}\n{limits}"),
         "early_performance": (early, CAPTIONS["early_performance"]),
     }
@@ -353,6 +387,8 @@ def make_tables(studies, paper=None):
         listed = judged, best, consistency, good, bad, early
         for name, table in compare_tables(paper, lengths, *listed):
             tables[name] = (table, f"{CAPTIONS['compare']} {caption}.")
+        if "compare_luck" in tables:
+            tables["compare_luck"] = (tables["compare_luck"][0], CAPTIONS["compare_luck"])
     return tables
 
 

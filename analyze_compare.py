@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from analyze_luck import add_luck_of_best, add_luck_of_consistent, luck_of_paper, luck_rows
 from analyze_runs import BASELINE, KEYS, rate_text, split_version
 
 PAPER_SEEDS = {"SAC": 5, "TD3": 5, "PPO": 10}
 PAPER_ENVIRONMENTS = 5
+PAPER_CONFIGURATIONS = 90  # 15 noises at 6 rates
 PAPER_STEPS = 1_000_000
 PAPER_FILES = {
     "best": "best.csv",
@@ -19,6 +21,7 @@ PAPER_FILES = {
     "consistently_worse": "consistently_worse.csv",
     "early_performance": "early_performance*.csv",  # one for each algorithm
 }
+LUCK = ("luck_median_percent", "luck_95_percent", "p_luck")
 FINAL = ("mean", "std", "n")
 AVERAGE = ("average_improvement_percent", "std_improvement_percent", "environments")
 
@@ -50,6 +53,9 @@ def compare_tables(paper, lengths, summary, best, consistency, good, bad, early)
     `lengths` has the steps of each algorithm: final returns after fewer steps than the paper's are
     shown beside them, without a difference.
     """
+    luck = None
+    if {"best", "consistent", "consistently_worse"} <= paper.keys():
+        paper, luck = with_luck(paper)
     if "best" in paper:
         # The paper's table has baselines too: they are rows of their own here.
         listed = pd.concat([summary[summary["noise"] == ""], best])
@@ -59,9 +65,21 @@ def compare_tables(paper, lengths, summary, best, consistency, good, bad, early)
         if name in paper:
             table = compare_table(consistency, listed, paper[name], *AVERAGE)
             yield f"compare_{name}", only_equal_steps(table, lengths)
+    if luck is not None:
+        yield "compare_luck", luck
     if "early_performance" in paper:
         table = compare_table(early, None, paper["early_performance"], *FINAL)
         yield "compare_early_performance", table
+
+
+def with_luck(paper):
+    """Add to the paper's tables what luck alone would show, and return its table of luck, too."""
+    best, good, bad = (paper[name] for name in ("best", "consistent", "consistently_worse"))
+    lucks = luck_of_paper(best, PAPER_SEEDS, PAPER_CONFIGURATIONS)
+    best = add_luck_of_best(best, lucks)
+    good, bad = add_luck_of_consistent(good, bad, lucks)
+    luck = pd.DataFrame(luck_rows(lucks, best, good, bad))
+    return paper | {"best": best, "consistent": good, "consistently_worse": bad}, luck
 
 
 def with_baseline_rows(paper):
@@ -69,7 +87,9 @@ def with_baseline_rows(paper):
     noisy = paper.rename(columns={"noisy_mean": "mean", "noisy_std": "std"})
     baseline = paper.rename(columns={"baseline_mean": "mean", "baseline_std": "std"})
     noise, rate = BASELINE
-    return pd.concat([noisy, baseline.assign(noise=noise, noise_rate=rate)], ignore_index=True)
+    baseline = baseline.assign(noise=noise, noise_rate=rate)
+    baseline = baseline.drop(columns=[name for name in LUCK if name in baseline])
+    return pd.concat([noisy, baseline], ignore_index=True)
 
 
 def only_equal_steps(table, lengths):
@@ -127,4 +147,5 @@ def compare_table(ours, listed, paper, mean, std, number):
     difference = table[mean] - table[f"paper_{mean}"]
     table["difference_se"] = difference / np.sqrt(variance.where(variance > 0))
     columns = [*names, "listed_by", number, mean, std, f"paper_{mean}", f"paper_{std}"]
-    return table.sort_values(names, kind="stable")[[*columns, "difference_se"]]
+    luck = [f"paper_{name}" for name in LUCK if f"paper_{name}" in table]
+    return table.sort_values(names, kind="stable")[[*columns, "difference_se", *luck]]

@@ -41,9 +41,12 @@ MERGED = {
     "P(improvement)": ("probability_of_improvement", "probability_low", "probability_high"),
 }
 WHOLE = ["n", "n_baseline", "environments", "chosen_from", "steps_to_baseline", "seeds_needed"]
+WHOLE += ["percent_of_environments", "configurations", "consistent", "consistently_worse"]
 # Columns that would make a table wider than a page; {name}.csv has them.
 ONLY_CSV = {
     "best": ["leave_one_seed_out_mean"],
+    "luck": ["consistent_by_luck_95", "consistently_worse_by_luck_95"],
+    "compare_luck": ["consistent_by_luck_95", "consistently_worse_by_luck_95"],
     "statistics": ["environments", "comparisons", "smallest_p", "smallest_p_adjusted"],
 }
 for _name in ("mean", "average improvement %"):
@@ -56,14 +59,14 @@ def cell(name, value):
         return "\u2013"
     if isinstance(value, str):
         return value or ("baseline" if name == "noise" else "\u2013")
-    if name.startswith("p_") or name in ("p", "smallest_p", "smallest_p_adjusted"):
+    if name.startswith(("p_", "paper_p_")) or name in ("p", "smallest_p", "smallest_p_adjusted"):
         return f"{value:.2g}"
     if name.startswith("probability"):
         return f"{value:.2f}"
     if name == "steps_millions":
         return f"{value:g}"
-    whole = name in WHOLE
-    return f"{value:,.0f}" if whole or name == "percent_of_environments" else f"{value:,.1f}"
+    whole = name in WHOLE or name.endswith("_beyond_luck")
+    return f"{value:z,.0f}" if whole else f"{value:z,.1f}"  # z: no "-0"
 
 
 def shown(name, table):
@@ -306,6 +309,7 @@ SECTIONS = {
     "best": "Best noise tried (may be worse than none)",
     "consistent": "Consistent noise",
     "consistently_worse": "Consistently worse",
+    "luck": "Luck",
     "statistics": "Statistics",
     "early_performance": "Learning curves",
     "ablation": "Parameters",

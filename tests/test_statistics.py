@@ -148,6 +148,16 @@ def test_satterthwaites_interval_of_three_seeds_is_welchs():
     np.testing.assert_allclose([low, high], 100 * np.array(welch) / base, rtol=0.01)
 
 
+def test_iqm_is_scipys():
+    rng = np.random.default_rng(0)
+    for n in range(1, 12):
+        scores = rng.normal(size=(2, 3, n))
+        expected = stats.trim_mean(scores, 0.25, axis=-1)
+        np.testing.assert_allclose(analyze_statistics.iqm(scores), expected, rtol=1e-12)
+        scores[0, 1, 0] = np.nan
+        assert np.isnan(analyze_statistics.iqm(scores)).sum() == 1
+
+
 def test_seeds_that_are_all_alike_have_an_interval_of_one_point():
     assert analyze_statistics.bootstrap_iqm(np.full((5, 1), 30.0), np.full((3, 1), 20.0)) == (
         50,
