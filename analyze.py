@@ -38,6 +38,7 @@ from analyze_luck import (
     luck_rows,
 )
 from analyze_report import figures, text_table, write_figure, write_report, write_table
+from analyze_robustness import read_robustness, robustness_sentences, robustness_tables
 from analyze_runs import BASELINE, KEYS, left_out, make_studies, read_runs
 from analyze_statistics import (
     COVERAGE,
@@ -271,8 +272,8 @@ def family_notes(statistics):
                 )
             elif needed > 1:
                 notes.append(
-                    f"{where}: with {seeds} and {size:.0f} comparisons a difference can be "
-                    f"significant after the correction only if {needed} or more are together "
+                    f"{where}: with {seeds} and {size:.0f} comparisons, differences can be "
+                    f"significant after the correction only if at least {needed} of them are "
                     f"(smallest possible p: {smallest:.2g}, corrected for one alone "
                     f"{min(1, size * smallest):.2g})."
                 )
@@ -465,6 +466,9 @@ def main(args):
         for study in studies
     ]
     overview = " ".join(overview)
+    robustness, problems_there = read_robustness(args.runs_dir, runs)
+    tables |= robustness_tables(robustness)
+    notes += problems_there
     drawn = []
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -481,6 +485,9 @@ def main(args):
         notes.append(f"{out} also holds an earlier analysis, not renewed: {', '.join(old)}")
     for line in shortened(verdicts):
         print(line)
+    if "robustness_score" in tables:
+        for line in robustness_sentences(tables["robustness_score"][0]):
+            print(line)
     print(f"\n{overview}\n\nBest noise tried (may be worse than none)\n")
     print(f"{text_table('best', tables['best'][0])}\n\n{tables['best'][1]}\n")
     for note in family_notes(tables["statistics"][0]) + notes:

@@ -11,6 +11,7 @@ import matplotlib
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from tabulate import tabulate
 
 from analyze_runs import rate_order
@@ -38,6 +39,7 @@ MERGED = {
     "average improvement %": ("average_improvement_percent", "std_improvement_percent"),
     "IQM": ("iqm", "iqm_low", "iqm_high"),
     "improvement (IQM) %": ("improvement_iqm_percent", "improvement_low", "improvement_high"),
+    "difference": ("difference", "difference_low", "difference_high"),
     "P(improvement)": ("probability_of_improvement", "probability_low", "probability_high"),
 }
 WHOLE = ["n", "n_baseline", "environments", "chosen_from", "steps_to_baseline", "seeds_needed"]
@@ -131,6 +133,8 @@ def figures(studies, tables):
             variants = [n for n in noises if n.split("(")[0] == wrapper and " + " not in n]
             if len(variants) > 1:
                 yield ablation_figure(study, summary, variants)
+    if "robustness" in tables:
+        yield from robustness_figures(tables["robustness"][0])
 
 
 def span(numbers):
@@ -186,8 +190,7 @@ def curves_figure(study, noise):
         curves = curves[:, np.isfinite(curves[-1])]
         mean = curves.mean(axis=1) if curves.size else np.full(len(x), np.nan)
         std = curves.std(axis=1, ddof=1) if curves.shape[1] > 1 else 0
-        color = viridis(0.7 * (i - 1) / max(1, len(configs) - 2)) if i else "black"
-        line, marker = ["-", "--", "-.", ":"][i % 4], ["", "o", "s", "^", "D", "v", "P", "X"][i % 8]
+        color, line, marker = line_style(i, len(configs))
         marks = {"marker": marker, "markevery": (min(i, every - 1), every), "markersize": 4.5}
         ax.plot(x, mean, line, color=color, linewidth=1.1 if i else 1.8, label=config[1], **marks)
         ax.fill_between(x, mean - std, mean + std, color=color, alpha=0.07, linewidth=0)
@@ -227,32 +230,51 @@ def ablation_figure(study, summary, noises):
     return f"ablation_{slug(study.algorithm)}_{wrapper}", fig, caption
 
 
-def heatmap_figure(study, summary):
-    """Draw the mean improvement over environments, noise x rate, with the numbers in the cells."""
-    rows = summary[summary["improvement_percent"].notna()]
-    grid = rows.pivot_table(index="noise", columns="noise_rate", values="improvement_percent")
-    grid = grid[sorted(grid.columns, key=rate_order)]
-    largest = np.nanmax(np.abs(grid.to_numpy()))
-    limit = int(np.clip(np.ceil(largest), 1, 100))
-    down, across = grid.shape
-    height = max(HEIGHT, 1.4 + 0.3 * down)
-    fig = Figure(figsize=(WIDTH, height))
-    left = 0.4 + 0.075 * max(map(len, grid.index))
-    wide, high = min(1.2 * across, WIDTH - left - 1.5), min(0.8 * down, height - 1.4)  # all cells
+def heatmap(grid, framed=None, below=0.9):
+    """Draw percentages (rows x columns), with the number in each cell: return figure, axes, limit.
+
+    The colours fit the data and end at \u00b1 `limit` %, which is at most 100. `framed` marks
+    cells (as `grid`, of bool); `below` is the space in inches for the names of the columns.
+    """
+    limit = int(np.clip(np.ceil(np.nanmax(np.abs(grid.to_numpy()))), 1, 100))
+    rows, columns = ([broken(name) for name in names] for names in (grid.index, grid.columns))
+    lines = max(name.count("\n") for name in rows) + 1
+    longest = max(len(line) for name in rows for line in name.split("\n"))
+    left = 0.4 + 0.075 * longest
+    height = max(HEIGHT, 0.5 + below + max(0.3, 0.17 * lines) * len(rows))
+    wide = min(1.2 * len(columns), WIDTH - left - 1.5)
+    high = min(0.8 * len(rows), height - 0.5 - below)
     bottom = height - 0.5 - high
+    fig = Figure(figsize=(WIDTH, height))
     ax = fig.add_axes([left / WIDTH, bottom / height, wide / WIDTH, high / height])
     image = ax.imshow(grid, cmap="cividis", vmin=-limit, vmax=limit, aspect="auto")
     for (i, j), value in np.ndenumerate(grid.to_numpy()):
         if np.isfinite(value):
             ink = "black" if value > 0 else "white"
             ax.text(j, i, f"{round(value):+d}", ha="center", va="center", color=ink, fontsize=8)
-    ax.set_xticks(range(across), grid.columns)
-    ax.set_yticks(range(down), grid.index)
+        if framed is not None and framed.iat[i, j]:
+            box = Rectangle((j - 0.46, i - 0.46), 0.92, 0.92, fill=False, edgecolor="red", lw=1.5)
+            ax.add_patch(box)
+    ax.set_xticks(range(len(columns)), columns)
+    ax.set_yticks(range(len(rows)), rows)
+    bar = fig.add_axes([(left + wide + 0.2) / WIDTH, bottom / height, 0.15 / WIDTH, high / height])
+    clipped = np.nanmax(np.abs(grid.to_numpy())) > limit
+    fig.colorbar(image, cax=bar, extend="both" if clipped else "neither", label="percent")
+    return fig, ax, limit
+
+
+def broken(label):
+    """Put each noise or rate of a combination on a line of its own."""
+    return str(label).replace(" + ", " +\n")
+
+
+def heatmap_figure(study, summary):
+    """Draw the mean improvement over environments, noise x rate, with the numbers in the cells."""
+    rows = summary[summary["improvement_percent"].notna()]
+    grid = rows.pivot_table(index="noise", columns="noise_rate", values="improvement_percent")
+    fig, ax, limit = heatmap(grid[sorted(grid.columns, key=rate_order)])
     ax.set_xlabel("noise rate")
     ax.set_title(f"{study.algorithm} ({span(rows['n'])} seeds)")
-    bar = fig.add_axes([(left + wide + 0.2) / WIDTH, bottom / height, 0.15 / WIDTH, high / height])
-    extend = "both" if largest > limit else "neither"
-    fig.colorbar(image, cax=bar, extend=extend, label="improvement (%)")
     caption = f"{study.algorithm}: improvement of the final mean return over the baseline, mean "
     caption += f"over environments ({span(rows.groupby(['noise', 'noise_rate']).size())} in a "
     caption += f"cell); the colours end at \u00b1 {limit} %."
@@ -283,7 +305,7 @@ def interval_figure(study, statistics):
         ax.plot(middle, place, "|", color="black", markersize=11, markeredgewidth=2)
         ax.axvline(neutral, color="black", linewidth=0.8, linestyle="--")
         ax.set_ylim(min(-0.6, len(rows) - 7), len(rows) - 0.4)  # a few rows stay at the top
-    left.set_yticks(place, labels)
+    left.set_yticks(place, [broken(label) for label in labels])
     left.set_xlabel("improvement over the baseline, IQM (%)")
     right.set_xlabel("probability of improvement")
     right.set_xlim(-0.02, 1.02)
@@ -294,6 +316,81 @@ def interval_figure(study, statistics):
         caption += f" The {len(rows)} best of {of} are chosen on the seeds that are shown, so "
         caption += "they look better than they are."
     return f"intervals_{slug(study.algorithm)}", fig, caption
+
+
+def robustness_figures(table):
+    """Yield (name, figure, caption) for every figure of robustness: heatmaps, then curves."""
+    for (algorithm, environment), rows in table.groupby(["algorithm", "environment"]):
+        clean = rows[(rows["noise"] == "") & (rows["test_noise"] == "")]["mean"]
+        if len(clean) and clean.iloc[0] != 0 and len(rows) > 1:
+            yield robustness_heatmap(algorithm, environment, rows, clean.iloc[0])
+    for (algorithm, noise), rows in table.groupby(["algorithm", "test_noise"]):
+        if noise and " + " not in noise and rows["test_rate"].nunique() >= 3:
+            clean = (table["algorithm"] == algorithm) & (table["test_noise"] == "")
+            yield robustness_curves(algorithm, noise, pd.concat([table[clean], rows]))
+
+
+def robustness_heatmap(algorithm, environment, rows, clean):
+    """Draw training configuration x test condition: the score 100 (R - C) / |C| of every cell."""
+    trained = rows["noise"].where(rows["noise"] != "", "no noise") + ", " + rows["noise_rate"]
+    tested = rows["test_noise"].where(rows["test_noise"] != "", "clean") + ", " + rows["test_rate"]
+    score = 100 * (rows["mean"] - clean) / abs(clean)
+    cells = rows.assign(
+        trained=trained.str.replace("no noise, 0.00", "no noise"),
+        tested=tested.str.replace("clean, 0.00", "clean"),
+        score=score,
+        same=rows["tested_on"] == "the same noise",
+    )
+    # Rows and columns stand in the order of the table, which is that of noises and rates.
+    cells = cells.drop_duplicates(["trained", "tested"])
+    order = {"index": cells["trained"].unique(), "columns": cells["tested"].unique()}
+    axes = {"index": "trained", "columns": "tested"}
+    grid = cells.pivot(**axes, values="score").reindex(**order)
+    same = cells.pivot(**axes, values="same").reindex(**order).eq(True)
+    longest = max(map(len, grid.columns))
+    fig, ax, limit = heatmap(grid, same, below=0.7 + 0.05 * longest)
+    ax.tick_params(axis="x", rotation=35)
+    for label in ax.get_xticklabels():
+        label.set(ha="right", rotation_mode="anchor")
+    ax.set_title(f"{algorithm} on {environment}: trained with (rows), tested with (columns)")
+    caption = f"{algorithm} on {environment} ({span(rows['n'])} seeds): mean return with the noise "
+    caption += "of the column, for policies trained with the noise of the row, in percent of the "
+    caption += "clean return of policies trained without noise. Framed: tested on the noise of "
+    caption += f"training. The colours end at \u00b1 {limit} %."
+    return f"robustness_heatmap_{slug(algorithm)}_{slug(environment)}", fig, caption
+
+
+def robustness_curves(algorithm, noise, rows):
+    """Draw the return against the rate of a test noise: one line per training configuration."""
+    configs = list(dict.fromkeys(zip(rows["noise"], rows["noise_rate"], strict=True)))
+    configs.sort(key=lambda config: (config[0], rate_order(config[1])))
+    labels = [f"{noise}, {rate}" if noise else "no noise" for noise, rate in configs]
+    environments = sorted(set(rows[rows["test_noise"] == noise]["environment"]))
+    fig, axes, add_legend = panels(environments, labels)
+    for (ax, environment), (i, config) in product(
+        zip(axes, environments, strict=True), enumerate(configs)
+    ):
+        mine = (rows["noise"] == config[0]) & (rows["noise_rate"] == config[1])
+        line = rows[mine & (rows["environment"] == environment)]
+        line = line.assign(rate=line["test_rate"].astype(float)).sort_values("rate")
+        color, dashes, marker = line_style(i, len(configs))
+        std = line["std"].astype(float).fillna(0)
+        look = {"color": color, "marker": marker or ".", "label": labels[i]}
+        ax.plot(line["rate"], line["mean"], dashes, **look)
+        ax.fill_between(
+            line["rate"], line["mean"] - std, line["mean"] + std, color=color, alpha=0.07, lw=0
+        )
+        ax.set_xlabel("rate of the noise in the test (0: clean)")
+    add_legend()
+    caption = f"{algorithm}, tested with {noise}: mean return over seeds against the rate, shaded "
+    caption += "\u00b1 one standard deviation; one line for each noise in training."
+    return f"robustness_curves_{slug(algorithm)}_{slug(noise)}", fig, caption
+
+
+def line_style(i, number):
+    """Return colour, line and marker of line i of so many; the first is the baseline, in black."""
+    color = viridis(0.7 * (i - 1) / max(1, number - 2)) if i else "black"
+    return color, ["-", "--", "-.", ":"][i % 4], ["", "o", "s", "^", "D", "v", "P", "X"][i % 8]
 
 
 def write_figure(out, name, fig):
@@ -313,6 +410,7 @@ SECTIONS = {
     "statistics": "Statistics",
     "early_performance": "Learning curves",
     "ablation": "Parameters",
+    "robustness": "Robustness",
     "summary": "All results",
     "missing": "Runs left out",
 }
@@ -326,7 +424,7 @@ def write_report(out, verdicts, tables, drawn, overview, problems, notes):
         section |= {"tables": [], "figures": []}
     for name, (table, caption) in tables.items():
         text = shown(name, table)
-        key = name.removeprefix("compare_")
+        key = name.removeprefix("compare_").removesuffix("_score")
         entry = {
             "name": name,
             "caption": caption,

@@ -185,3 +185,30 @@ def steps_to_reach(curves, steps, target):
     # The last mean of the baseline is its own target, but rounding depends on the order of a sum.
     reached = np.flatnonzero((means >= target) | np.isclose(means, target, rtol=1e-9))
     return steps[reached[0]] if len(reached) else np.nan
+
+
+def contrast(cells, weights):
+    """Weighted sum of the means of independent samples, with its standard error and 95 % interval.
+
+    Student's t with Satterthwaite's degrees of freedom: each sample has a variance of its own.
+    cells: arrays (n_i), weights: numbers -> estimate, standard error, low, high; without an
+    interval where a sample has fewer than MIN_SEEDS.
+    """
+    estimate = sum(weight * np.mean(cell) for cell, weight in zip(cells, weights, strict=True))
+    sizes = np.array([len(cell) for cell in cells])
+    if sizes.min() < MIN_SEEDS:
+        return estimate, np.nan, np.nan, np.nan
+    variances = np.array([np.var(cell, ddof=1) for cell in cells])
+    parts = np.square(weights) * variances / sizes
+    error = np.sqrt(parts.sum())
+    if error == 0:
+        return estimate, 0.0, estimate, estimate
+    half = error * stats.t.ppf(0.975, parts.sum() ** 2 / np.sum(parts**2 / (sizes - 1)))
+    return estimate, error, estimate - half, estimate + half
+
+
+def holm(p):
+    """Correct p-values (n,) for n tests with Holm's step-down method."""
+    order, adjusted = np.argsort(p), np.empty(len(p))
+    adjusted[order] = np.maximum.accumulate(np.sort(p) * np.arange(len(p), 0, -1))
+    return np.minimum(1, adjusted)

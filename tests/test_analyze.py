@@ -109,7 +109,7 @@ def run(tmp_path, runs="runs", out="results", compare=None):
     """Run analyze.py's main function and read its csv tables."""
     args = analyze.Args(runs_dir=tmp_path / runs, out=tmp_path / out, compare=compare)
     analyze.main(args)
-    text = {"noise": str, "noise_rate": str}
+    text = {"noise": str, "noise_rate": str, "test_rate": str}
     files = sorted((tmp_path / out).glob("*.csv"))
     return {f.stem: pd.read_csv(f, dtype=text).fillna({"noise": ""}) for f in files}
 
@@ -447,7 +447,7 @@ def test_five_against_five_cannot_reach_significance_alone_among_90(tmp_path):
     assert table["smallest_p_adjusted"].iloc[1] == pytest.approx(90 * 2 / 252)
     (note,) = analyze.family_notes(table)
     assert "with 5 seeds and 90 comparisons" in note and "0.0079" in note
-    assert "only if 15 or more" in note  # 90 * 0.0079 / 0.05 = 14.3
+    assert "only if at least 15 of them are" in note  # 90 * 0.0079 / 0.05 = 14.3
     assert "for one alone 0.71" in note
     _, caption = analyze.make_tables([study])["statistics"]
     assert note in caption and f"{analyze_statistics.COVERAGE[5]} % (n = 5)" in caption
