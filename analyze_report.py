@@ -10,6 +10,7 @@ import jinja2
 import matplotlib
 import numpy as np
 import pandas as pd
+from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from tabulate import tabulate
@@ -31,7 +32,7 @@ def slug(text):
 
 # ------------------------------------------------------------------------------------------- tables
 
-# Columns that are shown as one: "mean ± std" or "estimate [low, high]".
+# Columns that are shown as one: "mean ± std", "estimate [low, high]" or "ours (the baseline's)".
 MERGED = {
     "baseline": ("baseline_mean", "baseline_std"),
     "noisy": ("noisy_mean", "noisy_std"),
@@ -42,8 +43,11 @@ MERGED = {
     "difference": ("difference", "difference_low", "difference_high"),
     "P(improvement)": ("probability_of_improvement", "probability_low", "probability_high"),
 }
-WHOLE = ["n", "n_baseline", "environments", "chosen_from", "steps_to_baseline", "seeds_needed"]
-WHOLE += ["percent_of_environments", "configurations", "consistent", "consistently_worse"]
+for _name in ("score", "worst_score", "cvar_score"):
+    MERGED[f"{_name} (baseline)"] = (_name, f"baseline_{_name}")
+WHOLE = ["n", "n_baseline", "conditions", "environments", "chosen_from", "steps_to_baseline"]
+WHOLE += ["seeds_needed", "percent_of_environments", "configurations"]
+WHOLE += ["consistent", "consistently_worse"]
 # Columns that would make a table wider than a page; {name}.csv has them.
 ONLY_CSV = {
     "best": ["leave_one_seed_out_mean"],
@@ -79,6 +83,8 @@ def shown(name, table):
         if parts[-1] in text:
             first, *rest = (text[c] for c in parts)
             both = first + " \u00b1 " + rest[0]
+            if title.endswith("(baseline)"):
+                both = first + " (" + rest[0] + ")"
             if len(parts) == 3:
                 both = first + " [" + rest[0] + ", " + rest[1] + "]"
                 both = both.where(table[parts[1]].notna(), first)
@@ -417,6 +423,15 @@ SECTIONS = {
 FIGURES_OF = {"intervals": "best", "heatmap": "consistent", "curves": "early_performance"}
 
 
+def breakable(text):
+    """Mark where a browser may break a cell: a noise between its words, but never a number."""
+    if re.match("-?[0-9]", text):
+        text = text.replace(" \u00b1 ", "\u00a0\u00b1\u00a0").replace(", ", ",\u00a0")
+        parts = [Markup('<span class="number">{}</span>').format(part) for part in text.split(" ")]
+        return Markup(" ").join(parts)
+    return Markup(re.sub("(?<=[a-z0-9])(?=[A-Z(])", "<wbr>", str(escape(text))))
+
+
 def write_report(out, verdicts, tables, drawn, overview, problems, notes):
     """Write report.html: one self-contained page with all verdicts, tables and figures."""
     sections = {key: {"id": key, "title": title} for key, title in SECTIONS.items()}
@@ -440,6 +455,7 @@ def write_report(out, verdicts, tables, drawn, overview, problems, notes):
     here = jinja2.FileSystemLoader(Path(__file__).parent)
     pages = jinja2.Environment(loader=here, autoescape=True, trim_blocks=True)
     full = [s for s in sections.values() if s["tables"] or s["figures"]]
+    pages.filters["breakable"] = breakable
     page = pages.get_template("report.html.jinja")
     groups = verdicts.groupby(["algorithm", "environment"], sort=False)
     verdicts = [group[["verdict", "sentence"]].to_dict("records") for _, group in groups]

@@ -19,6 +19,7 @@ import pandas as pd
 
 from analyze_runs import BASELINE, KEYS, order, rate_text
 from analyze_statistics import contrast, holm, improvement_percent, mann_whitney, mean_std
+from analyze_verdict import p_value
 
 FILES = ("robustness.csv", "robustness.csv.gz")
 HEADER = ["noise", "noise_rate", "episode", "episodic_return", "episodic_length"]
@@ -28,8 +29,8 @@ RUN_COLUMNS = [*KEYS, "seed", *CONDITION, "mean", "cvar"]
 COLUMNS = [*KEYS, *CONDITION, "tested_on", "n", "mean", "std", "change_percent", "cvar"]
 SCORE_COLUMNS = [*KEYS, "n", "n_baseline", "conditions", "score", "baseline_score"]
 SCORE_COLUMNS += ["difference", "difference_low", "difference_high", "p", "p_holm"]
-SCORE_COLUMNS += ["clean_change_percent", "worst_score", "baseline_worst_score", "worst_condition"]
-SCORE_COLUMNS += ["cvar_score", "baseline_cvar_score"]
+SCORE_COLUMNS += ["clean_change_percent", "cvar_score", "baseline_cvar_score"]
+SCORE_COLUMNS += ["worst_score", "baseline_worst_score", "worst_condition"]
 
 CAPTIONS = {
     "robustness_score": """Primary figure of robustness: the score on noise that was not in
@@ -272,9 +273,10 @@ def robustness_sentences(scores):
         if row.p <= 0.05:
             more = "more" if row.difference > 0 else "less"
             verdict = f"{'' if row.p_holm <= 0.05 else 'perhaps '}{more} robust to new noise"
+        corrected = p_value(row.p_holm).removeprefix("= ")
         yield (
             f"{row.algorithm} on {where}, trained with {row.noise} at rate {row.noise_rate}: "
             f"{verdict} (score {row.score:.0f} against {row.baseline_score:.0f} without noise in "
-            f"training, p = {row.p:.2g}, Holm {row.p_holm:.2g}; clean return "
+            f"training, p {p_value(row.p)}, Holm {corrected}; clean return "
             f"{row.clean_change_percent:+.0f} %)."
         )
