@@ -39,12 +39,14 @@ from analyze_luck import (
 )
 from analyze_report import figures, text_table, write_figure, write_report, write_table
 from analyze_robustness import read_robustness, robustness_sentences, robustness_tables
-from analyze_runs import BASELINE, KEYS, left_out, make_studies, read_runs
+from analyze_runs import BASELINE, KEYS, left_out, make_studies, read_choice, read_runs
 from analyze_statistics import (
     COVERAGE,
     COVERAGE_OF_MIXTURES,
     MIN_SEEDS,
     bootstrap_iqm,
+    contrast,
+    holm,
     improvement_percent,
     leave_one_seed_out,
     mann_whitney,
@@ -82,6 +84,9 @@ COLUMNS = {
         consistent consistent_by_luck consistent_by_luck_95 p_consistent consistent_beyond_luck
         consistently_worse consistently_worse_by_luck consistently_worse_by_luck_95
         p_consistently_worse consistently_worse_beyond_luck""",
+    "interactions": """algorithm environment noise noise_rate n both_mean first_mean second_mean
+        baseline_mean interaction interaction_low interaction_high standard_error
+        interaction_percent percent_low percent_high""",
     "early_performance": "algorithm environment noise steps_millions noise_rate mean std n",
     "statistics": """algorithm environment noise noise_rate verdict improvement_iqm_percent
         improvement_low improvement_high p p_adjusted comparisons probability_of_improvement
@@ -182,10 +187,11 @@ def statistics_rows(study):
     envs = np.array(study.environments)
     pusher = np.array([env.startswith("Pusher") for env in envs])
     scopes = [(env, envs == env) for env in envs]
-    if len(envs) > 1:
-        scopes.append(("all", np.full(len(envs), True)))
-    if pusher.any() and (~pusher).sum() > 1:
-        scopes.append(("all but Pusher", ~pusher))
+    if study.phase != "confirmation":  # there each environment has its one comparison
+        if len(envs) > 1:
+            scopes.append(("all", np.full(len(envs), True)))
+        if pusher.any() and (~pusher).sum() > 1:
+            scopes.append(("all but Pusher", ~pusher))
     for (scope, chosen), config in product(scopes, study.returns):
         x, y = study.final(config)[:, chosen], study.final(BASELINE)[:, chosen]
         here = np.isfinite(x).any(axis=0)
@@ -220,20 +226,64 @@ def against_baseline(x, y):
     return row
 
 
-def adjust(statistics):
-    """Add Benjamini-Hochberg's p per (algorithm, environment), the smallest in reach, and verdicts.
+def adjust(statistics, confirmations=()):
+    """Add p corrected for all comparisons of a family, the smallest in reach, and verdicts.
 
-    The verdict follows the p of the exact test, corrected for all comparisons of the family.
+    A family is an algorithm in one environment, corrected with Benjamini and Hochberg's method. The
+    `confirmations` (algorithms) of `./benchmark.sh choose` were fixed beforehand: they are one
+    family, corrected with Holm's method.
     """
     tested = statistics[statistics["p"].notna()]
-    for _, family in tested.groupby(["algorithm", "environment"]):
-        adjusted = stats.false_discovery_control(family["p"].astype(float))
-        statistics.loc[family.index, "p_adjusted"] = adjusted
+    confirmed = tested["algorithm"].isin(confirmations)
+    families = [family for _, family in tested[~confirmed].groupby(["algorithm", "environment"])]
+    for family in [*families, tested[confirmed]]:
+        p = family["p"].to_numpy(float)
         alone = np.minimum(1, family["smallest_p"].astype(float) * len(family))
+        if family["algorithm"].isin(confirmations).any():
+            adjusted = holm(p)
+        else:
+            adjusted = stats.false_discovery_control(p)
+        statistics.loc[family.index, "p_adjusted"] = adjusted
         statistics.loc[family.index, "smallest_p_adjusted"] = alone
         statistics.loc[family.index, "comparisons"] = len(family)
     statistics["verdict"] = [verdict(row) for _, row in statistics.iterrows()]
     return statistics
+
+
+def interaction_rows(study):
+    """Yield, for two noises and both together: how much more do they change than their sum?
+
+    I = J(A + B) - J(A) - J(B) + J(0) of the mean final returns, in every environment where all
+    four have at least MIN_SEEDS seeds, with a 95 % interval; then relative to |J(0)|.
+    """
+    for (e, environment), config in product(enumerate(study.environments), study.returns):
+        parts = list(zip(config[0].split(" + "), config[1].split(" + "), strict=True))
+        if len(parts) != 2 or parts[0] == parts[1]:
+            continue
+        cells = []
+        for part in (config, *parts, BASELINE):
+            finals = study.final(part)[:, e] if part in study.returns else np.empty(0)
+            cells.append(finals[np.isfinite(finals)])
+        if min(map(len, cells)) < MIN_SEEDS:
+            continue
+        both, first, second, alone = cells
+        value, error, low, high = contrast(cells, [1, -1, -1, 1])
+        percent = 100 / abs(alone.mean()) if alone.mean() else np.nan
+        yield {
+            **dict(zip(KEYS, (study.algorithm, environment, *config), strict=True)),
+            "n": min(map(len, cells)),
+            "both_mean": both.mean(),
+            "first_mean": first.mean(),
+            "second_mean": second.mean(),
+            "baseline_mean": alone.mean(),
+            "interaction": value,
+            "interaction_low": low,
+            "interaction_high": high,
+            "standard_error": error,
+            "interaction_percent": value * percent,
+            "percent_low": low * percent,
+            "percent_high": high * percent,
+        }
 
 
 def with_p(table, statistics):
@@ -333,6 +383,16 @@ is at most 0.05, and perhaps so where only p is. Smallest p adjusted: what one c
 could reach at most with its number of seeds. Detectable: the improvement that these seeds find at
 the 5 % level, uncorrected, with 80 % power; seeds needed: how many on each side the observed
 improvement takes. Both are for normal returns with the standard deviation of these seeds.""",
+    "interactions": """Two noises together: interaction = mean with both - mean with the first -
+mean with the second + mean without noise, of the final test returns, where each of the four has at
+least 3 seeds (n is the smallest number), with a 95 % interval (Welch, Satterthwaite), and in
+percent of |mean without noise|. Above zero, both together are better than their two effects added
+up. This is descriptive: nothing is corrected for the number of rows.""",
+    "choice": """How ./benchmark.sh choose came to its noise: rounds of the search, in which the
+better half survives (score: mean over the seeds of the last three tests), and the confirmation of
+the winner on fresh seeds (1001 and up; score: mean final test return; survives: whether it was
+shown to be better than no noise). Search and confirmation have rows of their own everywhere, and
+only the confirmation is judged: the search's seeds chose the noise, which flatters it.""",
     "missing": """Runs that are in no table and no figure, with their seeds. Missing are the seeds
 that at least half of an algorithm's configurations with noise have, and baselines.""",
     "compare_luck": f"""The same for the paper's tables: {PAPER_CONFIGURATIONS} configurations in
@@ -358,7 +418,8 @@ def make_tables(studies, paper=None):
     consistency = frame("consistency", consistency_rows(judged))
     early = frame("early_performance", (row for study in studies for row in early_rows(study)))
     statistics = frame("statistics", (row for study in judging for row in statistics_rows(study)))
-    statistics = adjust(statistics)
+    confirmations = [study.algorithm for study in studies if study.phase == "confirmation"]
+    statistics = adjust(statistics, confirmations)
     summary, judged, best, consistency = (
         with_p(table, statistics) for table in (summary, judged, best, consistency)
     )
@@ -378,6 +439,9 @@ def make_tables(studies, paper=None):
         "statistics": (statistics, f"{CAPTIONS['statistics']}\n{limits}"),
         "early_performance": (early, CAPTIONS["early_performance"]),
     }
+    found = frame("interactions", (row for study in judging for row in interaction_rows(study)))
+    if len(found):
+        tables["interactions"] = (found, CAPTIONS["interactions"])
     for base in sorted({study.base for study in studies}):
         same = [study.algorithm for study in studies if study.base == base]
         table = summary[summary["algorithm"].isin(same)]
@@ -458,6 +522,12 @@ def main(args):
         no_finished_run(args.runs_dir)
     tables = make_tables(studies, paper)
     tables["missing"] = (missing, CAPTIONS["missing"])
+    try:
+        choice = read_choice(args.runs_dir)
+    except ValueError as error:
+        fail(error)
+    if choice is not None:
+        tables["choice"] = (choice, CAPTIONS["choice"])
     verdicts = sentences(studies, tables["statistics"][0])
     overview = [f"Finished runs: {(runs['status'] == 'finished').sum()}."]
     overview += [

@@ -40,6 +40,8 @@ MERGED = {
     "average improvement %": ("average_improvement_percent", "std_improvement_percent"),
     "IQM": ("iqm", "iqm_low", "iqm_high"),
     "improvement (IQM) %": ("improvement_iqm_percent", "improvement_low", "improvement_high"),
+    "interaction": ("interaction", "interaction_low", "interaction_high"),
+    "interaction %": ("interaction_percent", "percent_low", "percent_high"),
     "difference": ("difference", "difference_low", "difference_high"),
     "P(improvement)": ("probability_of_improvement", "probability_low", "probability_high"),
 }
@@ -409,6 +411,7 @@ def write_figure(out, name, fig):
 # ------------------------------------------------------------------------------------------- report
 
 SECTIONS = {
+    "choice": "Choice of a noise",
     "best": "Best noise tried (may be worse than none)",
     "consistent": "Consistent noise",
     "consistently_worse": "Consistently worse",
@@ -416,6 +419,7 @@ SECTIONS = {
     "statistics": "Statistics",
     "early_performance": "Learning curves",
     "ablation": "Parameters",
+    "interactions": "Two noises together",
     "robustness": "Robustness",
     "summary": "All results",
     "missing": "Runs left out",

@@ -22,6 +22,7 @@ NOT_SETTINGS = {"env_id", "seed", "noise", "noise_rate", "runs_dir", "overwrite"
 NOT_SETTINGS |= {"torch_threads", "checkpoint_frequency", "eval_frequency"}
 RUN_COLUMNS = ["run", "status", "reason", "base", "phase", *KEYS, "seed", "episodes", "total"]
 RUN_COLUMNS += ["settings", "versions", "steps", "returns"]
+CHOICE_COLUMNS = [*KEYS[:2], "phase", "round", *KEYS[2:], "seeds", "score", "survives"]
 FIRST_CONFIRMATION_SEED = 1001  # of `./benchmark.sh choose`: lower seeds are those of its search
 
 
@@ -137,6 +138,22 @@ def read_runs(runs_dir):
     twice = (runs["status"] == "finished") & runs.duplicated(["status", *KEYS, "seed"])
     runs.loc[twice, ["status", "reason"]] = ["duplicate", "same configuration and seed as another"]
     return runs
+
+
+def read_choice(runs_dir):
+    """Read the choice.csv of `./benchmark.sh choose`, or return None where there is none.
+
+    Raises ValueError for a file with other columns.
+    """
+    path = Path(runs_dir) / "choice.csv"
+    if not path.exists():
+        return None
+    text = dict.fromkeys(("round", "noise", "noise_rate", "survives"), str)
+    choice = pd.read_csv(path, dtype=text, keep_default_na=False)
+    if list(choice.columns) != CHOICE_COLUMNS:
+        raise ValueError(f"{path} does not have the columns {','.join(CHOICE_COLUMNS)}")
+    choice["noise_rate"] = [rate_text(rates.split(" + ")) for rates in choice["noise_rate"]]
+    return choice
 
 
 def labels(base, group):
@@ -283,11 +300,11 @@ def make_studies(runs):
             place = seeds.index(run.seed), envs.index(run.environment)
             shared = np.isin(run.steps, grid)
             returns[run.noise, run.noise_rate][:, *place] = run.returns[shared]
+        base, phase = group[["base", "phase"]].iloc[0]
         for env, values in zip(envs, returns[BASELINE][-1].T, strict=True):
-            if np.isnan(values).all():
+            if np.isnan(values).all() and phase != "search":
                 notes.append(f"{algorithm}: no finished baseline on {env}, so no improvement there")
         notes += version_notes(algorithm, group["versions"])
-        base, phase = group[["base", "phase"]].iloc[0]
         studies.append(Study(algorithm, base, phase, envs, seeds, grid, returns))
     return studies, notes
 
