@@ -62,6 +62,7 @@ __all__ = [
     "canonical_env_id",
     "canonical_noises",
     "make_noisy",
+    "noise_slug",
     "noise_wrappers",
     "parse_noise",
     "run_name",
@@ -829,6 +830,19 @@ def noise_wrappers(env: Env) -> dict[str, NoiseWrapper]:
     return found
 
 
+def noise_slug(noises: Sequence[str], rates: Sequence[float | str]) -> str:
+    """Return noises as a part of a file's name, "" for none; equal configurations have equal ones.
+
+    >>> noise_slug(["RandomUniformScaleReward(.5, 1.5)"], [0.05])
+    'RandomUniformScaleReward_0.5_1.5_p0.05'
+    """
+    words = []
+    for noise, rate in _pair(noises, rates):
+        name_and_arguments = re.findall(r"[^(), ]+", str(noise))
+        words.append("_".join([*name_and_arguments, f"p{rate}".replace(":", "to")]))
+    return "+".join(words)
+
+
 def run_name(
     env_id: str, exp_name: str, noises: Sequence[str], rates: Sequence[float | str], seed: int
 ) -> str:
@@ -843,11 +857,7 @@ def run_name(
     >>> run_name("ALE/Pong-v5", "ppo", [], [], seed=1)
     'ALE-Pong-v5__ppo__baseline__1'
     """
-    words = []
-    for noise, rate in _pair(noises, rates):
-        name_and_arguments = re.findall(r"[^(), ]+", str(noise))
-        words.append("_".join([*name_and_arguments, f"p{rate}".replace(":", "to")]))
-    slug = "+".join(words) or "baseline"
+    slug = noise_slug(noises, rates) or "baseline"
     name = f"{_safe(env_id)}__{_safe(exp_name)}__{slug}__{seed}"
     if len(name) > 240:  # a file's name has at most 255 bytes
         short_slug = f"{slug[:100]}_{hashlib.sha256(slug.encode()).hexdigest()[:16]}"

@@ -1,0 +1,328 @@
+"""Test trained policies again: clean and under noise, in a window, or as a video.
+
+    python evaluate.py runs/Hopper-v5__* --noise "RandomNormalNoisyObservation(0.1)" \
+        "RandomNormalNoisyAction(0.2)" --noise-rate 0.2 1.0 --jobs 4
+    python evaluate.py runs/Hopper-v5__sac_continuous_noisy__baseline__1 --render
+    python evaluate.py runs --video videos
+
+Every policy plays without noise and under every noise at every rate. Episode i begins with
+reset(seed = --seed + i), which also seeds the noise: all policies and conditions share their
+initial states. Returns are the environment's own, before noise on the reward. robustness.csv in
+the run's folder keeps them, and what it has is not played again.
+"""
+
+import csv
+import importlib
+import itertools
+import json
+import multiprocessing
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import tyro
+from gymnasium.wrappers import RecordVideo
+from tabulate import tabulate
+from tqdm import tqdm
+
+from analyze_runs import is_run, rate_text
+from noisy_wrappers import canonical_noises, make_noisy, noise_slug
+
+HEADER = ["noise", "noise_rate", "episode", "episodic_return", "episodic_length"]
+DISPLAY = "import glfw; assert glfw.init() and glfw.get_primary_monitor()"
+
+
+@dataclass
+class Args:
+    """Command-line arguments."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """folders of finished runs, or folders that hold such folders"""
+    noise: tuple[str, ...] = ()
+    """noises to test under; "A(..)+B(..)" combines two"""
+    noise_rate: tuple[float | str, ...] = ()
+    """probabilities p; every noise is tested at every one"""
+    episodes: int = 100
+    """test episodes per policy and condition"""
+    seed: int = 2_000_000
+    """seed of the first episode; what is stored is not played again for another seed"""
+    jobs: int = 1
+    """processes side by side"""
+    render: bool = False
+    """show one episode of each condition in a window and store nothing"""
+    video: Path | None = None
+    """write a video of one episode of each condition into this folder and store nothing else"""
+
+
+class Run(NamedTuple):
+    """A finished run; `trained_with` is a row of the table, all seeds of one configuration."""
+
+    folder: Path
+    algorithm: str
+    env_id: str
+    max_episode_steps: int | None
+    trained_with: tuple[str, str, str, str]  # environment, experiment, noise, noise rate
+
+
+def fail(message, code=2):
+    """Exit with one line that says what to do."""
+    print("error:", message, file=sys.stderr, flush=True)
+    raise SystemExit(code)
+
+
+def reason(error):
+    """Return an exception's text as one line."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def find_runs(paths):
+    """Return the runs that the paths name, each once; a folder stands for its finished runs."""
+    folders = []
+    for path in paths:
+        if path.name in ("logs", "choice.csv") or (path / "report.html").exists():
+            continue  # of benchmark.sh and of analyze.py
+        if path.is_dir() and is_run(path):
+            folders.append(path)
+        elif path.is_dir() and any(map(is_run, path.iterdir())):
+            runs = [folder for folder in sorted(path.iterdir()) if is_run(folder)]
+            folders += [folder for folder in runs if (folder / "result.json").exists()]
+        else:
+            fail(f"{path} is neither a run nor a folder of runs")
+    if not folders:
+        fail(f"there is no finished run in {', '.join(map(str, paths))}")
+    return [read_run(folder) for folder in dict.fromkeys(map(Path.absolute, folders))]
+
+
+def read_run(folder):
+    """Read what a finished run's config.json says."""
+    if not (folder / "result.json").exists():
+        fail(f"{folder} is not finished: the command that started it goes on with it")
+    try:
+        config = json.loads((folder / "config.json").read_text())
+        args = config["args"]
+        noise = " + ".join(args["noise"]) or "no noise"
+        trained_with = (args["env_id"], args["exp_name"], noise, rate_text(args["noise_rate"]))
+        max_episode_steps = args.get("max_episode_steps")
+        return Run(folder, config["algorithm"], args["env_id"], max_episode_steps, trained_with)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        fail(f"cannot read {folder / 'config.json'}: {type(error).__name__}: {reason(error)}")
+
+
+def read_conditions(args):
+    """Return the clean condition and every noise at every rate, each once.
+
+    That is {(noise, noise rate) as in robustness.csv: (noises, noise rates)}.
+    """
+    if bool(args.noise) != bool(args.noise_rate):
+        fail("--noise and --noise-rate go together: every noise is tested at every rate")
+    conditions = {("", "0.0"): ([], [])}
+    for noise, rate in itertools.product(args.noise, args.noise_rate):
+        try:
+            noises, rates = canonical_noises(re.split(r"(?<=\))\s*\+\s*", noise), [rate])
+        except ValueError as error:
+            fail(error)
+        if any(isinstance(rate, str) for rate in rates):
+            fail(f"--noise-rate {rate}: policies are tested at constant rates")
+        if noises:  # a rate of 0 is clean
+            conditions[" + ".join(noises), " + ".join(map(str, rates))] = (noises, rates)
+    return conditions
+
+
+def load(run, render_mode=None):
+    """Return a run's clean environment and its policy, NumPy to NumPy."""
+    name = f"{run.algorithm.lower()}_continuous_noisy"
+    try:
+        script = importlib.import_module(name)
+    except ImportError as error:
+        fail(f"{run.folder}: cannot import {name}: {error}")
+    steps = run.max_episode_steps
+    env = script.make_env(run.env_id, max_episode_steps=steps, render_mode=render_mode)
+    try:
+        return env, script.load_policy(run.folder, env)
+    except Exception as error:  # a damaged file may raise anything
+        fail(f"{run.folder / 'policy.pt'} is no policy for {run.env_id}: {reason(error)}")
+
+
+def check(run, conditions):
+    """Exit unless the policy fits its environment and every noise can act on it."""
+    env, _ = load(run)
+    for noises, rates in conditions.values():
+        try:
+            make_noisy(env, noises, rates)
+        except ValueError as error:
+            fail(f"{run.folder}: {error}")
+    env.close()
+
+
+def play(run, noises, rates, args):
+    """Play episodes; return their true returns and lengths, [(return, length), ...]."""
+    env, policy = load(run, "rgb_array" if args.video else "human" if args.render else None)
+    video = f"{run.folder.name}__{noise_slug(noises, rates) or 'clean'}"
+    if args.video:
+        env = RecordVideo(env, str(args.video / f".{video}"), episode_trigger=lambda i: True)
+    env = make_noisy(env, noises, rates)
+    results = []
+    for episode in range(args.episodes):
+        observation, _ = env.reset(seed=args.seed + episode)
+        terminated = truncated = False
+        while not (terminated or truncated):
+            observation, _, terminated, truncated, info = env.step(policy(observation))
+        episodic_return = np.asarray(info["episode"]["r"]).item()  # a sum of numbers or of arrays
+        results.append((episodic_return, int(info["episode"]["l"])))
+    env.close()
+    if args.video:
+        folder = args.video / f".{video}"
+        (folder / "rl-video-episode-0.mp4").replace(args.video / f"{video}.mp4")
+        folder.rmdir()
+    return results
+
+
+def play_all(tasks, args):
+    """Yield the results of play(run, noises, rates, args) for all tasks, in their order."""
+    with tqdm(tasks, unit="condition", disable=None) as bar:
+        if args.jobs == 1 or args.render:
+            for task in bar:
+                yield play(*task, args)
+            return
+        context = multiprocessing.get_context("spawn")  # PyTorch does not survive a fork
+        ignore = (signal.SIGINT, signal.SIG_IGN)  # at Ctrl-C they finish what they play
+        with ProcessPoolExecutor(args.jobs, context, signal.signal, ignore) as pool:
+            futures = [pool.submit(play, *task, args) for task in tasks]
+            try:
+                for _, future in zip(bar, futures, strict=True):
+                    yield future.result()
+            finally:
+                pool.shutdown(cancel_futures=True)
+
+
+def read_stored(run):
+    """Read robustness.csv: {(noise, noise rate): [(return, length), ...]}."""
+    path = run.folder / "robustness.csv"
+    stored = {}
+    try:
+        for row in csv.DictReader(path.read_text().splitlines() if path.exists() else []):
+            result = float(row["episodic_return"]), int(row["episodic_length"])
+            stored.setdefault((row["noise"], row["noise_rate"]), []).append(result)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        text = f"{type(error).__name__}: {reason(error)}"
+        fail(f"cannot read {path} ({text}); delete it to play everything again")
+    return stored
+
+
+def write_stored(run, stored):
+    """Write robustness.csv, whole or not at all."""
+    path = run.folder / "robustness.csv"
+    temporary = path.with_suffix(".tmp")
+    try:
+        with open(temporary, "w") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(HEADER)
+            for key, results in stored.items():
+                writer.writerows([*key, i, *result] for i, result in enumerate(results))
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        fail(f"cannot write {path}: {error}", code=1)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def print_table(runs, conditions, stored, episodes):
+    """Print the mean and the sample standard deviation over seeds, training by test."""
+    rows = []
+    for trained_with in dict.fromkeys(run.trained_with for run in runs):
+        seeds = [stored[run] for run in runs if run.trained_with == trained_with]
+        row = [*trained_with, len(seeds)]
+        for key in conditions:
+            means = [np.mean(seed[key][:episodes], axis=0)[0] for seed in seeds]
+            spread = f" ± {np.std(means, ddof=1):.1f}" if len(means) > 1 else ""
+            row.append(f"{np.mean(means):.1f}{spread}")
+        rows.append(row)
+    headers = ["environment", "experiment", "trained with", "at rate", "seeds"]
+    for noise, rate in conditions:
+        headers.append(f"{noise}\nat {rate}".replace(" + ", " +\n") if noise else "clean")
+    print(tabulate(rows, headers, disable_numparse=True))
+
+
+def works(code):
+    """Tell whether Python can run some code, in a process of its own, for it may crash."""
+    return not subprocess.run([sys.executable, "-c", code], capture_output=True).returncode
+
+
+def prepare_video(folder):
+    """Make the folder; let MuJoCo draw without a display, with the first library that works."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        fail(f"--video: cannot write to {folder}: {error}")
+    if os.environ.get("MUJOCO_GL") or works(DISPLAY):
+        return
+    for library in ("egl", "osmesa"):
+        os.environ["MUJOCO_GL"] = library
+        if works(f"from mujoco.{library} import GLContext; GLContext(64, 64).make_current()"):
+            return
+    fail(
+        "--video needs a display, or a library to draw without one: on Debian or Ubuntu, "
+        "apt install libegl1 libgl1, or libosmesa6"
+    )
+
+
+def show(runs, conditions, args):
+    """Play one episode of each condition in a window or into a video; store nothing else."""
+    tasks = [(run, *condition) for run in runs for condition in conditions.values()]
+    try:
+        results = play_all(tasks, replace(args, episodes=1))
+        for (run, *condition), [(episodic_return, length)] in zip(tasks, results, strict=True):
+            tested = noise_slug(*condition) or "clean"
+            print(f"{run.folder.name}, {tested}: return {episodic_return:.1f}, {length} steps")
+    except Exception as error:  # of any library that draws
+        fail(f"cannot draw: {reason(error)}")
+
+
+def main(args):
+    """Check everything, play what is not stored, print the table."""
+    for name, least in (("episodes", 1), ("jobs", 1), ("seed", 0)):
+        if getattr(args, name) < least:
+            fail(f"--{name} must be at least {least}, not {getattr(args, name)}")
+    if args.render and args.video:
+        fail("--render and --video exclude each other")
+    if args.render and not works(DISPLAY):
+        fail("--render needs a display; --video FOLDER makes videos without one")
+    os.environ["OMP_NUM_THREADS"] = "1"  # before the scripts import PyTorch; processes inherit it
+    sys.path.append(os.getcwd())  # my_module:MyEnv-v0 may lie in the folder this is called from
+    conditions = read_conditions(args)
+    runs = find_runs(args.runs)
+    stored = {run: read_stored(run) for run in runs}
+    for run in runs:
+        check(run, conditions)
+    if args.video:
+        prepare_video(args.video)
+    if args.video or args.render:
+        show(runs, conditions, args)
+        return
+    todo = []
+    for run, key in itertools.product(runs, conditions):
+        if len(stored[run].get(key, [])) < args.episodes:
+            todo.append((run, key))
+    tasks = [(run, *conditions[key]) for run, key in todo]
+    for (run, key), results in zip(todo, play_all(tasks, args), strict=True):
+        stored[run][key] = results
+        write_stored(run, stored[run])
+    print_table(runs, conditions, stored, args.episodes)
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Args))
+    except KeyboardInterrupt:
+        fail("stopped; the conditions that were played are stored", code=130)
