@@ -6,9 +6,12 @@ BIN := .venv/bin
 
 demo: $(BIN)/.run
 	PYTHON=$(BIN)/python ./benchmark.sh demo
-	$(BIN)/python analyze.py --runs-dir runs/demo --out runs/demo/results
-	@echo "The curves: .venv/bin/tensorboard --logdir runs/demo"
-	@echo "The tables and figures: runs/demo/results/report.html"
+	$(BIN)/python analyze.py --runs-dir runs/demo >runs/demo/analysis.txt
+	@echo
+	@head -n 1 runs/demo/analysis.txt
+	@echo "The picture: runs/demo/results/curves_PPO_RandomEarlyTermination_50.svg"
+	@echo "All tables and figures: runs/demo/results/report.html"
+	@echo "The curves in TensorBoard: .venv/bin/tensorboard --logdir runs/demo"
 
 test: $(BIN)/.dev
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile

@@ -5,10 +5,14 @@ set -euo pipefail
 usage() {
   cat <<'END'
 Usage: ./benchmark.sh PRESET [grid options] [executor options] [-- script options]
-       ./benchmark.sh status PRESET [grid options]
+       ./benchmark.sh choose --algos ... --envs ... [options as above]
+       ./benchmark.sh status [PRESET] [grid options]
 
 Presets
-  demo       PPO on Hopper-v5, baseline and one noise, 100,000 steps, into runs/demo
+  choose     finds out whether a noise helps, and which: for each algorithm and environment that you
+             name, runs the noises with more and more seeds, drops the worse half again and again,
+             compares the winner with no noise on fresh seeds, and says what came out
+  demo       PPO on Pusher-v5, without and with one noise, 5 seeds, 100,000 steps, into runs/demo
   baseline   no noise: 3 algorithms, 5 environments, the paper's seeds
   best       the paper's best noise for each algorithm and environment
   paper      15 noises at 6 rates, 9,100 runs
@@ -17,12 +21,28 @@ Presets
 Every preset includes the baselines.
 
 Grid options replace a preset's values
-  --algos sac td3 ppo      --envs Hopper-v5 ...       --seeds 1-5 7
+  --algos sac td3 ppo
+  --envs Hopper-v5 my_envs:MyEnv-v0
+             an environment of your own: my_envs.py lies in the folder that you call this from
+  --seeds 1-5 7
   --noises "RandomNormalNoisyReward(1.0)" "RandomEarlyTermination(50)+RandomMixupObservation(0.5)"
-  --noise-rates 0.05 1.0   --total-timesteps 1000000  --runs-dir runs
+             noises joined by + act together
+  --noise-rates 0.05 1.0 1.0:0.0
+             each noise is run at each rate; 1.0:0.0 falls linearly during training
+  --noises "RandomNormalNoisyReward(1.0)@0.1+RandomEarlyTermination(50)@0.2"
+             rates of its own, for each noise; --noise-rates does not apply to these
+  --combine  custom: adds every pair of the noises, both in one environment
+  --total-timesteps 1e6
+  --runs-dir runs
+             where the run folders go; counts from the folder that you call this from
+
+Options of choose
+  --exclude "NOISE@RATE"   noises to leave out, because they always fail for instance
+  --budget N               runs that the search may take, about (default: 3 for each noise)
+  --confirm N              fresh seeds for the final comparison (default: 10)
 
 Executor options
-  --dry-run             print the commands, start nothing
+  --dry-run             print the commands of the runs that are to do, start nothing
   --executor local      (default) runs side by side on this machine
   --executor parallel   GNU parallel, on this machine or over ssh
   --executor slurm      job arrays; submits and returns
@@ -32,21 +52,24 @@ Executor options
   --remote-dir DIR      where the project lies on machines that do not share this folder: run
                         folders are then sent and fetched with rsync
   --slurm-args "..."    options for sbatch, e.g. "--partition=cpu --time=24:00:00"
-  --wait                slurm: wait for the jobs and report
+  --wait                slurm: wait for the jobs and report (choose always waits)
+
+Options of the training scripts, such as --eval-episodes 20, stand at the end, after "--".
 
 Examples
+  ./benchmark.sh choose --algos ppo --envs Pusher-v5 --noise-rates 1.0
   ./benchmark.sh demo
-  ./benchmark.sh best --envs Hopper-v5 --seeds 1 --total-timesteps 200000 --runs-dir runs/short
+  ./benchmark.sh best --envs Hopper-v5 --seeds 1 --total-timesteps 2e5 --runs-dir runs/short
   ./benchmark.sh custom --algos td3 --noises "RandomUniformScaleReward(0.5, 1.5)" --noise-rates 0.05
   ./benchmark.sh paper --executor parallel --sshlogin hostA,hostB
   ./benchmark.sh paper --executor slurm --slurm-args "--time=24:00:00 --mem-per-cpu=4G"
-  ./benchmark.sh status paper
+  ./benchmark.sh status --runs-dir runs/short
   ./benchmark.sh paper --dry-run | grep sac_ | head -n 1 | sh
 
 The same command again starts what is not done and resumes what was interrupted. Ctrl-C stops
-every run with a checkpoint. Logs: RUNS_DIR/logs. Paths count from the project's folder; the
-interpreter is $PYTHON, else .venv/bin/python, else python. Exit status: 0 every run is done,
-1 some are not, 2 bad arguments, 130 stopped by Ctrl-C. See docs/sweeps.md.
+every run with a checkpoint. `status` without a preset tells of the runs that RUNS_DIR holds. Logs
+are in RUNS_DIR/logs. The interpreter is $PYTHON, else .venv/bin/python, else python. Exit status:
+0 every run is done, 1 some are not, 2 bad arguments, 130 stopped by Ctrl-C. See docs/sweeps.md.
 END
 }
 
@@ -57,8 +80,16 @@ log_of() { echo "${1%/*}/logs/${1##*/}.log"; }
 # FOLDER COMMAND: one run, its output framed by two lines that begin with "#"; returns its status.
 # TERM and INT reach all processes of a run, from whoever sends them. USR1 reaches this shell
 # only, and means: have the run write its checkpoint and end. It sets `asked`.
+# The log is locked while the run lives, even if only the run itself survives: whoever else wants
+# to start the same run waits for it, and goes on with it if it was stopped.
 run_one() {
   asked=
+  mkdir -p "${1%/*}/logs"
+  exec 9>>"$(log_of "$1")"
+  if ! flock --nonblock 9; then
+    echo "$1 is running already: waiting for it" >&2
+    flock 9 >/dev/null 2>&1 || return
+  fi
   [ ! -e "$1/result.json" ] || return 0
   export OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 PYTHONUNBUFFERED=1
   echo "# $(date '+%F %T') $HOSTNAME: $2"
@@ -79,16 +110,12 @@ slurm_task() { # LINES OFFSET: one task of a job array, requeued if it was stopp
   exit "$status"
 }
 
+caller=$(pwd -P)
 cd "$(dirname "${BASH_SOURCE[0]}")"
-case ${1:-} in # how the executors call this script: run-one and run-logged SWEEP FOLDER COMMAND
+case ${1:-} in # how the executors call this script: run-one SWEEP FOLDER COMMAND
   run-one) # on a machine whose connection may break: the run must outlive its reader
     trap : TERM INT USR1
     run_one "$3" "$4" | { trap '' TERM INT USR1 && { cat || cat >/dev/null; }; } || exit 1
-    exit ;;
-  run-logged) # exit status 255 ends xargs, if the sweep that started it was killed
-    driver=${2%-*} # the sweep's name without its time: HOST-PROCESS
-    kill -0 "${driver##*-}" 2>/dev/null || exit 255
-    run_one "$3" "$4" >>"$(log_of "$3")" || exit 1
     exit ;;
   slurm-task) slurm_task "$2" "$3" ;;
   "" | -h | --help) usage || true; exit ;;
@@ -119,45 +146,65 @@ done
   fail "--sshlogin and --remote-dir belong to --executor parallel"
 [ "$executor" = slurm ] || [ -z "$slurm_args$wait" ] ||
   fail "--slurm-args and --wait belong to --executor slurm"
+[ "${grid[0]:-}" != choose ] || wait=1 # for each batch of runs: their returns decide on the next
 
 if [ -z "${PYTHON:-}" ]; then
   if [ -x .venv/bin/python ]; then PYTHON=.venv/bin/python; else PYTHON=python; fi
 fi
 export PYTHON
+# An environment of the user's own lies where the command was given
+[ "$caller" = "$(pwd -P)" ] || export PYTHONPATH="${PYTHONPATH:+$PYTHONPATH:}$caller"
 "$PYTHON" -c "import sys, importlib.util as u; sys.exit(not all(map(u.find_spec, sys.argv[1:])))" \
   gymnasium mujoco torch tyro tensorboard 2>/dev/null ||
   fail "'$PYTHON' lacks a package: set PYTHON, or install requirements.txt into .venv"
-if [ $view = status ]; then exec "$PYTHON" grid.py status "${grid[@]}"; fi
-lines=$("$PYTHON" grid.py list "${grid[@]}") || exit $?
-todo=$(awk -F'\t' -v OFS='\t' '$2 == "todo" {print $1, $3}' <<<"$lines")
-count=$(grep -c . <<<"$todo" || true)
-echo "$(wc -l <<<"$lines") runs, $count to do" >&2
+
+show() { "$PYTHON" sweep.py "$1" "$caller" ${grid[@]+"${grid[@]}"}; }
+if [ $view = status ]; then
+  show status
+  exit
+fi
+
+list_todo() { # sets `lines`, all runs; and `todo`, those that are to do and were not yet tried
+  lines=$(show list) || exit $?
+  todo=$(awk -F'\t' -v OFS='\t' '$2 == "todo" {print $1, $3}' <<<"$lines" |
+    grep -vxFf <(printf '%s\n' "$tried") || true)
+  count=$(grep -c . <<<"$todo" || true)
+}
+tried=''
+list_todo
+first=${lines%%$'\t'*}
+[ -z "$remote_dir" ] || [ "${first#/}" = "$first" ] ||
+  fail "--remote-dir needs a --runs-dir in the project's folder, not ${first%/*}"
 # Whatever becomes of the reader of a pipe ("| head"), nothing is started
-if [ -n "$dry_run" ]; then cut -f3 <<<"$lines" || true; exit; fi
+if [ -n "$dry_run" ]; then cut -f2 <<<"$todo" || true; exit; fi
 
 if [ "$executor" = parallel ]; then
   parallel --version 2>/dev/null | grep -q "GNU parallel" ||
     fail "--executor parallel needs GNU parallel (Debian: apt-get install parallel)"
 elif [ "$executor" = slurm ]; then
   command -v sbatch >/dev/null || fail "--executor slurm needs sbatch, on a Slurm cluster"
-else
-  command -v xargs >/dev/null || fail "--executor local needs xargs (Debian: findutils)"
 fi
-if [ "$count" -eq 0 ]; then exec "$PYTHON" grid.py report "${grid[@]}"; fi
+command -v flock >/dev/null || fail "this needs flock (Debian: apt-get install util-linux)"
+if [ "$count" -eq 0 ]; then
+  show report
+  exit
+fi
 
-first=${lines%%$'\t'*}
 sweep=$HOSTNAME-$$-$(date +%Y%m%d%H%M%S)
 logs=${first%/*}/logs list=${first%/*}/logs/lines-$sweep.tsv
 mkdir -p "$logs" || fail "--runs-dir: cannot write to ${first%/*}"
-printf '%s\n' "$todo" >"$list"
 
 run_local() { # nproc obeys OMP_NUM_THREADS, which is about the threads of one process
+  local cores folder command
   cores=$(env -u OMP_NUM_THREADS -u OMP_THREAD_LIMIT nproc 2>/dev/null) ||
     cores=$(getconf _NPROCESSORS_ONLN)
-  tr '\t\n' '\0\0' <"$list" |
-    xargs -0 -n 2 -P "${jobs:-$cores}" ./benchmark.sh run-logged "$sweep"
+  while IFS=$'\t' read -r folder command; do
+    while [ "$(jobs -pr | wc -l)" -ge "${jobs:-$cores}" ]; do wait -n || true; done
+    run_one "$folder" "$command" >>"$(log_of "$folder")" &
+  done <"$list"
+  wait
 }
-stop_local() { kill -TERM -- "-$group"; } # xargs ends at once, the runs after their checkpoint
+stop_local() { kill -TERM -- "-$group"; } # run_local ends at once, the runs after their checkpoint
 
 export PARALLEL_SSH=${PARALLEL_SSH:-ssh -o BatchMode=yes}
 parallel_options=(--will-cite --workdir "${remote_dir:-$PWD}")
@@ -175,30 +222,34 @@ run_parallel() { # --termseq: where a connection is lost, the runs get TERM and 
     done
 }
 stop_parallel() { # HUP: parallel starts no more runs, and waits for those that USR1 stops
-  kill -HUP -- "-$group" 2>/dev/null
-  local pattern="^bash ./benchmark.sh run-one $sweep"
-  if [ -z "$sshlogin" ]; then
-    pkill -USR1 -f "$pattern"
-  else
-    parallel "${parallel_options[@]}" --nonall pkill -USR1 -f "'$pattern'"
-  fi
+  local pattern="^bash ./benchmark.sh run-one $sweep" seconds=0
+  while kill -HUP -- "-$group" 2>/dev/null && [ $seconds -lt 3600 ]; do # again for late starters
+    if [ -z "$sshlogin" ]; then
+      pkill -USR1 -f "$pattern" || true
+    else
+      parallel "${parallel_options[@]}" --nonall pkill -USR1 -f "'$pattern'" || true
+    fi
+    sleep 1
+    seconds=$((seconds + 1))
+  done
 }
 
 submit() { # the array's indices are line numbers, counted from the offset of its part
-  local size offset n id
+  local size offset n
   size=$(scontrol show config | awk '$1 == "MaxArraySize" {print $3}')
   [ "${size:-0}" -gt 0 ] || fail "scontrol show config does not tell MaxArraySize"
   read -ra slurm_options <<<"$slurm_args"
-  for ((offset = 0; offset < count; offset += size)); do
+  ids=()
+  for ((offset = 0; offset < count && stopped == 0; offset += size)); do
     n=$((count - offset < size ? count - offset : size))
-    id=$(sbatch --parsable --array="0-$((n - 1))${jobs:+%$jobs}" --requeue --signal=B:USR1@180 \
-      --ntasks=1 --cpus-per-task=1 --job-name=noisy-sweep \
+    ids+=("$(sbatch --parsable --array="0-$((n - 1))${jobs:+%$jobs}" --requeue \
+      --signal=B:USR1@180 --ntasks=1 --cpus-per-task=1 --job-name=noisy-sweep \
       --open-mode=append --output="$logs/slurm-%A.out" \
       ${slurm_options[@]+"${slurm_options[@]}"} \
-      --wrap "exec ./benchmark.sh slurm-task $(printf %q "$list") $offset") ||
+      --wrap "exec ./benchmark.sh slurm-task $(printf %q "$list") $offset")") ||
       fail "sbatch refused runs $((offset + 1)) to $((offset + n)); submitted before: ${ids[*]}"
-    ids+=("${id%%;*}")
   done
+  ids=("${ids[@]%%;*}") # behind a semicolon stands the cluster's name
   echo "submitted; to stop: scancel ${ids[*]}" >&2
 }
 run_slurm() { # the arrays are over when squeue answers and does not name them
@@ -206,45 +257,71 @@ run_slurm() { # the arrays are over when squeue answers and does not name them
   until queue=$(squeue --noheader --user="$(id -un)" --format=%F 2>/dev/null) &&
     ! grep -qxF "$(printf '%s\n' "${ids[@]}")" <<<"$queue"; do sleep 5; done
 }
-stop_slurm() { scancel "${ids[@]}"; }
+stop_slurm() { scancel "${ids[@]%%;*}"; }
 
-if [ "$executor" = slurm ]; then
-  ids=()
-  trap '[ -z "${ids[*]}" ] || scancel "${ids[@]}"; exit 130' INT TERM HUP
-  submit
-  [ -n "$wait" ] || exit 0
-else
+# Were this command killed, the executor would start run after run: the guard stops it then
+guard() { # a killed command may stay as a zombie: it is dead when the guard has another parent
+  local me=$BASHPID
+  while [ "$(ps -o ppid= -p "$me")" -eq $$ ]; do sleep 1; done
+  "stop_$executor"
+}
+
+stopped=0 group='' ids=()
+stop() { # EXIT_STATUS
+  if [ "$stopped" -eq 0 ]; then
+    stopped=$1
+    echo "stopping: every run writes a checkpoint first" >&2 || true
+    [ -z "$group${ids[*]}" ] || "stop_$executor" &
+  elif [ "$executor" = slurm ]; then
+    stop_slurm || true
+  elif [ -n "$group" ]; then
+    kill -TERM -- "-$group" || true
+  fi
+}
+
+# The executor and its guard have process groups of their own, so that one signal to the executor's
+# reaches every run once.
+run_todo() {
+  local guard watch=''
+  printf '%s\n' "$todo" >"$list"
+  if [ "$executor" = slurm ]; then
+    submit
+    [ -n "$wait" ] || exit 0
+  fi
+  trap - PIPE
+  set -m
+  "run_$executor" &
+  group=$!
+  guard &
+  guard=$!
+  set +m
+  [ "$stopped" -eq 0 ] || "stop_$executor" &
+  trap '' PIPE # whoever reads what this prints may leave first
+  [ ! -t 2 ] || { "$PYTHON" sweep.py watch "$caller" "${grid[@]}" & watch=$!; }
+  while kill -0 -- "-$group" 2>/dev/null; do
+    sleep 1 & wait $! || true # a trap interrupts wait, not sleep
+  done
+  kill -- "-$guard" || true
+  [ -z "$watch" ] || { kill "$watch" && echo >&2; }
+  group='' ids=()
+  tried+=$'\n'$todo
+}
+
+if [ "$executor" != slurm ]; then
   trap 'rm -f "$list"' EXIT
   [ -z "$sshlogin" ] || parallel "${parallel_options[@]}" --nonall --tag \
     "$PYTHON" -c "'import mujoco, torch, tyro, noisy_wrappers'" "&&" test -x benchmark.sh >&2 ||
     fail "a machine of --sshlogin cannot run the project in ${remote_dir:-$PWD} with $PYTHON"
 fi
-
-stopped=0
-stop() { # EXIT_STATUS
-  if [ "$executor" = parallel ] && [ "$stopped" -ne 0 ]; then kill -TERM -- "-$group"; fi
-  "stop_$executor" || true
-  [ "$stopped" -ne 0 ] || echo "stopping: every run writes a checkpoint first" >&2 || true
-  stopped=$1
-}
-
-# The executor has a process group of its own, so that one signal to it reaches every run once.
-set -m
-"run_$executor" &
-group=$! watch=''
-set +m
-trap '' PIPE # whoever reads what this prints may leave first
 trap 'stop 130' INT
 trap 'stop 143' TERM HUP
-[ ! -t 2 ] || { "$PYTHON" grid.py watch "${grid[@]}" & watch=$!; }
-while kill -0 -- "-$group" 2>/dev/null; do
-  sleep 1 & wait $! || true # a trap interrupts wait, not sleep
-  [ "$stopped" -eq 0 ] || [ "$executor" != parallel ] || stop_parallel || true # for late starters
+while [ "$count" -gt 0 ]; do
+  run_todo
+  if [ "$stopped" -ne 0 ]; then
+    show stopped
+    echo "stopped; the same command goes on from here"
+    exit "$stopped"
+  fi
+  if [ "${grid[0]}" = choose ]; then list_todo; else break; fi
 done
-[ -z "$watch" ] || { kill "$watch" && echo >&2; }
-if [ "$stopped" -ne 0 ]; then
-  "$PYTHON" grid.py stopped "${grid[@]}"
-  echo "stopped; the same command goes on from here"
-  exit "$stopped"
-fi
-"$PYTHON" grid.py report "${grid[@]}"
+show report

@@ -1,38 +1,26 @@
-"""The runs of a sweep: which there are, the command of each, and how far they have come.
+"""The runs of a sweep: the arguments of benchmark.sh, the runs that they name, their commands.
 
-benchmark.sh is the way in; `./benchmark.sh --help` explains the arguments. What it calls:
-
-    python grid.py list PRESET ...     one run per line: folder, "done" or "todo", command
-    python grid.py status PRESET ...   a summary, the failed runs, the slowest of those running
-    python grid.py stopped PRESET ...  a summary and the failed runs, when the sweep was stopped
-    python grid.py report PRESET ...   a summary and what did not finish, then exit status 1
-    python grid.py watch PRESET ...    the summary as one line that is rewritten, on a terminal
-
-A run is done when its folder holds result.json. Everything else is read from its log, which
-benchmark.sh ends with the run's exit status: it is running while its log has no such end and is
-at most two minutes old. That holds on every executor, on machines this one cannot see.
+`./benchmark.sh --help` explains the arguments. sweep.py shows how far the runs have come.
 """
 
 import argparse
+import ast
 import csv
+import difflib
 import functools
 import itertools
 import json
 import os
 import re
 import shlex
-import shutil
 import subprocess
 import sys
-import time
-from datetime import timedelta
 from pathlib import Path
 from typing import NamedTuple
 
-import gymnasium
+from noisy_wrappers import canonical_env_id, canonical_noises, run_name
 
-from noisy_wrappers import canonical_noises, run_name
-
+PROJECT = Path(__file__).parent
 SEEDS = {"sac": range(1, 6), "td3": range(1, 6), "ppo": range(1, 11)}  # the paper's
 ENVS = ["HalfCheetah-v5", "Hopper-v5", "Humanoid-v5", "Pusher-v5", "Walker2d-v5"]
 RATES = [0.01, 0.05, 0.1, 0.2, 0.5, 1.0]
@@ -61,8 +49,8 @@ ABLATION += [
 PRESETS = {  # the grid options that a preset sets; its noises are in preset_pairs
     "demo": {
         "algos": ["ppo"],
-        "envs": ["Hopper-v5"],
-        "seeds": [[1]],
+        "envs": ["Pusher-v5"],
+        "seeds": [range(1, 6)],
         "total_timesteps": 100_000,
         "runs_dir": "runs/demo",  # never into a sweep's folders: these runs are shorter
     },
@@ -71,11 +59,13 @@ PRESETS = {  # the grid options that a preset sets; its noises are in preset_pai
     "paper": {},
     "ablation": {"algos": ["ppo"]},
     "custom": {},
+    "choose": {},
 }
+GRID_OPTIONS = ["--algos", "--envs", "--noises", "--noise-rates", "--seeds", "--total-timesteps"]
+GRID_OPTIONS += ["--runs-dir", "--combine", "--exclude", "--budget", "--confirm"]
+EXECUTOR_OPTIONS = ["--dry-run", "--executor", "--jobs", "--sshlogin", "--remote-dir"]
+EXECUTOR_OPTIONS += ["--slurm-args", "--wait", "--help"]  # benchmark.sh reads these
 OURS = ["env-id", "seed", "noise", "noise-rate", "total-timesteps", "runs-dir", "exp-name"]
-STOPPED = (129, 130, 138, 143)  # exit statuses of a run that was told to stop, by signal
-END = re.compile(r"# .* exit=(\d+)")
-PROGRESS = re.compile(r"step=(\d+)/\d+ sps=(\d+)")
 
 
 class Run(NamedTuple):
@@ -84,82 +74,175 @@ class Run(NamedTuple):
     folder: Path
     kind: tuple[str, str]  # algorithm, environment: runs of one kind are equally fast
     total_timesteps: int
-    command: list[str]
+    script: str
+    arguments: list[str]
 
 
-class Progress(NamedTuple):
-    """How far a run has come."""
-
-    state: str  # done, running, failed or to do
-    step: int
-    sps: float
-    reason: str  # why it is not done, "" where nothing is known yet
-    last_line: str
-    log: Path
+# ------------------------------------------------------------------------------------ the arguments
 
 
-def parse_args(argv):
+def parse_args(view, caller, argv):
     """Return the grid's arguments; `extra` are the scripts' own, after "--"."""
-    split = argv.index("--") if "--" in argv else len(argv)
     parser = argparse.ArgumentParser(prog="benchmark.sh", add_help=False, allow_abbrev=False)
-    parser.error = fail
-    parser.add_argument("view", choices=["list", "status", "stopped", "report", "watch"])
-    parser.add_argument("preset")
+    parser.error = lambda message: fail(message.removeprefix("argument "))
+    parser.add_argument("preset", nargs="?")
     parser.add_argument("--algos", nargs="+", type=str.lower, default=list(SEEDS))
     parser.add_argument("--envs", nargs="+", default=ENVS)
-    parser.add_argument("--noises", nargs="+", default=[])
-    parser.add_argument("--noise-rates", nargs="+", type=float, default=[])
+    parser.add_argument("--noises", nargs="+", type=entry, default=[])
+    parser.add_argument("--noise-rates", nargs="+", type=rate, default=[])
     parser.add_argument("--seeds", nargs="+", type=seeds)
-    parser.add_argument("--total-timesteps", type=int, default=1_000_000)
+    parser.add_argument("--total-timesteps", type=whole_number, default=1_000_000)
     parser.add_argument("--runs-dir", default="runs")
-    preset = argv[1] if len(argv) > 1 else ""
-    if preset and preset not in PRESETS:
-        fail(f"unknown preset {preset!r}; choose one of {', '.join(PRESETS)}")
+    parser.add_argument("--combine", action="store_true")
+    parser.add_argument("--exclude", nargs="+", type=entry, default=[])
+    parser.add_argument("--budget", type=whole_number)
+    parser.add_argument("--confirm", type=whole_number, default=10)
+    split = argv.index("--") if "--" in argv else len(argv)
+    words, extra = argv[:split], argv[split + 1 :]
+    given = {word.partition("=")[0] for word in words if word.startswith("--")}
+    preset = words[0] if words and not words[0].startswith("--") else None
+    if preset not in PRESETS and not (preset is None and view == "status"):
+        named = words[0] if words else ""
+        fail(f"unknown preset {named!r}; choose one of {', '.join(PRESETS)}")
+    for name in sorted(given.difference(GRID_OPTIONS)):
+        fail(unknown_option(name))
     parser.set_defaults(**PRESETS.get(preset, {}))
-    args = parser.parse_args(argv[:split])
-    args.extra = argv[split + 1 :]
+    args = parser.parse_args(words)
+    args.given, args.extra = given, extra
+    args.runs_dir = from_project(caller, args.runs_dir)
     return args
+
+
+def unknown_option(name):
+    """Say what to write instead of an option that the grid does not have."""
+    known = script_options().difference(f"--{ours}" for ours in OURS)
+    if name in known:
+        return f"{name} is an option of the scripts: put it at the end, after --"
+    near = difflib.get_close_matches(name, [*GRID_OPTIONS, *EXECUTOR_OPTIONS, *known], n=1)
+    if not near:
+        return f"unknown option {name}; ./benchmark.sh --help lists them"
+    after = ", an option of the scripts, at the end after --" if near[0] in known else ""
+    return f"unknown option {name}; did you mean {near[0]}{after}?"
+
+
+def script_options():
+    """Return the scripts' options, from their text: importing them takes seconds."""
+    options = set()
+    for path in PROJECT.glob("*_continuous_noisy.py"):
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ClassDef) and node.name == "Args":
+                fields = [field for field in node.body if isinstance(field, ast.AnnAssign)]
+                options.update(f"--{field.target.id.replace('_', '-')}" for field in fields)
+    return options
+
+
+def from_project(caller, text):
+    """Return a path that counts from the caller's folder as one that counts from the project's.
+
+    It is relative where it lies in the project, so that it means the same on other machines.
+    """
+    path = os.path.normpath(os.path.join(caller, text))
+    if Path(path).is_relative_to(os.getcwd()):
+        path = os.path.relpath(path)
+    if not re.fullmatch(r"[^-\t\n][^\t\n]*", path):
+        fail("--runs-dir must be a path without tabs and newlines that begins with no dash")
+    return path
+
+
+def whole_number(text):
+    """Read "1000000" or "1e6"."""
+    try:
+        value = float(text)
+        if value != int(value):
+            raise ValueError
+    except (ValueError, OverflowError):
+        reason = f"{text!r} is not a whole number, such as 1000000 or 1e6"
+        raise argparse.ArgumentTypeError(reason) from None
+    return int(value)
 
 
 def seeds(text):
     """Read a seed, "3", or a range of seeds, "1-5"."""
     match = re.fullmatch(r"(\d+)(?:-(\d+))?", text)
-    values = match and range(int(match[1]), int(match[2] or match[1]) + 1)
+    values = range(0)
+    if match:
+        first, last = match.groups(default=match[1])
+        values = range(int(first), int(last) + 1)
     if not values:
-        raise argparse.ArgumentTypeError(f"{text!r} is no seed, as 3, and no range, as 1-5")
+        fail(f"--seeds takes numbers and ranges, separated by spaces: 1 2 3 or 1-3, not {text!r}")
     return values
 
 
+def rate(text):
+    """Read a noise rate: a number, or "start:end" for one that changes during training."""
+    if ":" in text:
+        return text  # canonical_noises reads it
+    try:
+        return float(text)
+    except ValueError:
+        reason = f"{text!r} is no rate: give a number from 0 to 1, or two as in 1.0:0.0"
+        raise argparse.ArgumentTypeError(reason) from None
+
+
+def entry(text):
+    """Read an entry of --noises, "A(..)", "A(..)+B(..)" or "A(..)@0.1+B(..)@0.2".
+
+    Returns a list of (noise, rate); the rate is None where --noise-rates will give it.
+    """
+    pairs = []
+    for part in re.split(r"\s*\+\s*(?=[A-Za-z_])", text.strip()):
+        noise, at, own = part.partition("@")
+        pairs.append((noise, rate(own) if at else None))
+    if len({own is None for _, own in pairs}) > 1:
+        reason = f"{text!r}: give each of these noises a rate with @, or none of them"
+        raise argparse.ArgumentTypeError(reason)
+    return pairs
+
+
 def check(args):
-    """Exit with one line about the first argument that no run could be started with."""
-    if unknown := [algorithm for algorithm in args.algos if algorithm not in SEEDS]:
-        fail(f"unknown algorithm {unknown[0]!r}; choose from {', '.join(SEEDS)}")
+    """Exit with one line about the first argument that no run could be started with.
+
+    Environments get their full names on the way.
+    """
+    for algorithm in args.algos:
+        if algorithm not in SEEDS:
+            fail(f"unknown algorithm {algorithm!r}; choose from {', '.join(SEEDS)}")
     if args.total_timesteps <= 0:
         fail(f"--total-timesteps must be greater than 0, not {args.total_timesteps}")
-    for env_id in (e for e in args.envs if ":" not in e):  # "module:id" registers on import
-        try:
-            gymnasium.spec(env_id)
-        except gymnasium.error.Error as error:
-            fail(f"--envs {env_id}: {error}")
-    if args.preset == "custom" and bool(args.noises) != bool(args.noise_rates):
-        fail("custom needs --noises and --noise-rates, or neither of them for the baselines only")
+    try:
+        args.envs = list(dict.fromkeys(map(canonical_env_id, args.envs)))
+    except ValueError as error:
+        fail(f"--envs: {error}")
+    for name in ("--exclude", "--budget", "--confirm"):
+        if name in args.given and args.preset != "choose":
+            fail(f"{name} belongs to choose")
+    if args.combine and args.preset != "custom":
+        fail("--combine belongs to custom")
+    if args.preset == "choose":
+        if not {"--algos", "--envs"} <= args.given:
+            fail("choose needs --algos and --envs: the noise is chosen for each of them")
+        if "--seeds" in args.given:
+            fail("choose takes the seeds that it needs: leave out --seeds; see --budget, --confirm")
     if {"-h", "--help"} & set(args.extra):
         fail("--help after the -- would start nothing: ask the script itself")
-    for word in (word for word in args.extra if word.startswith("--")):
+    for word in args.extra:
+        if not word.startswith("--"):
+            continue
         name = word.partition("=")[0].removeprefix("--").replace("_", "-")
         if name in OURS:
             fail(f"--{name} is part of the grid: it has an option of its own, before the --")
         if name == "overwrite":
             fail("--overwrite would start interrupted runs afresh: delete their folders instead")
-    if not re.fullmatch(r"[^-\t\n][^\t\n]*", args.runs_dir):
-        fail("--runs-dir must be a path without tabs and newlines that begins with no dash")
+
+
+# ----------------------------------------------------------------------------------------- the runs
 
 
 def preset_pairs(preset, algorithm, env_id):
     """Return a preset's (noise, rate) pairs for one algorithm and environment."""
     if preset == "demo":
-        return [("RandomNormalNoisyReward(1.0)", 1.0)]  # the paper's best for PPO on Hopper
-    if preset == "paper":
+        return [("RandomEarlyTermination(50)", 1.0)]  # the paper's best for PPO on Pusher
+    if preset in ("paper", "choose"):
         return list(itertools.product(NOISES, RATES))
     if preset == "ablation":
         return ABLATION
@@ -172,193 +255,151 @@ def preset_pairs(preset, algorithm, env_id):
 @functools.cache
 def best_pairs():
     """Return the paper's best noise and rate for each algorithm and environment."""
-    with open(Path(__file__).parent / "results" / "paper" / "best.csv", newline="") as file:
-        return {
-            (row["algorithm"].lower(), row["environment"].rpartition("-v")[0]): (
-                row["noise_as_run"],
-                float(row["noise_rate"]),
-            )
-            for row in csv.DictReader(file)
-        }
+    pairs = {}
+    with open(PROJECT / "results" / "paper" / "best.csv", newline="") as file:
+        for row in csv.DictReader(file):
+            cell = row["algorithm"].lower(), row["environment"].rpartition("-v")[0]
+            pairs[cell] = row["noise_as_run"], float(row["noise_rate"])
+    return pairs
 
 
 @functools.cache
-def canonical(noise, rate):
-    """Return the canonical noises and rates of one cell, whose noises may be joined by "+"."""
+def canonical(noises, rates):
+    """Return noises and rates in canonical notation, with a rate for each noise."""
     try:
-        return canonical_noises(re.split(r"(?<=\))\s*\+\s*", noise), [rate])
+        return canonical_noises(noises, rates)
     except ValueError as error:
         fail(error)
 
 
 def cells(args, algorithm, env_id):
-    """Yield the noises and rates to run, the baseline first."""
-    yield [], []
+    """Return the noises and the rates of every noisy cell of the grid, in the order given."""
     pairs = preset_pairs(args.preset, algorithm, env_id)
+    entries, rates = [[pair] for pair in pairs], []
     if args.noises or args.noise_rates:
-        noises = args.noises or dict.fromkeys(noise for noise, _ in pairs)
-        rates = args.noise_rates or dict.fromkeys(rate for _, rate in pairs)
-        pairs = itertools.product(noises, rates)
-    for noise, rate in pairs:
-        yield canonical(noise, rate)
+        names = dict.fromkeys(noise for noise, _ in pairs)
+        entries = args.noises or [[(noise, None)] for noise in names]
+        rates = args.noise_rates or list(dict.fromkeys(own for _, own in pairs))
+    if args.combine:
+        entries = entries + [a + b for a, b in itertools.combinations(entries, 2)]
+    crossed = [pairs for pairs in entries if any(rate is None for _, rate in pairs)]
+    if crossed and not rates:
+        fail('--noises needs --noise-rates, or a rate with each noise, as in "NOISE@0.1"')
+    if args.noise_rates and not crossed:
+        fail("--noise-rates needs --noises that have no rate of their own")
+    found = []
+    for pairs in entries:
+        for common in rates if pairs in crossed else [None]:
+            found.append(cell(pairs, common))
+    return found
+
+
+def cell(pairs, common=None):
+    """Return canonical noises and rates; `common` is the rate of those without one of their own."""
+    noises = tuple(noise for noise, _ in pairs)
+    rates = tuple(common if rate is None else rate for _, rate in pairs)
+    return canonical(noises, rates)
+
+
+def make_run(args, algorithm, env_id, noises, rates, seed):
+    """Return one run of the grid."""
+    script = f"{algorithm}_continuous_noisy"
+    arguments = ["--env-id", env_id, "--seed", str(seed)]
+    if noises:
+        arguments += ["--noise", *noises, "--noise-rate", *map(str, rates)]
+    arguments += ["--total-timesteps", str(args.total_timesteps)]
+    arguments += ["--runs-dir", args.runs_dir, *args.extra]
+    folder = Path(args.runs_dir, run_name(env_id, script, noises, rates, seed))
+    return Run(folder, (algorithm, env_id), args.total_timesteps, f"{script}.py", arguments)
 
 
 def grid(args):
     """Return the runs, each once, the first seed of everything first."""
-    python, runs = os.environ.get("PYTHON", "python"), {}
-    of = {a: sorted(set(itertools.chain(*(args.seeds or [SEEDS[a]])))) for a in args.algos}
-    for seed in sorted(set().union(*of.values())):
-        algorithms = [algorithm for algorithm in of if seed in of[algorithm]]
-        for algorithm, env_id in itertools.product(algorithms, dict.fromkeys(args.envs)):
-            script = f"{algorithm}_continuous_noisy"
-            for noises, rates in cells(args, algorithm, env_id):
-                name = run_name(env_id, script, noises, rates, seed)
-                if name in runs:
-                    continue
-                noise = ["--noise", *noises, "--noise-rate", *map(str, rates)] if noises else []
-                command = [python, f"{script}.py", "--env-id", env_id, "--seed", str(seed), *noise]
-                command += ["--total-timesteps", str(args.total_timesteps)]
-                command += ["--runs-dir", args.runs_dir, *args.extra]
-                folder = Path(args.runs_dir) / name
-                runs[name] = Run(folder, (algorithm, env_id), args.total_timesteps, command)
-    return list(runs.values()) or fail("the grid is empty")
+    seeds_of = {}
+    for algorithm in args.algos:
+        seeds_of[algorithm] = set(itertools.chain(*(args.seeds or [SEEDS[algorithm]])))
+    runs = {}
+    for seed in sorted(set().union(*seeds_of.values())):
+        for algorithm, env_id in itertools.product(seeds_of, args.envs):
+            if seed not in seeds_of[algorithm]:
+                continue
+            for noises, rates in [([], []), *cells(args, algorithm, env_id)]:
+                run = make_run(args, algorithm, env_id, noises, rates, seed)
+                runs.setdefault(run.folder, run)
+    return list(runs.values())
+
+
+def runs_in(folder):
+    """Return the runs that a folder or its logs tell of, for a status that names no grid."""
+    folder = Path(folder)
+    names = {path.parent.name for path in folder.glob("*/config.json")}
+    names |= {path.stem for path in folder.glob("logs/*__*.log")}
+    if not names:
+        fail(f"no runs in {folder}; name their folder with --runs-dir")
+    runs = []
+    for name in sorted(names):
+        path = folder / name / "config.json"
+        steps = 0  # unknown: it has failed before it began
+        if path.exists():
+            try:
+                steps = json.loads(path.read_text())["args"]["total_timesteps"]
+            except (OSError, ValueError, KeyError, TypeError) as error:
+                fail(f"cannot read {path} ({type(error).__name__}: {error}); delete its folder")
+        env_id, script = name.split("__")[:2]
+        runs.append(Run(folder / name, (script, env_id), steps, "", []))
+    return runs
+
+
+def result(run):
+    """Return whether a run is finished, and what is wrong with its result.json, or "".
+
+    Exits if the folder holds a finished run of another length.
+    """
+    path = run.folder / "result.json"
+    if not path.exists():
+        return False, ""
+    try:
+        steps = json.loads(path.read_text())["total_timesteps"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        reason = f"{path} cannot be read ({type(error).__name__}: {error})"
+        return False, f"{reason}; delete the run's folder to run it again"
+    if steps != run.total_timesteps:
+        fail(f"{run.folder} holds a finished run of {steps} steps; choose another --runs-dir")
+    return True, ""
+
+
+def command_line(run):
+    """Return a run's command, complete: it can be pasted into a shell in the project's folder."""
+    words = [os.environ.get("PYTHON", "python"), run.script, *run.arguments]
+    if ":" in run.kind[1] and "PYTHONPATH" in os.environ:  # where the environment's module lies
+        words = ["env", f"PYTHONPATH={os.environ['PYTHONPATH']}", *words]
+    return shlex.join(words)
 
 
 def check_extra(runs):
     """Let each script read one command: a typing error is not worth 9,100 failed runs."""
-    read = "import tyro; from {} import Args; tyro.cli(Args)"
-    for command in {run.command[1]: run.command for run in runs}.values():
-        python, script, *args = command
-        code = read.format(script.removesuffix(".py"))
-        if subprocess.run([python, "-c", code, *args], stdout=subprocess.DEVNULL).returncode:
-            fail(f"{script} does not accept the arguments after --, or cannot be imported")
+    read = "import sys, tyro; from {} import Args; sys.argv[0] = '{}'; tyro.cli(Args)"
+    for run in {run.script: run for run in runs}.values():
+        code = read.format(run.script.removesuffix(".py"), run.script)
+        command = [os.environ.get("PYTHON", "python"), "-c", code, *run.arguments]
+        answer = subprocess.run(command, capture_output=True, text=True)
+        if answer.returncode:
+            fail(f"{run.script}: {script_error(answer.stderr)}")
 
 
-def is_done(run):
-    """Tell whether a run is finished; exit if its folder holds a run of another length."""
-    path = run.folder / "result.json"
-    if not path.exists():
-        return False
-    try:
-        steps = json.loads(path.read_text())["total_timesteps"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        fail(f"cannot read {path} ({type(error).__name__}: {error}); delete the run's folder")
-    if steps != run.total_timesteps:
-        fail(f"{run.folder} holds a finished run of {steps} steps; choose another --runs-dir")
-    return True
-
-
-def look(run, now, fresh):
-    """Return a run's progress, from its folder and a log that is `fresh` for so many seconds."""
-    log, age, lines = run.folder.parent / "logs" / f"{run.folder.name}.log", float("inf"), []
-    done = is_done(run)
-    if log.exists():
-        with open(log, "rb") as file:
-            stat = os.fstat(file.fileno())
-            age = now - stat.st_mtime
-            file.seek(max(0, stat.st_size - 8192))
-            lines = file.read().decode(errors="replace").splitlines()
-    end = END.fullmatch(lines[-1]) if lines else None
-    found = [match for match in map(PROGRESS.match, lines) if match]
-    step, sps = map(int, found[-1].groups()) if found else (0, 0)
-    told = [line for line in lines if not line.startswith("# ") and re.search(r"\w", line)]
-    if done:
-        state, reason = "done", ""
-    elif end:
-        status = int(end[1])
-        state, reason = ("to do", "stopped") if status in STOPPED else ("failed", f"exit {status}")
-        reason = f"signal {status - 128}" if state == "failed" and status > 128 else reason
-    else:
-        state, reason = ("running", "") if age < fresh else ("to do", "lost" if lines else "")
-    return Progress(state, step, sps, reason, told[-1].strip() if told else "", log)
-
-
-def remaining(run, progress):
-    """Return the environment steps that a run has left."""
-    return 0 if progress.state == "done" else max(0, run.total_timesteps - progress.step)
-
-
-def summary(runs, progresses):
-    """Return one line: how many runs are in which state, how fast it goes, how long it takes."""
-    count = {state: 0 for state in ("done", "running", "failed", "to do")}
-    speeds = {}
-    for run, progress in zip(runs, progresses, strict=True):
-        count[progress.state] += 1
-        if progress.sps:  # from the most particular to the most general
-            for key in (run.kind, run.kind[0], None):
-                speeds.setdefault(key, []).append(progress.sps)
-    speed = {key: len(values) / sum(1 / v for v in values) for key, values in speeds.items()}
-    text = f"{len(runs)} runs: " + ", ".join(f"{n} {state}" for state, n in count.items())
-    if count["running"] and speed:
-        seconds = sum(
-            remaining(run, p) / (speed.get(run.kind) or speed.get(run.kind[0]) or speed[None])
-            for run, p in zip(runs, progresses, strict=True)
-        )
-        now = sum(p.sps for p in progresses if p.state == "running")
-        left = timedelta(seconds=round(seconds / count["running"]))
-        text += f"; {now:,.0f} steps/s now, about {left} left"
-    return text
-
-
-def table(rows):
-    """Print rows as columns."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        print("  " + "  ".join(map(str.ljust, row, widths)).rstrip())
-
-
-def main(argv):
-    """Print one view of the grid; returns the exit status."""
-    args = parse_args(argv)
-    check(args)
-    runs = grid(args)
-    if args.view == "list":
-        done = [is_done(run) for run in runs]
-        if args.extra and not all(done):
-            check_extra(runs)
-        for run, over in zip(runs, done, strict=True):
-            folder = f"{run.folder.parent}/{run.folder.name}"  # with a slash, for --runs-dir . too
-            print(folder, "done" if over else "todo", shlex.join(run.command), sep="\t")
-        return 0
-    parent = os.getppid()
-    while args.view == "watch":
-        width, now = shutil.get_terminal_size().columns - 1, time.time()
-        line = summary(runs, [look(run, now, fresh=120) for run in runs])
-        print(f"\r{line[:width].ljust(width)}", end="", file=sys.stderr, flush=True)
-        time.sleep(10)
-        if os.getppid() != parent:  # benchmark.sh was killed
-            return 0
-
-    fresh = 120 if args.view == "status" else 0  # nothing runs any more, however fresh its log is
-    progresses = [look(run, time.time(), fresh) for run in runs]
-    print(f"{args.runs_dir}: {summary(runs, progresses)}")
-    over = args.view == "report"
-    named = [p for p in progresses if p.state == "failed" or (over and p.reason)]
-    if named:
-        print("not finished:" if over else "failed:")
-        table([(p.reason, str(p.log), p.last_line) for p in named])
-    left = [
-        (remaining(run, p) / p.sps, run, p)
-        for run, p in zip(runs, progresses, strict=True)
-        if p.state == "running" and p.sps
-    ]
-    if left:
-        print("slowest of those running (time left, steps per second, step):")
-        left = sorted(left, key=lambda item: item[0], reverse=True)[:5]
-        table(
-            [
-                (str(timedelta(seconds=round(seconds))), f"{p.sps}/s", f"{p.step}", str(run.folder))
-                for seconds, run, p in left
-            ]
-        )
-    return int(over and any(p.state != "done" for p in progresses))
+def script_error(text):
+    """Return what a script says about a bad argument: tyro draws a box around it."""
+    told = []
+    for line in text.splitlines():
+        line = line.strip("\u2502 ")
+        if line.startswith("\u2500"):  # below this rule stands where to find help
+            break
+        if not line.startswith("\u256d"):
+            told.append(line)
+    return " ".join(told) or "cannot be started"
 
 
 def fail(message):
-    """Exit with one line."""
-    print(f"error: {' '.join(str(message).split())}", file=sys.stderr)
+    """Exit and say what to do."""
+    print(f"error: {message}", file=sys.stderr)
     sys.exit(2)
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

@@ -1,4 +1,4 @@
-"""benchmark.sh with real runs on its real engines: xargs, GNU parallel, ssh and Slurm.
+"""benchmark.sh with real runs on its real engines: this machine, GNU parallel, ssh and Slurm.
 
 The engine tests need the Debian packages parallel, openssh-server, rsync, slurm-wlm and munge. They
 start an sshd and a one-node cluster of their own and stop them again. Without the packages they
@@ -10,6 +10,7 @@ import csv
 import json
 import os
 import pty
+import random
 import re
 import select
 import shlex
@@ -25,7 +26,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import stub_run
 import tyro
+
+import choose_runs
+from grid import check, parse_args
 
 ROOT = Path(__file__).parent.parent
 PATH = f"{os.environ['PATH']}:/usr/sbin:/sbin"
@@ -45,11 +50,13 @@ CHEAP = ["--", *CHEAP.split(), "--eval-frequency", "1000", "--checkpoint-frequen
 ON_SIGNAL = [*CHEAP[:-1], "1000000000"]  # a checkpoint only when the run is told to stop
 SWEEPS = []  # the sweeps of the current test
 PATIENCE = 240  # seconds until a test gives up waiting: a busy machine is no failure
-FOREVER = ["--total-timesteps", "1000000000"]
+FOREVER = ["--total-timesteps", "1e9"]
+A = "RandomNormalNoisyReward(1)"
+C = "choose --algos ppo --envs Hopper-v5"
 
 
-def start(*args, env=ENV, cwd=ROOT, prefix=(), **streams):
-    command = [*prefix, "./benchmark.sh", *map(str, args)]
+def start(*args, env=ENV, cwd=ROOT, script="./benchmark.sh", prefix=(), **streams):
+    command = [*prefix, script, *map(str, args)]
     streams = streams or {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     # This test may ignore SIGINT, if a shell has started it in the background, and SIGHUP, if nohup
     # has. What it starts would inherit that, and bash cannot trap what it ignored from the start.
@@ -90,13 +97,13 @@ def dry_run(*args):
     for option in ("--seed", "--total-timesteps"):
         parser.add_argument(option, required=True, type=int)
     parser.add_argument("--noise", nargs="+", default=[])
-    parser.add_argument("--noise-rate", nargs="+", default=[], type=float)
+    parser.add_argument("--noise-rate", nargs="+", default=[])
     return [parser.parse_args(shlex.split(line), argparse.Namespace(text=line)) for line in lines]
 
 
 def folders(*args):
-    """Return the run folders of a grid, by grid.py, which benchmark.sh asks too."""
-    command = [sys.executable, "grid.py", "list", *map(str, args)]
+    """Return the run folders of a grid, by sweep.py, which benchmark.sh asks too."""
+    command = [sys.executable, "sweep.py", "list", str(ROOT), *map(str, args)]
     out = subprocess.run(command, env=ENV, cwd=ROOT, check=True, capture_output=True, text=True)
     return [Path(line.split("\t")[0]) for line in out.stdout.splitlines()]
 
@@ -246,6 +253,20 @@ def output(command, env):
 
 
 @pytest.fixture
+def stub(tmp_path_factory):
+    """An environment in which a stub stands for the training scripts."""
+    python = tmp_path_factory.mktemp("stub") / "python"
+    python.write_text(
+        f"""#!/bin/sh
+case $1 in *_continuous_noisy.py) exec {sys.executable} {ROOT}/tests/stub_run.py "$@" ;; esac
+exec {sys.executable} "$@"
+"""
+    )
+    python.chmod(0o755)
+    return ENV | {"PYTHON": str(python)}
+
+
+@pytest.fixture
 def engine(request):
     """The options and the environment of one executor that runs two runs at a time."""
     if request.param == "slurm":
@@ -339,13 +360,18 @@ def check_stopped(runs, shown):
         assert attempts(folder)[0][-1].endswith("exit=143")
 
 
+def copy_project(folder):
+    """Copy what a sweep of SAC needs."""
+    folder.mkdir()
+    for file in ("benchmark.sh", "sweep.py", "grid.py", "noisy_wrappers.py"):
+        shutil.copy2(ROOT / file, folder)
+    shutil.copy2(ROOT / "sac_continuous_noisy.py", folder)
+    return folder
+
+
 def test_machines_without_a_shared_folder(sshd, tmp_path):
     """The run folders travel: an interrupted run can go on elsewhere."""
-    here, there = tmp_path / "here", tmp_path / "there"
-    for folder in (here, there):
-        folder.mkdir()
-        for file in ("benchmark.sh", "grid.py", "noisy_wrappers.py", "sac_continuous_noisy.py"):
-            shutil.copy2(ROOT / file, folder)
+    here, there = copy_project(tmp_path / "here"), copy_project(tmp_path / "there")
     grid = ["baseline", *GRID[1:7], "--total-timesteps", "200000"]
     machine = ["--executor", "parallel", "--sshlogin", "second", "--remote-dir", there]
     folder = here / folders(*grid)[0]
@@ -378,11 +404,12 @@ def test_a_lost_connection(sshd, tmp_path):
     assert (folder / "checkpoint.pt").exists()
 
 
-def test_an_unreachable_machine(sshd, tmp_path):
+def test_a_machine_without_the_project(sshd, tmp_path):
+    here = copy_project(tmp_path / "here")
     machine = ["--executor", "parallel", "--sshlogin", "second", "--remote-dir", tmp_path]
-    result = run(*GRID, "--runs-dir", tmp_path, *machine, *CHEAP, env=sshd)
+    result = run(*GRID, *machine, *CHEAP, env=sshd, cwd=here)
     assert result.code == 2 and "error: a machine of --sshlogin" in result.err
-    assert not list(tmp_path.glob("*/*.log"))
+    assert not list(here.glob("runs/*/*.log"))
 
 
 def test_slurm_requeues_before_the_time_limit(slurm, tmp_path):
@@ -421,7 +448,7 @@ def test_paper_grid():
     noisy = [line for line in lines if line.noise]
     assert len(noisy) == 9000
     assert Counter(*zip(*(x.noise for x in noisy), strict=True)) == dict.fromkeys(noises, 600)
-    rates = [0.01, 0.05, 0.1, 0.2, 0.5, 1.0]
+    rates = ["0.01", "0.05", "0.1", "0.2", "0.5", "1.0"]
     assert Counter(*zip(*(x.noise_rate for x in noisy), strict=True)) == dict.fromkeys(rates, 1500)
     for algorithm, seeds in ALGORITHMS.items():
         of = Counter(line.seed for line in lines if line.script.startswith(algorithm))
@@ -451,7 +478,7 @@ def test_scripts_accept_every_line(algorithm):
         args = tyro.cli(script.Args, args=shlex.split(line.text)[2:])
         assert list(args.noise) == line.noise
         assert [args.env_id, args.seed] == [line.env_id, 1]
-        assert list(args.noise_rate) == line.noise_rate
+        assert list(map(str, args.noise_rate)) == line.noise_rate
 
 
 def test_other_presets():
@@ -459,7 +486,7 @@ def test_other_presets():
     with open(ROOT / "results" / "paper" / "best.csv") as file:
         for row in csv.DictReader(file):
             cell = (row["algorithm"].lower(), row["environment"].replace("-v2", "-v5"))
-            best -= {cell, (*cell, row["noise_as_run"], float(row["noise_rate"]))}
+            best -= {cell, (*cell, row["noise_as_run"], str(float(row["noise_rate"])))}
     assert not best
     assert len(dry_run("best")) == 2 * len(dry_run("baseline")) == 200
     ablation = dry_run("ablation")
@@ -469,10 +496,15 @@ def test_other_presets():
             name, low, high = re.fullmatch(r"(\w+)\((.+), (.+)\)", *line.noise).groups()
             scale = name == "RandomUniformScaleReward"
             assert float(low) == pytest.approx(2 - float(high) if scale else -float(high))
-            assert line.noise_rate == ([0.05] if scale else [1.0])
+            assert line.noise_rate == (["0.05"] if scale else ["1.0"])
     assert {(x.script[:3], x.env_id, x.runs_dir) for x in dry_run("demo")} == {
-        ("ppo", "Hopper-v5", "runs/demo")
+        ("ppo", "Pusher-v5", "runs/demo")
     }
+    assert [(x.seed, x.noise, x.total_timesteps) for x in dry_run("demo")] == [
+        (seed, noise, 100_000)
+        for seed in range(1, 6)
+        for noise in ([], ["RandomEarlyTermination(50)"])
+    ]
 
 
 def test_spellings_and_rate_zero_are_one_run():
@@ -484,12 +516,147 @@ def test_spellings_and_rate_zero_are_one_run():
     ]
 
 
+def test_rates_of_ones_own_and_pairs():
+    cells = ["--noises", f"{A}@0.1+RandomEarlyTermination(50)@1:0", "RandomDropoutObservation(0.9)"]
+    lines = dry_run("custom", *GRID[1:7], *cells, "--noise-rates", "0.5", "1.0:0", "--combine")
+    early, reward, drop = (
+        "RandomEarlyTermination(50)",
+        "RandomNormalNoisyReward(1.0)",
+        "RandomDropoutObservation(0.9)",
+    )
+    assert [list(zip(line.noise, line.noise_rate, strict=True)) for line in lines] == [
+        [],
+        [(early, "1.0:0.0"), (reward, "0.1")],
+        [(drop, "0.5")],
+        [(drop, "1.0:0.0")],
+        [(early, "1.0:0.0"), (reward, "0.1"), (drop, "0.5")],
+        [(early, "1.0:0.0"), (reward, "0.1"), (drop, "1.0:0.0")],
+    ]
+    three = ["--noises", A, "RandomEarlyTermination(50)", "RandomDropoutObservation(0.9)"]
+    lines = dry_run("custom", *GRID[1:7], *three, "--noise-rates", "0.5", "--combine")
+    assert [len(line.noise) for line in lines] == [0, 1, 1, 1, 2, 2, 2]
+    assert {rate for line in lines for rate in line.noise_rate} == {"0.5"}
+    assert {x.total_timesteps for x in dry_run("demo", "--total-timesteps", "2.5e3")} == {2500}
+
+
+def test_an_environment_and_runs_in_the_callers_folder(tmp_path):
+    (tmp_path / "my_envs.py").write_text(
+        "import gymnasium\n"
+        "gymnasium.register('Mine-v0', 'gymnasium.envs.classic_control:PendulumEnv', "
+        "max_episode_steps=100)\n"
+    )
+    grid = ["baseline", "--algos", "sac", "--envs", "my_envs:Mine", "--seeds", "1"]
+    grid += ["--total-timesteps", "400", "--runs-dir", "mine", *CHEAP]
+    shown = run(*grid, "--dry-run", cwd=tmp_path, script=ROOT / "benchmark.sh")
+    assert shown.code == 2 and "--dry-run" in shown.err  # it stood after the --
+    grid.insert(1, "--dry-run")
+    shown = run(*grid, cwd=tmp_path, script=ROOT / "benchmark.sh")
+    line = shown.out.strip()
+    assert "--env-id my_envs:Mine-v0" in line and f"--runs-dir {tmp_path}/mine" in line
+    del grid[1]
+    swept = run(*grid, cwd=tmp_path, script=ROOT / "benchmark.sh")
+    assert swept.code == 0, swept.out + swept.err
+    [folder] = (tmp_path / "mine").glob("*/result.json")
+    shutil.rmtree(tmp_path / "mine")
+    subprocess.run(line, shell=True, check=True, cwd=ROOT)  # pasted into a shell
+    assert folder.exists()
+    # In the project, the path stays relative.
+    inside = run("demo", "--dry-run", cwd=ROOT / "docs", script=ROOT / "benchmark.sh")
+    assert inside.out.splitlines()[0].endswith("--runs-dir docs/runs/demo")
+
+
 def test_a_line_runs_when_pasted_into_a_shell(tmp_path):
     grid = ["best", "--algos", "ppo", "--envs", "Hopper-v5", "--seeds", "1"]
     small = ["--total-timesteps", "2048", "--runs-dir", tmp_path / "my runs"]
     result = run(*grid, *small, "--dry-run", "--", "--no-compile", "--eval-episodes", "1")
     subprocess.run(result.out.splitlines()[1], shell=True, check=True, cwd=ROOT)
     assert (folders(*grid, *small)[1] / "result.json").exists()
+
+
+# CHOOSE
+
+CHOOSE = ["choose", "--algos", "ppo", "--envs", "Pendulum-v1", "--noise-rates", "1", "--confirm"]
+CHOOSE += ["4", "--budget", "6", "--total-timesteps", "1000", "--noises", A]
+CHOOSE += ["RandomDropoutObservation(0.9)", "RandomMixupObservation(0.5)"]
+
+
+def chosen(folder):
+    """Return what a choice leaves behind: its lines, and the names of its runs."""
+    names = {path.parent.name for path in folder.glob("*/config.json")}
+    return (folder / "choice.csv").read_bytes(), names
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    """The choice that the sweeps below should make, from run folders made in this process."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    args = parse_args("list", "/", [*CHOOSE, "--runs-dir", str(folder)])
+    check(args)
+    while due := [c.runs[run] for c in choose_runs.choices(args) for run in c.state.due]:
+        for one in due:
+            stub_run.train([one.script, *one.arguments])
+    [sentence] = choose_runs.conclusion(choose_runs.choices(args), folder)
+    return *chosen(folder), sentence
+
+
+@pytest.mark.parametrize("engine", ["local", "parallel", "slurm"], indirect=True)
+def test_choose_survives_being_killed(engine, tmp_path, stub, undisturbed):
+    executor, env = engine
+    command = [*CHOOSE, "--runs-dir", tmp_path, *executor]
+    env = env | {"PYTHON": stub["PYTHON"], "STUB_SECONDS": "0.2"}
+    dice = random.Random(1)
+
+    def begun():
+        return len(list(tmp_path.glob("*/config.json")))
+
+    for number in (signal.SIGINT, signal.SIGKILL, signal.SIGINT):
+        wanted = begun() + dice.randint(1, 4)
+        sweep = start(*command, env=env)
+        wait_for(lambda wanted=wanted: begun() >= wanted, what="runs")
+        sweep.send_signal(number)
+        sweep.communicate(timeout=PATIENCE)
+        assert sweep.returncode == (130 if number == signal.SIGINT else -signal.SIGKILL)
+    last = run(*command, env=env)
+    assert last.code == 0, last.out + last.err
+    assert (*chosen(tmp_path), last.out.splitlines()[-1]) == undisturbed
+    logs = {path.name: path.read_text() for path in tmp_path.glob("logs/*__*.log")}
+    again = run(*command, env=env)
+    assert again.code == 0 and again.out == last.out and not again.err
+    assert logs == {path.name: path.read_text() for path in tmp_path.glob("logs/*__*.log")}
+
+
+def test_a_failing_run_stops_its_choice_and_no_other(tmp_path, stub):
+    command = [*CHOOSE, "--algos", "ppo", "sac", "--confirm", "5", "--runs-dir", tmp_path]
+    result = run(*command, env=stub | {"STUB_FAILS": "*ppo*Dropout*"})
+    assert result.code == 1 and "exit 1" in result.out and "error: this one fails" in result.out
+    assert "PPO on Pendulum-v1, round 1 of 2: 3 of 3 noises, seed 1; 1 runs to do" in result.out
+    assert '--exclude "RandomDropoutObservation(0.9)@1.0"' in result.out
+    assert result.out.splitlines()[-1] == "SAC on Pendulum-v1: all runs are done"
+    assert not (tmp_path / "choice.csv").exists()
+    status = run("status", *command)
+    assert status.code == 0 and "1 failed" in status.out
+    without = run(*command, "--exclude", "RandomDropoutObservation(0.90)@1", env=stub)
+    assert without.code == 0, without.out + without.err
+    ppo, sac = without.out.splitlines()[-2:]
+    assert ppo.startswith("PPO on Pendulum-v1: ") and sac.startswith("SAC on Pendulum-v1: ")
+    assert "Dropout" not in (tmp_path / "choice.csv").read_text()
+
+
+def test_a_dry_run_of_choose_prints_the_batch_that_is_due(tmp_path, stub):
+    command = [*CHOOSE, "--runs-dir", tmp_path]
+    first = run(*command, "--dry-run")
+    assert (
+        first.out.count("\n") == 3 and "13 runs in all, 5 to search and 8 to confirm" in first.err
+    )
+    # 13 runs of 1000 steps at 5,700 steps per second, and 10 seconds to start: 132 s
+    assert "0 are done, about 0.037 core-hours are left" in first.err
+    for line in first.out.splitlines():
+        subprocess.run(line.replace(sys.executable, stub["PYTHON"]), shell=True, check=True)
+    second = run(*command, "--dry-run")
+    assert [" --seed 2 " in line for line in second.out.splitlines()] == [True, True]
+    assert "round 2 of 2: 2 of 3 noises, seeds 1 to 2; 2 runs to do" in second.err
+    # The three finished runs say that they have taken 36 seconds each; ten are left.
+    assert "3 are done, about 0.1 core-hours are left" in second.err
 
 
 # REPORTS AND ERRORS
@@ -526,6 +693,23 @@ def test_status_arithmetic(tmp_path):
     ]
 
 
+def test_status_without_a_grid_reads_the_folder(tmp_path, stub):
+    grid = ["baseline", *GRID[1:5], "--seeds", "1-2", "--total-timesteps", "1000"]
+    assert run(*grid, "--runs-dir", tmp_path, env=stub).code == 0
+    (tmp_path / "Hopper-v5__ppo__baseline__1").mkdir()
+    config = '{"args": {"total_timesteps": 500}}'
+    (tmp_path / "Hopper-v5__ppo__baseline__1" / "config.json").write_text(config)
+    log = "# now host: python x.py\nerror: bad\n# now host: exit=2\n"
+    (tmp_path / "logs" / "Hopper-v5__ppo__baseline__2.log").write_text(log)  # it has no folder
+    for words in (["status"], ["status", "custom"]):
+        result = run(*words, "--runs-dir", tmp_path)
+        assert result.code == 0, result.err
+        assert "4 runs: 2 done, 0 running, 1 failed, 1 to do" in result.out
+        assert re.search(r"exit 2 .*baseline__2.log +error: bad\n", result.out)
+    empty = run("status", "--runs-dir", tmp_path / "none")
+    assert empty.code == 2 and f"error: no runs in {tmp_path}/none" in empty.err
+
+
 def test_a_finished_run_of_another_length_is_not_taken_for_done(tmp_path):
     grid = ["baseline", "--algos", "ppo", "--envs", "Hopper-v5", "--seeds", "1"]
     grid += ["--total-timesteps", "1000", "--runs-dir", tmp_path]
@@ -534,12 +718,26 @@ def test_a_finished_run_of_another_length_is_not_taken_for_done(tmp_path):
     (folder / "result.json").write_text('{"total_timesteps": 20}')
     result = run(*grid)
     assert result.code == 2 and "holds a finished run of 20 steps" in result.err
-    for damaged in ("", "{}", "[]"):
-        (folder / "result.json").write_text(damaged)
-        result = run("status", *grid)
-        assert result.code == 2 and f"cannot read {folder}/result.json" in result.err
-        assert result.err.count("\n") == 1
     assert not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize("damaged", ["", "{}", "[]"])
+def test_a_damaged_result_fails_its_run_and_stops_no_other(damaged, tmp_path, stub):
+    grid = ["baseline", "--algos", "ppo", "--envs", "Hopper-v5", "--seeds", "1-2"]
+    grid += ["--total-timesteps", "1000", "--runs-dir", tmp_path]
+    bad, good = folders(*grid)
+    bad.mkdir()
+    (bad / "result.json").write_text(damaged)
+    advice = f"{bad}/result.json cannot be read ("
+    status = run("status", *grid)
+    assert status.code == 0 and re.search(
+        rf"damaged +{log_of(bad)} +{re.escape(advice)}", status.out
+    )
+    sweep = run(*grid, env=stub)
+    assert sweep.code == 1 and f"warning: {advice}" in sweep.err and "2 runs, 1 to do" in sweep.err
+    assert (bad / "result.json").read_text() == damaged and (good / "result.json").exists()
+    assert "2 runs: 1 done, 0 running, 1 failed, 0 to do" in sweep.out
+    assert "delete the run's folder to run it again" in sweep.out
 
 
 def test_runs_may_be_in_the_projects_own_folder(tmp_path):
@@ -555,13 +753,11 @@ def test_runs_may_be_in_the_projects_own_folder(tmp_path):
     assert len(list(project.glob("logs/*.log"))) == 3
 
 
-def test_openmps_threads_do_not_limit_the_number_of_runs(tmp_path):
-    (tmp_path / "xargs").write_text('#!/bin/sh\necho "$@" >"$(dirname "$0")/arguments"\n')
-    (tmp_path / "xargs").chmod(0o755)
-    env = ENV | {"PATH": f"{tmp_path}:{PATH}", "OMP_NUM_THREADS": "1"}
-    run(*GRID, "--runs-dir", tmp_path / "runs", env=env)
+def test_openmps_threads_do_not_limit_the_number_of_runs(tmp_path, stub):
+    grid = ["baseline", *GRID[1:5], "--seeds", "1-99", "--runs-dir", tmp_path]
+    start(*grid, env=stub | {"OMP_NUM_THREADS": "1", "STUB_SECONDS": "1000"})
     cores = len(os.sched_getaffinity(0))
-    assert f"-P {cores} " in (tmp_path / "arguments").read_text()
+    wait_for(lambda: len(processes("stub_run.py", tmp_path)) == cores, what="a run on every core")
 
 
 def test_a_sweep_whose_reader_has_left_still_stops_its_runs(tmp_path):
@@ -578,18 +774,41 @@ def test_a_sweep_whose_reader_has_left_still_stops_its_runs(tmp_path):
     assert not runs[2].exists()
 
 
-def test_a_killed_sweep_starts_no_more_runs(tmp_path):
+@pytest.mark.parametrize("engine", ["local", "parallel"], indirect=True)
+def test_a_killed_sweep_stops_its_runs(engine, tmp_path):
+    executor, env = engine
     grid = [*FOREVER, "--runs-dir", tmp_path, *ON_SIGNAL]
     runs = folders(*GRID, *grid)
-    sweep = start(*GRID, "--jobs", "1", *grid)
+    sweep = start(*GRID, *executor, "--jobs", "1", *grid, env=env)
     wait_for(lambda: is_training(runs[0]))
     sweep.kill()
     sweep.wait()
-    [pid] = processes("sac_continuous_noisy.py", tmp_path)
-    os.kill(pid, signal.SIGTERM)  # the run that the sweep has left behind
-    engine = ["pgrep", "-f", f"run-logged .*-{sweep.pid}-"]
-    wait_for(lambda: subprocess.run(engine, stdout=subprocess.DEVNULL).returncode)
+    wait_for(lambda: not processes(tmp_path), what="the run's end")
+    wait_for(lambda: attempts(runs[0])[0][-1].endswith("exit=143"), what="the log's end")
     assert (runs[0] / "checkpoint.pt").exists() and not runs[1].exists()
+
+
+def test_a_killed_shell_around_a_run_stops_no_other(tmp_path, stub):
+    grid = ["baseline", *GRID[1:5], "--seeds", "1-4", "--jobs", "1", "--runs-dir", tmp_path]
+    runs = folders(*grid[:-4], *grid[-2:])
+    sweep = start(*grid, env=stub | {"STUB_SECONDS": "2"})
+    [pid] = wait_for(lambda: processes("stub_run.py", tmp_path), what="the first run")
+    shell = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1]
+    os.kill(int(shell), signal.SIGKILL)
+    out, err = sweep.communicate(timeout=PATIENCE)
+    assert sweep.returncode == 0, out + err  # its run went on to its end
+    assert all((folder / "result.json").exists() for folder in runs)
+
+
+def test_a_second_sweep_waits_for_the_runs_of_the_first(tmp_path, stub):
+    grid = ["baseline", *GRID[1:5], "--seeds", "1", "--runs-dir", tmp_path]
+    [folder] = folders(*grid)
+    first = start(*grid, env=stub | {"STUB_SECONDS": "4"})
+    wait_for(lambda: processes("stub_run.py", tmp_path), what="the run")
+    second = run(*grid, env=stub)
+    assert second.code == 0 and f"{folder} is running already: waiting for it" in second.err
+    assert first.wait(timeout=PATIENCE) == 0
+    assert len(attempts(folder)) == 1 and "running already" not in log_of(folder).read_text()
 
 
 @pytest.mark.parametrize(
@@ -599,12 +818,58 @@ def test_a_killed_sweep_starts_no_more_runs(tmp_path):
         ("best --algos dqn", "unknown algorithm 'dqn'; choose from sac, td3, ppo"),
         ("custom --noises Foo(1) --noise-rates 1", "bad noise 'Foo(1)': unknown name; valid are"),
         ("paper --noise-rates 1.5", "1.5"),
-        ("custom --noises RandomNormalNoisyReward(1)", "custom needs --noises and --noise-rates"),
+        (
+            "custom --noises RandomNormalNoisyReward(1)",
+            '--noises needs --noise-rates, or a rate with each noise, as in "NOISE@0.1"',
+        ),
         ("best --envs Ant-v5", "the paper has no best noise for sac on Ant-v5"),
-        ("demo --envs Nope-v5", "--envs Nope-v5: "),
-        ("demo --seeds 1 2-1", "--seeds: '2-1' is no seed, as 3, and no range, as 1-5"),
-        ("demo --seeds x", "--seeds: 'x' is no seed"),
-        ("demo --seeds 1-", "--seeds: '1-' is no seed"),
+        ("custom --noise-rates 1", "--noise-rates needs --noises that have no rate of their own"),
+        (
+            f"custom --noises {A}@1 --noise-rates 1",
+            "--noise-rates needs --noises that have no rate",
+        ),
+        (f"custom --noises {A}@1+{A}", "give each of these noises a rate with @, or none"),
+        (
+            f"custom --noises {A}@x",
+            "'x' is no rate: give a number from 0 to 1, or two as in 1.0:0.0",
+        ),
+        (f"custom --noises {A}@1:2", "got '1:2'"),
+        (f"custom --noises {A} --noise-rates 0.5:", "got '0.5:'"),
+        ("paper --noise-rates a:b", "got 'a:b'"),
+        ("paper --combine", "--combine belongs to custom"),
+        ("paper --budget 5", "--budget belongs to choose"),
+        ("choose --algos ppo", "choose needs --algos and --envs"),
+        ("choose --envs Hopper-v5", "choose needs --algos and --envs"),
+        (f"{C} --seeds 1-3", "leave out --seeds"),
+        (f"{C} --budget 89", "--budget must be at least 90, a run for each noise, not 89"),
+        (f"{C} --budget 100000", "--budget 100000 is too large: the best noises would run with"),
+        (f"{C} --confirm 3", "--confirm must be at least 4, not 3: with fewer seeds no difference"),
+        (f"{C} --envs Hopper Pusher-v5 --confirm 4", "--confirm must be at least 5, not 4: "),
+        (f"{C} --noises {A} --noise-rates 0", "there is no noise to choose from"),
+        (f"{C} --noises {A} --noise-rates 1 --exclude {A}@1", "there is no noise to choose from"),
+        (f"{C} --exclude {A}@0.3", "--exclude: RandomNormalNoisyReward(1.0) at 0.3 is not among"),
+        (f"{C} --exclude {A}", '--exclude needs a rate with each noise, as in "NOISE@0.1"'),
+        (f"{C} --noise-rates 0.5:", "got '0.5:'"),
+        ("demo --envs Nope-v5", "--envs: there is no environment 'Nope-v5': "),
+        ("demo --envs nope:Env-v0", "--envs: there is no environment 'nope:Env-v0': No module"),
+        (
+            "demo --seeds 1 2-1",
+            "--seeds takes numbers and ranges, separated by spaces: 1 2 3 or 1-3",
+        ),
+        ("demo --seeds 1,2,3", "separated by spaces: 1 2 3 or 1-3, not '1,2,3'"),
+        ("demo --seeds 1-", "not '1-'"),
+        ("demo --total-timesteps 1.5", "'1.5' is not a whole number, such as 1000000 or 1e6"),
+        ("demo --total-timesteps inf", "'inf' is not a whole number"),
+        ("demo --seed 1", "unknown option --seed; did you mean --seeds?"),
+        ("demo --env-id Hopper-v5", "unknown option --env-id; did you mean --envs?"),
+        ("demo --exectuor local", "unknown option --exectuor; did you mean --executor?"),
+        ("demo --gamma 0.9", "--gamma is an option of the scripts: put it at the end, after --"),
+        ("demo --gama 0.9", "did you mean --gamma, an option of the scripts, at the end after --?"),
+        ("demo --xyzzy 1", "unknown option --xyzzy; ./benchmark.sh --help lists them"),
+        (
+            "demo --remote-dir x --executor parallel",
+            "--remote-dir needs a --runs-dir in the project",
+        ),
         ("demo --runs-dir=-x", "--runs-dir must be a path"),
         ("demo --slurm-args --time=1:00", "--slurm-args and --wait belong to --executor slurm"),
         ("demo --wait", "--slurm-args and --wait belong to --executor slurm"),
@@ -617,7 +882,7 @@ def test_a_killed_sweep_starts_no_more_runs(tmp_path):
         ("demo --sshlogin host", "--sshlogin and --remote-dir belong to --executor parallel"),
         ("demo -- --help", "--help after the -- would start nothing"),
         ("demo -- --seed 2", "--seed is part of the grid"),
-        ("best --algos sac -- --nope", "sac_continuous_noisy.py does not accept the arguments"),
+        ("best --algos sac -- --nope", "sac_continuous_noisy.py: Unrecognized options: --nope"),
     ],
 )
 def test_bad_input(args, message, tmp_path):
@@ -626,13 +891,14 @@ def test_bad_input(args, message, tmp_path):
     assert result.code == 2, result.out + result.err
     errors = [line for line in result.err.splitlines() if line.startswith("error: ")]
     assert len(errors) == 1 and message in errors[0]
-    assert "--nope" in args or len(result.err.splitlines()) == 1
+    lines = [line for line in result.err.splitlines() if not line.endswith("to do")]
+    assert len(lines) == (11 if "unknown name" in message else 1)
     assert not result.out and not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(("executor", "program"), [("parallel", "parallel"), ("slurm", "sbatch")])
 def test_missing_engine(executor, program, tmp_path):
-    tools, used = tmp_path / "bin", "env bash dirname awk grep wc cut hostname date mkdir tr xargs"
+    tools, used = tmp_path / "bin", "env bash dirname awk grep wc cut flock"
     tools.mkdir()
     for tool in used.split():
         (tools / tool).symlink_to(shutil.which(tool))

@@ -1,0 +1,226 @@
+"""The runs of `./benchmark.sh choose`: their folders say what they returned, choose.py what is due.
+
+The run folders are the only state. Whatever was killed, and whichever executor goes on, the same
+command computes from the finished runs where each choice stands.
+"""
+
+import csv
+import itertools
+import json
+import os
+from pathlib import Path
+from statistics import fmean
+from typing import NamedTuple
+
+import choose
+from analyze_runs import read_config, read_evaluations
+from grid import Run, cell, cells, fail, make_run, result
+
+# What a run takes on one core until the finished ones tell: docs/sweeps.md
+STEPS_PER_SECOND = {"sac": 150, "td3": 265, "ppo": 5700}  # in small MuJoCo environments
+START_UP = 10  # seconds, with compilation
+
+
+class Choice(NamedTuple):
+    """The choice of a noise for one algorithm and environment, as far as it has come."""
+
+    name: str  # "PPO on Hopper-v5"
+    algorithm: str
+    env_id: str
+    schedule: list[tuple[int, int]]  # of its search
+    confirm: int  # fresh seeds of the confirmation
+    state: choose.State
+    runs: dict[tuple[str, str, int], Run]  # those that have been due so far
+    returns: dict[tuple[str, str, int], float]  # of those that are finished
+    core_hours: float  # about what is left
+
+
+def choices(args):
+    """Return the choices of one command, or exit if its numbers make no choice."""
+    pairs = list(itertools.product(dict.fromkeys(args.algos), args.envs))
+    fewest = choose.fewest_seeds(len(pairs))
+    if args.confirm < fewest:
+        fail(
+            f"--confirm must be at least {fewest}, not {args.confirm}: with fewer seeds no "
+            f"difference could be significant (number of verdicts: {len(pairs)})"
+        )
+    return [follow(args, algorithm, env_id) for algorithm, env_id in pairs]
+
+
+def follow(args, algorithm, env_id):
+    """Return one choice: where the finished runs have brought it."""
+    noises = candidates(args, algorithm, env_id)
+    budget = 3 * len(noises) if args.budget is None else args.budget
+    if budget < len(noises):
+        fail(f"--budget must be at least {len(noises)}, a run for each noise, not {budget}")
+    schedule = choose.schedule(len(noises), budget)
+    last_seed = sum(seeds for _, seeds in schedule)
+    if last_seed >= choose.FRESH_SEED:
+        fail(f"--budget {budget} is too large: the best noises would run with {last_seed} seeds")
+    cell_of = {choose.BASELINE: ([], [])} | noises
+    runs, returns, times = {}, {}, []
+    while True:
+        state = choose.advance(list(noises), budget, args.confirm, returns)
+        finished = {}
+        for noise, rate, seed in state.due:
+            run = make_run(args, algorithm, env_id, *cell_of[noise, rate], seed)
+            runs[noise, rate, seed] = run
+            if result(run)[0]:
+                finished[noise, rate, seed], seconds = read_run(run, seed)
+                times.append(seconds)
+        if not finished:
+            break
+        returns |= finished
+    left = choose.number_of_runs(len(noises), budget, args.confirm) - len(returns)
+    expected = START_UP + args.total_timesteps / STEPS_PER_SECOND[algorithm]
+    core_hours = left * (fmean(times) if times else expected) / 3600
+    name = f"{algorithm.upper()} on {env_id}"
+    return Choice(name, algorithm, env_id, schedule, args.confirm, state, runs, returns, core_hours)
+
+
+def runs_of(found):
+    """Return the runs of all choices together, the first seed of everything first."""
+    runs = []
+    for choice in found:
+        runs += [(seed, run) for (_, _, seed), run in choice.runs.items()]
+    return [run for _, run in sorted(runs, key=lambda pair: pair[0])]
+
+
+def candidates(args, algorithm, env_id):
+    """Return the noises to choose from, each once: {(noise, rate) as text: (noises, rates)}."""
+    noises = {}
+    for found in cells(args, algorithm, env_id):
+        if found != ([], []):  # at rate 0 a noise is none
+            noises[as_text(found)] = found
+    for pairs in args.exclude:
+        if any(rate is None for _, rate in pairs):
+            fail('--exclude needs a rate with each noise, as in "NOISE@0.1"')
+        excluded = as_text(cell(pairs))
+        if excluded not in noises:
+            fail(f"--exclude: {' at '.join(excluded)} is not among the noises")
+        del noises[excluded]
+    if not noises:
+        fail("there is no noise to choose from")
+    return noises
+
+
+def as_text(found):
+    """Spell a cell's noises and rates, as in config.json and tables: "A + B", "0.1 + 0.2"."""
+    noises, rates = found
+    return " + ".join(noises), " + ".join(map(str, rates))
+
+
+def read_run(run, seed):
+    """Return what a finished run counts for, and how many seconds it has taken.
+
+    That is the mean over its last tests in the search, and its last test in the confirmation.
+    """
+    try:
+        config = read_config(run.folder)
+        _, tests = read_evaluations(run.folder, config["episodes"], config["total"])
+        seconds = json.loads((run.folder / "result.json").read_text())["wall_time_seconds"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        fail(f"cannot read {run.folder} ({reason}); delete it to run it again")
+    count = 1 if seed >= choose.FRESH_SEED else choose.LAST_TESTS
+    return fmean(tests[-count:]), seconds
+
+
+# ---------------------------------------------------------------------------------------- in words
+
+
+def plan(found):
+    """Yield lines that say, before a batch starts, what is due and what all of it will take."""
+    if not any(choice.state.due for choice in found):
+        return
+    for choice in found:
+        yield describe(choice)
+    search = sum(noises * seeds for choice in found for noises, seeds in choice.schedule)
+    confirm = sum(2 * choice.confirm for choice in found)
+    finished = sum(len(choice.returns) for choice in found)
+    hours = sum(choice.core_hours for choice in found)
+    hours = f"{hours:.1f}" if hours >= 0.1 else f"{hours:.2g}"
+    yield (
+        f"{search + confirm} runs in all, {search} to search and {confirm} to confirm; "
+        f"{finished} are done, about {hours} core-hours are left"
+    )
+
+
+def describe(choice):
+    """Say where a choice stands."""
+    state = choice.state
+    number, rounds = len(state.rounds) + 1, len(choice.schedule)
+    if not state.due:
+        return f"{choice.name}: all runs are done"
+    seeds = f"seeds {state.seeds[0]} to {state.seeds[-1]}" if len(state.seeds) > 1 else "seed 1"
+    due = f"{seeds}; {len(state.due)} runs to do"
+    if number <= rounds:
+        noises = f"{len(state.noises)} of {choice.schedule[0][0]} noises"
+        return f"{choice.name}, round {number} of {rounds}: {noises}, {due}"
+    winner = choose.spelled(*state.noises)
+    return f"{choice.name}, confirmation: {winner} against no noise, {due}"
+
+
+def standing(found):
+    """Yield lines that say where each choice stands, and which noises are still in the running."""
+    for choice in found:
+        yield describe(choice)
+        if choice.state.rounds:
+            scores = choice.state.rounds[-1].scores
+            for noise in sorted(choice.state.noises, key=scores.get, reverse=True):
+                yield f"  {scores[noise]:10.2f}  {choose.spelled(noise)}"
+
+
+def conclusion(found, runs_dir):
+    """Yield the verdicts, one line for each choice, and write choice.csv.
+
+    While runs of a choice are left, there is none: then say what to do about them.
+    """
+    if any(choice.state.due for choice in found):
+        for choice in found:
+            yield obstacle(choice) if choice.state.due else describe(choice)
+        return
+    comparisons = []
+    for choice in found:
+        [winner] = choice.state.noises
+        comparisons.append(choose.compare(winner, choice.state.seeds, choice.returns))
+    corrected = choose.holm([comparison.p for comparison in comparisons])
+    rows = []
+    for choice, comparison, p in zip(found, comparisons, corrected, strict=True):
+        names = choice.algorithm.upper(), choice.env_id
+        helped = choose.helps(comparison, p)
+        rows += choose.rows(*names, choice.state, choice.returns, helped)
+    write_choice(Path(runs_dir, "choice.csv"), rows)
+    for choice, comparison, p in zip(found, comparisons, corrected, strict=True):
+        noises = choice.schedule[0][0] if choice.schedule else 1
+        yield choose.verdict(choice.name, noises, comparison, p, len(found))
+
+
+def obstacle(choice):
+    """Say that a choice cannot go on, and what to do."""
+    text = f"{describe(choice)}. These did not finish; the same command starts them again."
+    for noise, rate, _ in choice.state.due:
+        pairs = zip(noise.split(" + "), rate.split(" + "), strict=True)
+        excluded = "+".join(f"{noise}@{rate}" for noise, rate in pairs)
+        advice = f'\n  If it fails every time, leave it out: --exclude "{excluded}"'
+        if noise and advice not in text:
+            text += advice
+    return text
+
+
+def write_choice(path, rows):
+    """Write choice.csv whole or not at all; it keeps what other commands have chosen."""
+    ours = {(row["algorithm"], row["environment"]) for row in rows}
+    try:
+        if path.exists():
+            with open(path, newline="") as file:
+                old = list(csv.DictReader(file))
+            rows = [r for r in old if (r["algorithm"], r["environment"]) not in ours] + rows
+        temporary = path.with_suffix(".tmp")
+        with open(temporary, "w", newline="") as file:
+            writer = csv.DictWriter(file, choose.COLUMNS, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+        os.replace(temporary, path)
+    except (OSError, KeyError, ValueError) as error:
+        fail(f"cannot write {path} ({type(error).__name__}: {error})")

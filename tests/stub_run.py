@@ -1,0 +1,76 @@
+"""Stands for a training script in the tests of sweeps: a run whose returns are known.
+
+    python tests/stub_run.py SCRIPT ARGUMENTS...
+
+STUB_SECONDS is how long a run takes; SIGTERM ends it. STUB_FAILS is a pattern of folders whose runs
+fail.
+"""
+
+import argparse
+import fnmatch
+import json
+import os
+import random
+import sys
+import time
+from pathlib import Path
+from statistics import fmean
+
+sys.path.insert(0, str(Path(__file__).parent.parent))
+from noisy_wrappers import run_name  # noqa: E402
+
+EPISODES = 2
+
+
+def episodes_of(algorithm, env_id, noise, rates, seed):
+    """Return the returns of four tests of a run, a pure function of what it is: (tests, episodes).
+
+    Every noise has a mean of its own, 100 +- 30; every episode is drawn around it.
+    """
+    kind = [algorithm, env_id, noise, rates]
+    score = 100 + (random.Random(repr(kind)).gauss(0, 30) if noise else 0)
+    rng = random.Random(repr([*kind, seed]))
+    return [[score + rng.gauss(0, 5) for _ in range(EPISODES)] for _ in range(4)]
+
+
+def tests_of(*run):
+    return [fmean(episodes) for episodes in episodes_of(*run)]
+
+
+def train(argv):
+    parser = argparse.ArgumentParser()
+    parser.add_argument("script")
+    parser.add_argument("--env-id", required=True)
+    parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--noise", nargs="*", default=[])
+    parser.add_argument("--noise-rate", nargs="*", default=[])
+    parser.add_argument("--total-timesteps", type=int, required=True)
+    parser.add_argument("--runs-dir", required=True)
+    args = parser.parse_args(argv)
+    args.noise_rate = [rate if ":" in rate else float(rate) for rate in args.noise_rate]
+    exp_name = args.script.removesuffix(".py")
+    name = run_name(args.env_id, exp_name, args.noise, args.noise_rate, args.seed)
+    folder = Path(args.runs_dir, name)
+    folder.mkdir(parents=True, exist_ok=True)
+    config = {"algorithm": exp_name[:3].upper(), "versions": {}}
+    config["args"] = vars(args) | {"eval_episodes": EPISODES}
+    (folder / "config.json").write_text(json.dumps(config))
+    print(f"step=0/{args.total_timesteps} sps=100", flush=True)
+    if fnmatch.fnmatch(name, os.environ.get("STUB_FAILS", "")):
+        sys.exit("error: this one fails")
+    time.sleep(float(os.environ.get("STUB_SECONDS", 0)))
+
+    tests = episodes_of(exp_name[:3], args.env_id, args.noise, args.noise_rate, args.seed)
+    rows = ["step,episode,episodic_return,episodic_length"]
+    for test, episodes in enumerate(tests, start=1):
+        for episode, value in enumerate(episodes):
+            rows.append(f"{test * args.total_timesteps // 4},{episode},{value},100")
+    (folder / "eval.csv").write_text("\n".join(rows) + "\n")
+    result = {"total_timesteps": args.total_timesteps, "wall_time_seconds": 36.0}
+    result["final_return_mean"] = fmean(tests[-1])
+    (folder / "result.tmp").write_text(json.dumps(result))
+    (folder / "result.tmp").rename(folder / "result.json")
+
+
+if __name__ == "__main__":
+    train(sys.argv[1:])
