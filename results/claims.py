@@ -1,13 +1,15 @@
-"""The tables of results/README.md, from the runs beside it: python results/claims.py.
+"""Write results/README.md from the runs and tables beside it: python results/claims.py.
 
-The comparisons were fixed before the runs, one in each row. So p-values are corrected with Holm's
-method over the rows; analyze.py corrects within an environment, for the choice of its best noise.
+README.md.jinja has the text, this file every number in it. The five comparisons of PPO with and
+without noise were fixed before the runs, with seeds 1 to 10 and one noise for each environment: so
+p-values are corrected with Holm's method over them. The seeds from 11 on are analysed apart.
 """
 
 import json
 import sys
 from pathlib import Path
 
+import jinja2
 import numpy as np
 import pandas as pd
 from scipy import stats
@@ -16,11 +18,24 @@ from tabulate import tabulate
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
 from analyze import make_tables  # noqa: E402
-from analyze_compare import PAPER_SEEDS, read_paper  # noqa: E402
+from analyze_compare import PAPER_CONFIGURATIONS, PAPER_SEEDS, read_paper, with_luck  # noqa: E402
+from analyze_luck import CONSISTENT_PERCENT, DRAWS, draw_improvements  # noqa: E402
 from analyze_runs import KEYS, make_studies, read_runs  # noqa: E402
+from analyze_statistics import mann_whitney  # noqa: E402
 
-# Training returns of PPO in CleanRL's documentation, mean and standard deviation of three seeds:
-# the first two at commit 2d660b6 (October 2023), the last since commit 35896b1 (November 2023).
+FIXED_SEEDS = range(1, 11)
+FRESH_SEEDS = range(11, 31)
+ENDING = "RandomEarlyTermination(50)"
+TRUNCATING = "RandomEarlyTermination(50, truncate=True)"
+MIXUP = "RandomMixupObservation(0.0, recursive=True)"
+SCALE = "RandomUniformScaleReward(0.5, 1.5)"
+RATES = [0.01, 0.05, 0.1, 0.2, 0.5, 1.0]
+# The paper's 15 noises by what they perturb; its text calls early termination dynamics noise.
+KINDS = {"observation": 8, "reward": 5, "dynamics": 2}
+
+# Training returns of PPO in CleanRL's documentation: mean and standard deviation of three seeds,
+# the population's, as its rlops takes it (np.std). The first two at commit 2d660b6 (October 2023),
+# the last since commit 35896b1 (November 2023).
 CLEANRL = {
     "CleanRL, v2": {
         "HalfCheetah": (2262.50, 1196.81),
@@ -44,6 +59,10 @@ CLEANRL = {
         "Walker2d": (2287.95, 571.78),
     },
 }
+CLEANRL_SEEDS = 3
+
+
+# ------------------------------------------------------------------------------------------ reading
 
 
 def plain(table):
@@ -52,18 +71,56 @@ def plain(table):
 
 
 def read_returns(folder):
-    """Return final test and training returns of each configuration, as lists over seeds."""
-    runs = read_runs(folder).query("status == 'finished'")
+    """Return one row per finished run: its configuration, seed, test and training return.
+
+    `error` is the variance that the test's few episodes give the test return.
+    """
+    runs = read_runs(folder).query("status == 'finished'").copy()
     results = [json.loads((folder / run / "result.json").read_text()) for run in runs["run"]]
     runs["test"] = [result["final_return_mean"] for result in results]
     runs["training"] = [result["train_return_mean_last_100"] for result in results]
-    return plain(runs).groupby(KEYS)[["test", "training"]].agg(list)
+    runs["error"] = [test_error(folder / run) for run in runs["run"]]
+    return plain(runs)[[*KEYS, "seed", "test", "training", "error"]]
 
 
-def sample(returns):
-    """Describe lists of returns: mean, sample standard deviation and number of each."""
-    std = returns.map(lambda values: np.std(values, ddof=1))
-    return pd.DataFrame({"mean": returns.map(np.mean), "std": std, "n": returns.map(len)})
+def test_error(run):
+    """Return the variance of the mean over the episodes of a run's last test."""
+    table = pd.read_csv(run / "eval.csv")
+    returns = table.loc[table["step"] == table["step"].max(), "episodic_return"]
+    return returns.var(ddof=1) / len(returns)
+
+
+def fixed_beforehand(runs, chosen):
+    """Keep the runs of the comparisons that were fixed beforehand.
+
+    They are those of FIXED_SEEDS without noise, and with a noise of `chosen`, a list of
+    (environment, noise, noise_rate).
+    """
+    configs = zip(runs["environment"], runs["noise"], runs["noise_rate"], strict=True)
+    wanted = np.array([config in chosen or config[1] == "" for config in configs], bool)
+    return runs[wanted & runs["seed"].isin(FIXED_SEEDS)]
+
+
+def cleanrl(title):
+    """Return CleanRL's training returns with the sample standard deviation."""
+    table = pd.DataFrame(CLEANRL[title], index=["mean", "std"]).T
+    table["std"] *= np.sqrt(CLEANRL_SEEDS / (CLEANRL_SEEDS - 1))
+    return table.assign(n=CLEANRL_SEEDS)
+
+
+# --------------------------------------------------------------------------------------- statistics
+
+
+def sample(runs, column):
+    """Describe the runs of each environment: mean, sample standard deviation and number."""
+    groups = runs.groupby("environment")[column]
+    return pd.DataFrame({"mean": groups.mean(), "std": groups.std(ddof=1), "n": groups.size()})
+
+
+def variance_share(runs):
+    """Return the percent of the variance between seeds that the test's few episodes make."""
+    groups = runs.groupby("environment")
+    return 100 * groups["error"].mean() / groups["test"].var(ddof=1)
 
 
 def standard_error(*samples):
@@ -86,6 +143,25 @@ def holm(p):
     return np.minimum(1, adjusted)
 
 
+def power(effect, std, n, other_std, other_n):
+    """Probability that the exact Mann-Whitney test finds a shift of normal returns at 5 %."""
+    rng, trials = np.random.default_rng(0), 2000
+    x = rng.normal(effect, std, (trials, n))
+    y = rng.normal(0, other_std, (trials, other_n))
+    p = [mann_whitney(a[:, None], b[:, None])[0] for a, b in zip(x, y, strict=True)]
+    return np.mean(np.array(p) <= 0.05)
+
+
+def power_of_levene(ratio, n):
+    """Probability that Brown and Forsythe's test finds this ratio of standard deviations at 5 %."""
+    rng, trials = np.random.default_rng(0), 2000
+    x, y = rng.normal(0, ratio, (trials, n)), rng.normal(0, 1, (trials, n))
+    return np.mean(stats.levene(x, y, center="median", axis=1).pvalue <= 0.05)
+
+
+# ----------------------------------------------------------------------------------------- spelling
+
+
 def cells(form, *columns):
     """Write one text for each row of the columns; a dash where a value does not exist."""
     rows = zip(*columns, strict=True)
@@ -98,24 +174,251 @@ def spell(x):
     return [f"{m:,.{d}f} ± {s:,.{d}f}" for m, s, d in zip(x["mean"], x["std"], digits, strict=True)]
 
 
-def show(title, columns):
-    """Print a dict of columns as a Markdown table; a last one, p, is followed by Holm's."""
+def markdown(columns):
+    """Write a dict of columns as a Markdown table; a column "p" is followed by Holm's."""
     if "p" in columns:
         columns["Holm"] = cells("{:.2g}", holm(columns["p"]))
         columns["p"] = cells("{:.2g}", columns["p"])
     table = pd.DataFrame(columns)
-    text = tabulate(table.values, table.columns, "pipe", disable_numparse=True)
-    print(f"{title}\n\n{text}\n")
+    return tabulate(table.values, table.columns, "pipe", disable_numparse=True)
+
+
+# ------------------------------------------------------------------------------- the paper's tables
+
+
+def luck_of_the_best(paper):
+    """The paper's best noises beside what the best of as many useless ones would show."""
+    best = paper["best"]
+    return {
+        "table": markdown(
+            {
+                "": best["algorithm"] + ", " + best["environment"],
+                "the paper's best noise": cells("`{}`, p = {}", best["noise"], best["noise_rate"]),
+                "improvement": cells("{:+.1f} %", best["improvement_percent"]),
+                "by luck: median": cells("{:+.1f} %", best["luck_median_percent"]),
+                "95 %": cells("{:+.1f} %", best["luck_95_percent"]),
+                "P(luck)": cells("{:.2f}", best["p_luck"]),
+            }
+        ),
+        "p": best["p_luck"],
+        "beyond": (best["p_luck"] <= 0.05).sum(),
+        "rows": len(best),
+        "improvement": best["improvement_percent"],
+    }
+
+
+def luck_of_the_consistent(luck):
+    """How many rows the paper's tables of consistent noise have, and would have by luck."""
+    columns = {"": luck["algorithm"]}
+    for name, title in (("consistent", "consistent"), ("consistently_worse", "worse everywhere")):
+        columns |= {
+            title: luck[name],
+            f"{title}, by luck (95 %)": cells(
+                "{:.0f} ({:.0f})", luck[f"{name}_by_luck"], luck[f"{name}_by_luck_95"]
+            ),
+            f"{title}, P(luck)": cells("{:.2g}", luck[f"p_{name}"]),
+            f"{title}, rows beyond luck": luck[f"{name}_beyond_luck"],
+        }
+    by = luck.set_index("algorithm")
+    return {
+        "table": markdown(columns),
+        "by": by.to_dict("index"),
+        "beyond": by["consistent_beyond_luck"].sum(),
+    }
+
+
+def rates(paper):
+    """How often each noise rate is the best, consistent, or worse everywhere."""
+    counts = {"p": [f"{rate:g}" for rate in RATES]}
+    ones = {}
+    for name, table in (
+        ("best", paper["best"]),
+        ("consistent", paper["consistent"]),
+        ("consistently worse", paper["consistently_worse"]),
+    ):
+        found = table["noise_rate"].astype(float)
+        counts[f"{name} ({len(found)})"] = [(found == rate).sum() for rate in RATES]
+        tail = stats.binomtest(int((found == 1).sum()), len(found), 1 / len(RATES))
+        ones[name.replace(" ", "_")] = {"count": (found == 1).sum(), "p": tail.pvalue}
+    names = list(counts)
+    table = pd.DataFrame(counts)
+    text = tabulate(table.values, ["noise rate", *names[1:]], "pipe", disable_numparse=True)
+    return {"table": text, "one": ones, "expected": len(paper["best"]) / len(RATES)}
+
+
+def kinds(paper):
+    """What the best noises perturb, for each algorithm."""
+    best = paper["best"]
+    kind = [
+        next((kind for kind in KINDS if noise.split("(")[0].endswith(kind.title())), "dynamics")
+        for noise in best["noise"]
+    ]
+    counts = pd.crosstab(best["algorithm"], pd.Series(kind, index=best.index))
+    counts = counts.reindex(columns=list(KINDS))
+    columns = {"": counts.index} | {
+        f"{kind} ({number} of the 15 noises)": counts[kind] for kind, number in KINDS.items()
+    }
+    exact = stats.fisher_exact(counts.loc[["PPO", "TD3"], ["reward", "observation"]])
+    return {
+        "table": markdown(columns),
+        "ppo": stats.binom.sf(counts.loc["PPO", "reward"] - 1, 5, KINDS["reward"] / 15),
+        "td3": stats.binom.sf(counts.loc["TD3", "observation"] - 1, 5, KINDS["observation"] / 15),
+        "fisher": exact.pvalue,
+    }
+
+
+def scaled_rewards(paper):
+    """Where the paper's new noise is consistent, and how often luck does as much.
+
+    A noise has six rates; by luck it is consistent at one or more of them in all three algorithms,
+    and so is at least one of the fifteen.
+    """
+    table = paper["consistent"].query("noise == @SCALE")
+    rng = np.random.default_rng(0)
+    n = PAPER_SEEDS["SAC"]  # the numbers of seeds and the spread do not matter for the sign
+    in_all = np.ones((PAPER_CONFIGURATIONS // len(RATES), DRAWS), bool)
+    for _ in PAPER_SEEDS:
+        draws = np.stack(
+            [draw_improvements(1, 1, 1e9, n, PAPER_CONFIGURATIONS * [n], rng) for _ in range(5)]
+        )
+        consistent = 100 * (draws >= 0).mean(axis=0) >= CONSISTENT_PERCENT
+        in_all &= consistent.reshape(-1, len(RATES), DRAWS).any(axis=1)
+    rows = zip(table["algorithm"], table["noise_rate"], strict=True)
+    worse = paper["consistently_worse"].query("noise == @SCALE")
+    return {
+        "where": ", ".join(f"{algorithm} at {rate}" for algorithm, rate in rows),
+        "worse": ", ".join(
+            f"{r.algorithm} at {r.noise_rate} ({r.average_improvement_percent:+.1f} %)"
+            for r in worse.itertuples()
+        ),
+        "this": 100 * in_all.mean(),
+        "any": 100 * in_all.any(axis=0).mean(),
+    }
+
+
+def worse_everywhere(paper):
+    """The noises that the paper finds worse in all environments, by their number of rates."""
+    table = paper["consistently_worse"]
+    counts = pd.crosstab(table["noise"], table["algorithm"])
+    names = [f"`{noise}`" for noise in counts.index]
+    text = markdown({"noise": names} | {name: counts[name] for name in counts})
+    return {"table": text, "counts": counts.T.to_dict()}
+
+
+def mixture(paper):
+    """What the averages of mixup at p = 1 say about which mixture the paper ran.
+
+    If four environments lose all (-100 %), the fifth follows from the average, and so does the
+    standard deviation.
+    """
+    rows = paper["consistently_worse"].query("noise == @MIXUP")
+    rows = rows[rows["noise_rate"].astype(float) == 1].set_index("algorithm")
+    result = {}
+    for algorithm in ("SAC", "TD3"):
+        average = rows.loc[algorithm, "average_improvement_percent"]
+        fifth = 5 * average + 400
+        result[algorithm] = {
+            "average": average,
+            "std": rows.loc[algorithm, "std_improvement_percent"],
+            "fifth": fifth,
+            "std_then": np.std([-100] * 4 + [fifth], ddof=1),
+        }
+    return result
+
+
+def paper_spread(paper):
+    """The standard deviations of the paper's best noises against their baselines: F tests."""
+    best = paper["best"]
+    ratio = best["noisy_std"] / best["baseline_std"]
+    df = best["algorithm"].map(PAPER_SEEDS) - 1
+    tail = stats.f.cdf(ratio**2, df, df)
+    p = holm(2 * np.minimum(tail, 1 - tail))
+    lower = best[(ratio < 1) & (p <= 0.05)]
+    return {
+        "lower": (ratio < 1).sum(),
+        "rows": len(best),
+        "significant": (p <= 0.05).sum(),
+        "names": ", ".join(
+            f"{a} on {e.split('-')[0]}"
+            for a, e in zip(lower["algorithm"], lower["environment"], strict=True)
+        ),
+    }
+
+
+def paper_speed(paper):
+    """The first step of the paper's early-performance table at the baseline's final mean."""
+    table = paper["early_performance"]
+    columns = {"": [], "baseline after 1.0": [], "no noise": [], "p = 0.01": [], "p = 0.05": []}
+    for environment, rows in table.groupby("environment"):
+        means = rows.pivot(index="steps_millions", columns="noise_rate", values="mean")
+        target = means.loc[1.0, "0.00"]
+        columns[""].append(environment)
+        columns["baseline after 1.0"].append(f"{target:,.0f}")
+        for rate, title in (("0.00", "no noise"), ("0.01", "p = 0.01"), ("0.05", "p = 0.05")):
+            reached = means.index[means[rate] >= target]
+            columns[title].append(f"{reached[0]:.1f}" if len(reached) else "\u2013")
+    final = table.query("environment == 'HalfCheetah-v2' and steps_millions == 1")
+    final = final.assign(n=PAPER_SEEDS["SAC"]).set_index("noise_rate")[["mean", "std", "n"]]
+    errors, p = welch(final.loc[["0.01"]], final.loc[["0.00"]].set_axis(["0.01"]))
+    return {"table": markdown(columns), "errors": errors.iloc[0], "p": p[0]}
+
+
+# ------------------------------------------------------------------------------------ PPO, our runs
+
+
+def baselines(base, paper_base):
+    """PPO without noise, ours against the paper's."""
+    ours = sample(base, "test")
+    errors, p = welch(ours, paper_base)
+    share = variance_share(base)
+    text = markdown(
+        {
+            "": ours.index,
+            "n": ours["n"],
+            "ours, v5": spell(ours),
+            "of the variance, the test's": cells("{:.0f} %", share),
+            "the paper, v2": spell(paper_base),
+            "difference in SE": cells("{:+.1f}", errors),
+            "p": p,
+        }
+    )
+    return {"table": text, "errors": errors, "share": share}
 
 
 def against_cleanrl(training):
     """Return columns with CleanRL's training returns, and ours minus them in standard errors."""
     columns = {}
-    for title, theirs in CLEANRL.items():
-        theirs = pd.DataFrame(theirs, index=["mean", "std"]).T.assign(n=3).loc[training.index]
+    for title in CLEANRL:
+        theirs = cleanrl(title).loc[training.index]
         errors, _ = welch(training, theirs)
         columns[f"{title} (SE)"] = cells("{} ({:+.1f})", spell(theirs), errors)
     return columns
+
+
+def cleanrl_tables(base, older, paper_base):
+    """PPO's training returns on v5 and v4 against CleanRL's, and CleanRL's against the paper."""
+    training, older_training = sample(base, "training"), sample(older, "training")
+    older_test = sample(older, "test")
+    errors = {title: welch(training, cleanrl(title)) for title in CLEANRL}
+    to_paper, p_to_paper = welch(cleanrl("CleanRL, v2"), paper_base)
+    older_errors, older_p = welch(older_test, paper_base)
+    v5 = {"": training.index, "ours, v5": spell(training)} | against_cleanrl(training)
+    v4 = {
+        "": [f"{name}-v4" for name in older_test.index],
+        "n": older_test["n"],
+        "test": spell(older_test),
+        "from the paper's in SE": cells("{:+.1f} (p = {:.2g})", older_errors, older_p),
+        "training": spell(older_training),
+    } | against_cleanrl(older_training)
+    return {
+        "v5": markdown(v5),
+        "v4": markdown(v4),
+        "v2_to_paper": pd.DataFrame({"se": to_paper, "p": p_to_paper}).to_dict("index"),
+        "newer": pd.DataFrame(
+            {"se": errors["CleanRL, v4, newer"][0], "p": errors["CleanRL, v4, newer"][1]}
+        ).to_dict("index"),
+        "largest": {title: se.abs().max() for title, (se, _) in errors.items()},
+    }
 
 
 def improvements(table):
@@ -128,117 +431,292 @@ def improvements(table):
     }
 
 
-studies, _ = make_studies(read_runs(HERE / "runs"))
-tables = make_tables(studies, read_paper(HERE / "paper"))
-statistics, summary, early = (
-    plain(tables[name][0]) for name in ("statistics", "summary_PPO", "compare_early_performance")
-)
+def five_noises(base, noisy, paper_base, paper_noisy, percent, statistics):
+    """PPO with the paper's best noise of each environment against PPO without."""
+    x, y = sample(noisy, "test"), sample(base, "test")
+    names = x.index
+    gain, paper_gain = x["mean"] - y["mean"], paper_noisy["mean"] - paper_base["mean"]
+    error = standard_error(x, y, paper_noisy, paper_base)
+    noise = noisy.groupby("environment")[["noise", "noise_rate"]].first()
+    tested = statistics.set_index("environment").loc[names]
+    found = [power(paper_gain[e], x["std"][e], x["n"][e], y["std"][e], y["n"][e]) for e in names]
+    text = markdown(
+        {
+            "": names,
+            "noise": cells("`{}`, p = {}", noise["noise"], noise["noise_rate"].str.rstrip("0.")),
+            "the paper": cells("{} ({:+.1f} %)", spell(paper_noisy), percent),
+            "ours": cells("{} ({:+.1f} %)", spell(x), 100 * gain / y["mean"].abs()),
+            **improvements(tested),
+            "p": tested["p"].to_numpy(float),
+        }
+    )
+    corrected = holm(tested["p"].to_numpy(float))
+    return {
+        "table": text,
+        "power": markdown(
+            {
+                "": names,
+                "the paper's gain": cells("{:+,.1f}", paper_gain),
+                "ours": cells("{:+,.1f}", gain),
+                "power to find the paper's": cells("{:.2f}", found),
+                "gains differ by SE": cells("{:+.1f}", (gain - paper_gain) / error),
+            }
+        ),
+        "percent": (100 * gain / y["mean"].abs()).to_dict(),
+        "paper_percent": percent.to_dict(),
+        "p": tested["p"].to_dict(),
+        "holm": dict(zip(names, corrected, strict=True)),
+    }
 
-# ---------------------------------------------------------------------------------- PPO, baselines
 
-ppo = read_returns(HERE / "runs").loc["PPO"].reset_index().set_index("environment")
-base = ppo[ppo["noise"] == ""]
-noisy = ppo[ppo["noise"] != ""].loc[base.index]
-names = base.index
-best = pd.read_csv(HERE / "paper/best.csv").query("algorithm == 'PPO'")
-best = plain(best).set_index("environment").loc[names].assign(n=PAPER_SEEDS["PPO"])
-paper_base, paper_noisy = (
-    best[[f"{name}_mean", f"{name}_std", "n"]].set_axis(["mean", "std", "n"], axis=1)
-    for name in ("baseline", "noisy")
-)
+def spread(base, noisy, paper_base, paper_noisy):
+    """PPO's standard deviations over seeds with and without noise."""
+    x, y = sample(noisy, "test"), sample(base, "test")
+    p = [
+        stats.levene(a, b, center="median").pvalue
+        for a, b in zip(
+            noisy.groupby("environment")["test"].agg(list),
+            base.groupby("environment")["test"].agg(list),
+            strict=True,
+        )
+    ]
+    text = markdown(
+        {
+            "": x.index,
+            "without noise": cells("{:,.1f}", y["std"]),
+            "with noise": cells("{:,.1f}", x["std"]),
+            "change": cells("{:+.0f} %", 100 * (x["std"] / y["std"] - 1)),
+            "the paper": cells("{:+.0f} %", 100 * (paper_noisy["std"] / paper_base["std"] - 1)),
+            "p": p,
+        }
+    )
+    return {"table": text, "power": power_of_levene(0.5, 10), "smallest": min(p)}
 
-without, training = sample(base["test"]), sample(base["training"])
-errors, p = welch(without, paper_base)
-show(
-    "PPO, baselines: test returns",
-    {
-        "": names,
-        "n": without["n"].array,
-        "ours, v5": spell(without),
-        "the paper, v2": spell(paper_base),
-        "difference in SE": cells("{:+.1f}", errors),
+
+def speed(summary):
+    """The first test at which PPO's mean over seeds is at the baseline's final mean."""
+    start = summary[summary["noise"] == ""].set_index("environment")["steps_to_baseline"]
+    noisy = summary[summary["noise"] != ""].set_index("environment")["steps_to_baseline"]
+    return markdown(
+        {
+            "": noisy.index,
+            "without noise": cells("{:,.0f}", start.loc[noisy.index]),
+            "with noise": cells("{:,.0f}", noisy),
+        }
+    )
+
+
+def compare_rows(name, x, y):
+    """Return a row of the table of Pusher: samples x and y of test returns."""
+    p, _ = mann_whitney(np.array(x)[:, None], np.array(y)[:, None])
+    mean, other = np.mean(x), np.mean(y)
+    interval = stats.ttest_ind(x, y, equal_var=False).confidence_interval(0.95)
+    return {
+        "": name,
+        "n": f"{len(x)}, {len(y)}",
+        "first": f"{mean:.1f} ± {np.std(x, ddof=1):.1f}",
+        "second": f"{other:.1f} ± {np.std(y, ddof=1):.1f}",
+        "difference [95 %]": f"{mean - other:+.1f} [{interval.low:.1f}, {interval.high:.1f}]",
+        "of the second": f"{100 * (mean - other) / abs(other):+.1f} %",
+        "p": f"{p:.2g}",
+    }, p
+
+
+def pusher(runs):
+    """PPO on Pusher with early termination: the fixed seeds, the fresh ones, and truncation."""
+    runs = runs.query("environment == 'Pusher' and noise_rate in ('0.00', '1.00')")
+    returns = {
+        noise: group.set_index("seed")["test"].sort_index()
+        for noise, group in runs.groupby("noise")
+    }
+
+    def seeds(noise, wanted):
+        found = returns.get(noise, pd.Series(dtype=float))
+        return found[found.index.isin(list(wanted))]
+
+    both = [*FIXED_SEEDS, *FRESH_SEEDS]
+    cases = [
+        ("terminated at 50, none: seeds 1 to 10", ENDING, "", FIXED_SEEDS, "fixed"),
+        ("terminated at 50, none: fresh seeds 11 to 30", ENDING, "", FRESH_SEEDS, "fresh"),
+        ("terminated at 50, none: all 30 seeds", ENDING, "", both, "all"),
+        ("truncated at 50, none: seeds 1 to 20", TRUNCATING, "", range(1, 21), "truncated"),
+        ("truncated, terminated at 50: seeds 1 to 20", TRUNCATING, ENDING, range(1, 21), "ways"),
+    ]
+    rows, p, percent = [], {}, {}
+    for name, first, second, wanted, key in cases:
+        x, y = seeds(first, wanted), seeds(second, wanted)
+        if len(x) == len(y) == len(wanted):
+            row, p[key] = compare_rows(name, x, y)
+            percent[key] = 100 * (x.mean() - y.mean()) / abs(y.mean())
+            rows.append(row)
+    x, y = seeds(ENDING, FIXED_SEEDS), seeds("", FIXED_SEEDS)
+    gain, n = x.mean() - y.mean(), len(FRESH_SEEDS)
+    return {
+        "table": markdown(pd.DataFrame(rows).rename(columns={"p": "p (exact)"}).to_dict("series")),
         "p": p,
-    },
-)
-show(
-    "PPO, baselines: training returns",
-    {"": names, "ours, v5": spell(training), **against_cleanrl(training)},
-)
-older = read_returns(HERE / "v4").loc["PPO"].reset_index().set_index("environment")
-test, training = sample(older["test"]), sample(older["training"])
-show(
-    "PPO, baselines on v4",
-    {
-        "": [f"{name}-v4" for name in older.index],
-        "n": test["n"].array,
-        "test": spell(test),
-        "from the paper's in SE": cells("{:+.1f}", welch(test, paper_base)[0]),
-        "training": spell(training),
-        **against_cleanrl(training),
-    },
-)
+        "percent": percent,
+        "power": power(gain, x.std(), n, y.std(), n),
+        "power_half": power(gain / 2, x.std(), n, y.std(), n),
+    }
 
-# -------------------------------------------------------------------------- PPO, noise and baseline
 
-with_noise = sample(noisy["test"])
-gain, paper_gain = with_noise["mean"] - without["mean"], paper_noisy["mean"] - paper_base["mean"]
-errors = (gain - paper_gain) / standard_error(with_noise, without, paper_noisy, paper_base)
-tested, changes = (
-    table.query("algorithm == 'PPO' and noise != ''").set_index("environment").loc[names]
-    for table in (statistics, summary)
-)
-show(
-    "PPO, the paper's best noise",
-    {
-        "": names,
-        "noise": cells("`{}`, rate {:g}", noisy["noise"], noisy["noise_rate"].astype(float)),
-        "the paper": cells("{} ({:+.1f} %)", spell(paper_noisy), best["improvement_percent"]),
-        "ours": cells("{} ({:+.1f} %)", spell(with_noise), changes["improvement_percent"]),
-        "gains differ by SE": cells("{:+.1f}", errors),
-        **improvements(tested),
-        "p": tested["p"].array,
-    },
-)
-show(
-    "PPO, standard deviation over seeds",
-    {
-        "": names,
-        "without noise": cells("{:,.1f}", without["std"]),
-        "with noise": cells("{:,.1f}", with_noise["std"]),
-        "change": cells("{:+.0f} %", changes["std_change_percent"]),
-        "the paper": cells("{:+.0f} %", 100 * (paper_noisy["std"] / paper_base["std"] - 1)),
-        "p": [
-            stats.levene(x, y, center="median").pvalue
-            for x, y in zip(base["test"], noisy["test"], strict=True)
-        ],
-    },
-)
-start = summary.query("algorithm == 'PPO' and noise == ''").set_index("environment").loc[names]
-show(
-    "PPO, first test at which the mean over seeds is at the baseline's final mean",
-    {
-        "": names,
-        "without noise": cells("{:,.0f}", start["steps_to_baseline"]),
-        "with noise": cells("{:,.0f}", changes["steps_to_baseline"]),
-    },
-)
+def half_cheetah(runs):
+    """How many runs of PPO on HalfCheetah end near 4,000, and how many elsewhere."""
+    runs = runs.query("environment == 'HalfCheetah'")
+    noisy = runs[runs["noise"].str.startswith("RandomUniformNoisyReward")]["test"]
+    base = runs[runs["noise"] == ""]["test"]
+    high, noisy_high = (base > 3000).sum(), (noisy > 3000).sum()
+    low, upper = stats.binomtest(int(high), len(base)).proportion_ci(method="exact")
+    table = [[high, len(base) - high], [noisy_high, len(noisy) - noisy_high]]
+    return {
+        "high": high,
+        "n": len(base),
+        "noisy_high": noisy_high,
+        "noisy_n": len(noisy),
+        "percent": [100 * low, 100 * upper],
+        "fisher": stats.fisher_exact(table).pvalue,
+        "rest": [base[base <= 3000].min(), base[base <= 3000].max()],
+        "tops": sorted(base[base > 3000], reverse=True),
+        "noisy": [noisy.min(), noisy.max()],
+    }
 
-# -------------------------------------------------------------------------- SAC, early performance
 
-early = early.query("steps_millions == 0.2 and n.notna()")
-tested = statistics.query("algorithm == 'SAC'").set_index("noise_rate").loc[early["noise_rate"]]
-ours = early[["mean", "std", "n"]].astype(float)
-paper = early[["paper_mean", "paper_std"]].set_axis(["mean", "std"], axis=1)
-errors, p = welch(ours, paper.assign(n=PAPER_SEEDS["SAC"]))
-show(
-    "SAC on HalfCheetah after 200,000 steps, RandomUniformScaleReward(0.5, 1.5)",
-    {
-        "noise rate": early["noise_rate"].array,
-        "n": cells("{:.0f}", ours["n"]),
-        "ours, v5": spell(ours),
-        "the paper, v2": spell(paper),
-        **improvements(tested),
-        "difference from the paper in SE": cells("{:+.1f}", errors),
-        "p": p,
-    },
-)
+def other_noises(statistics, skip):
+    """Our comparisons that are in no other table of the page."""
+    rows = statistics[statistics["p"].notna() & ~statistics["noise"].isin(skip)]
+    if rows.empty:
+        return ""
+    return markdown(
+        {
+            "": rows["algorithm"] + ", " + rows["environment"],
+            "noise": cells("`{}`, p = {}", rows["noise"], rows["noise_rate"]),
+            "n": cells("{:.0f}, {:.0f}", rows["n"], rows["n_baseline"]),
+            **improvements(rows),
+            "p (exact)": cells("{:.2g}", rows["p"]),
+            "adjusted": cells("{:.2g}", rows["p_adjusted"]),
+        }
+    )
+
+
+# ----------------------------------------------------------------------------------------- SAC, all
+
+
+def sac(early, statistics):
+    """SAC on HalfCheetah after 200,000 steps, ours and the paper's."""
+    early = early.query("algorithm == 'SAC' and steps_millions == 0.2 and n.notna()")
+    tested = statistics.query("algorithm == 'SAC'").set_index("noise_rate")
+    tested = tested.loc[early["noise_rate"]]
+    ours = early[["mean", "std", "n"]].astype(float)
+    paper = early[["paper_mean", "paper_std"]].set_axis(["mean", "std"], axis=1)
+    errors, p = welch(ours, paper.assign(n=PAPER_SEEDS["SAC"]))
+    noisy = tested[tested["p"].notna()]
+    text = markdown(
+        {
+            "noise rate": early["noise_rate"],
+            "n": cells("{:.0f}", ours["n"]),
+            "ours, v5": spell(ours),
+            "the paper, v2": spell(paper),
+            **improvements(tested),
+            "p (exact)": cells("{:.2g}", tested["p"]),
+            "difference from the paper in SE": cells("{:+.1f} (p = {:.2g})", errors, p),
+        }
+    )
+    return {"table": text, "p": noisy["p"].to_dict(), "finds": noisy["detectable_percent"].min()}
+
+
+def noise_rates(folder):
+    """The largest distance of a realised noise rate from p, in binomial standard deviations."""
+    largest = 0
+    for path in sorted(folder.glob("*/result.json")):
+        args = json.loads((path.parent / "config.json").read_text())["args"]
+        counts = json.loads(path.read_text())["noise_applied"].values()
+        for rate, (applied, calls) in zip(args["noise_rate"], counts, strict=True):
+            deviation = (calls * rate * (1 - rate)) ** 0.5
+            if deviation:
+                largest = max(largest, abs(applied - calls * rate) / deviation)
+    return largest
+
+
+def reward_scale():
+    """The standard deviation by which PPO would divide its reward on Pusher (reward_scale.py)."""
+    table = pd.read_csv(HERE / "reward_scale/reward_scale.csv").fillna({"noise": ""})
+    return table.set_index(["noise", "begins_anew_when"])["std"].to_dict()
+
+
+def numbers():
+    """Compute all that the page says."""
+    paper, luck = with_luck(read_paper(HERE / "paper"))
+    best = plain(paper["best"]).query("algorithm == 'PPO'").set_index("environment")
+    best = best.assign(n=PAPER_SEEDS["PPO"])
+    paper_base, paper_noisy = (
+        best[[f"{name}_mean", f"{name}_std", "n"]].set_axis(["mean", "std", "n"], axis=1)
+        for name in ("baseline", "noisy")
+    )
+
+    runs = read_runs(HERE / "runs")
+    tables = make_tables(make_studies(runs)[0], read_paper(HERE / "paper"))
+    statistics, early = (plain(tables[n][0]) for n in ("statistics", "compare_early_performance"))
+
+    returns = read_returns(HERE / "runs")
+    ppo = returns.query("algorithm == 'PPO'")
+    chosen = list(zip(best.index, best["noise"], best["noise_rate"], strict=True))
+    of_five = fixed_beforehand(ppo, chosen)
+    base, noisy = of_five[of_five["noise"] == ""], of_five[of_five["noise"] != ""]
+    five = runs[runs["algorithm"] == "PPO"]
+    five = five.loc[fixed_beforehand(plain(five), chosen).index]
+    five = make_tables(make_studies(five)[0])
+    five_statistics, five_summary = (plain(five[n][0]) for n in ("statistics", "summary_PPO"))
+    five_statistics = five_statistics[five_statistics["p"].notna()]
+    skip = [*best["noise"], TRUNCATING, SCALE]
+    shares = variance_share(base), variance_share(noisy)
+    counts = returns.groupby("algorithm").size()
+    return {
+        "runs": ", ".join(f"{name} {n}" for name, n in counts.items()),
+        "draws": f"{DRAWS:,}",
+        "scaled_reward": SCALE,
+        "noisy_share": shares[1],
+        "highest_share": max(share.drop("Humanoid").max() for share in shares),
+        "luck": luck_of_the_best(paper),
+        "consistent": luck_of_the_consistent(luck),
+        "rates": rates(paper),
+        "kinds": kinds(paper),
+        "scaled": scaled_rewards(paper),
+        "worse": worse_everywhere(paper),
+        "mixture": mixture(paper),
+        "paper_spread": paper_spread(paper),
+        "paper_speed": paper_speed(paper),
+        "baselines": baselines(base, paper_base),
+        "cleanrl": cleanrl_tables(base, read_returns(HERE / "v4"), paper_base),
+        "five": five_noises(
+            base, noisy, paper_base, paper_noisy, best["improvement_percent"], five_statistics
+        ),
+        "spread": spread(base, noisy, paper_base, paper_noisy),
+        "speed": speed(five_summary),
+        "pusher": pusher(ppo),
+        "half_cheetah": half_cheetah(ppo),
+        "others": other_noises(statistics, skip),
+        "sac": sac(early, statistics),
+        "rate_error": noise_rates(HERE / "runs"),
+        "scale": reward_scale(),
+    }
+
+
+def page():
+    """Return the text of README.md."""
+    loader = jinja2.FileSystemLoader(HERE)
+    filters = {
+        "p": lambda x: f"{x:.2g}",
+        "g": lambda x: f"{x:g}",
+        "whole": lambda x: f"{x:,.0f}",
+        "tenth": lambda x: f"{x:.1f}",
+        "signed": lambda x: f"{x:+.1f}",
+    }
+    options = {"undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
+    environment = jinja2.Environment(loader=loader, keep_trailing_newline=True, **options)
+    environment.filters |= filters
+    return environment.get_template("README.md.jinja").render(numbers())
+
+
+if __name__ == "__main__":
+    (HERE / "README.md").write_text(page())
+    print(f"Wrote {HERE / 'README.md'}")

@@ -1,0 +1,165 @@
+"""The page of results: its numbers are those of claims.py, and claims.py's are right."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from gymnasium.wrappers import NormalizeReward
+from scipy import stats
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "results"))
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "results/reward_scale"))
+import claims
+import reward_scale
+
+from analyze_verdict import detectable_shift
+
+RESULTS = claims.HERE
+
+
+def test_the_page_is_what_its_command_writes():
+    assert (RESULTS / "README.md").read_text() == claims.page()
+
+
+# ----------------------------------------------------------------------------------- statistics
+
+
+def test_cleanrls_deviations_are_those_of_a_population():
+    """Three seeds: their sample standard deviation is sqrt(3/2) times what CleanRL prints."""
+    returns = np.array([1.0, 2, 6])
+    claims_std = claims.CLEANRL["CleanRL, v2"]["Hopper"][1]
+    hopper = claims.cleanrl("CleanRL, v2").loc["Hopper"]
+    assert hopper["mean"] == 2311.49 and hopper["n"] == 3
+    assert hopper["std"] / claims_std == pytest.approx(returns.std(ddof=1) / returns.std())
+
+
+def test_holm_by_hand():
+    np.testing.assert_allclose(claims.holm([0.01, 0.04, 0.03, 0.5]), [0.04, 0.09, 0.09, 0.5])
+
+
+def test_welch_is_scipys():
+    rng = np.random.default_rng(0)
+    runs = pd.DataFrame({"environment": ["a"] * 5 + ["b"] * 7, "test": rng.normal(size=12)})
+    other = runs.assign(test=rng.normal(size=12))
+    x, y = claims.sample(runs, "test"), claims.sample(other, "test")
+    errors, p = claims.welch(x, y)
+    for i, name in enumerate("ab"):
+        pair = [table.loc[table["environment"] == name, "test"] for table in (runs, other)]
+        expected = stats.ttest_ind(*pair, equal_var=False)
+        assert p[i] == pytest.approx(expected.pvalue)
+        assert errors.iloc[i] == pytest.approx(expected.statistic)
+
+
+def test_power_is_that_of_the_test():
+    """Without an effect it is the level of the exact test, which is 0.043 for ten against ten."""
+    assert claims.power(0, 1, 10, 1, 10) == pytest.approx(0.043, abs=0.012)
+    assert claims.power(3, 1, 10, 1, 10) > 0.99
+    assert claims.power(50 * detectable_shift(10, 10), 50, 10, 50, 10) == pytest.approx(
+        0.8, abs=0.03
+    )
+    assert 0.02 < claims.power_of_levene(1, 10) < 0.06 and claims.power_of_levene(9, 10) > 0.9
+
+
+def test_the_share_of_the_test_in_the_variance(tmp_path):
+    """Episodes of 1, 2, 3: variance 1, of their mean 1/3; between seeds 2 and 4: variance 2."""
+    lines = ["step,episode,episodic_return,episodic_length", "10,0,9,1", "10,1,0,1", "10,2,5,1"]
+    lines += ["20,0,1,1", "20,1,2,1", "20,2,3,1"]
+    (tmp_path / "eval.csv").write_text("\n".join(lines) + "\n")
+    assert claims.test_error(tmp_path) == pytest.approx(1 / 3)
+    runs = pd.DataFrame({"environment": ["a", "a"], "test": [2.0, 4.0], "error": [1 / 3, 1 / 3]})
+    assert claims.variance_share(runs)["a"] == pytest.approx(100 / 3 / 2)
+
+
+# ------------------------------------------------------------------------------- which runs count
+
+
+def make_runs(seeds_of_noise, shift=0.0):
+    """Runs of PPO on Pusher: seed s has the return -50 - s % 10 + 20 (+ shift from seed 11 on)."""
+    rows = [
+        ("PPO", "Pusher", noise, "1.00" if noise else "0.00", seed, value)
+        for noise, seeds, gain in seeds_of_noise
+        for seed in seeds
+        for value in [-50.0 - seed % 10 + gain + (shift if noise and seed > 10 else 0)]
+    ]
+    names = ["algorithm", "environment", "noise", "noise_rate", "seed", "test"]
+    return pd.DataFrame(rows, columns=names)
+
+
+def test_fresh_seeds_are_apart_and_only_whole_sets_are_shown():
+    runs = make_runs([("", range(1, 31), 0), (claims.ENDING, range(1, 31), 20)], shift=-20)
+    found = claims.pusher(runs)
+    assert set(found["p"]) == {"fixed", "fresh", "all"}
+    assert found["p"]["fixed"] < 1e-4 and found["p"]["fresh"] == pytest.approx(1)
+    assert found["percent"]["fixed"] == pytest.approx(100 * 20 / 54.5)
+    assert found["percent"]["fresh"] == pytest.approx(0)
+    incomplete = claims.pusher(runs[runs["seed"] != 30])
+    assert set(incomplete["p"]) == {"fixed"}
+    truncated = make_runs([(claims.TRUNCATING, range(1, 21), 20)])
+    found = claims.pusher(pd.concat([runs, truncated]))
+    assert set(found["p"]) == {"fixed", "fresh", "all", "truncated", "ways"}
+    assert found["p"]["truncated"] < 1e-4
+
+
+def test_the_five_comparisons_stay_on_seeds_1_to_10():
+    runs = make_runs([("", range(1, 31), 0), (claims.ENDING, range(1, 31), 20), ("N(1)", [1], 5)])
+    kept = claims.fixed_beforehand(runs, [("Pusher", claims.ENDING, "1.00")])
+    assert set(kept["seed"]) == set(range(1, 11)) and set(kept["noise"]) == {"", claims.ENDING}
+    other = claims.fixed_beforehand(runs, [("Hopper", claims.ENDING, "1.00")])
+    assert set(other["noise"]) == {""} and len(other) == 10
+
+
+# ---------------------------------------------------------------------- what the paper's tables say
+
+
+def test_what_the_papers_tables_say_by_hand():
+    paper = claims.read_paper(RESULTS / "paper")
+    found = claims.rates(paper)["one"]
+    assert [found[name]["count"] for name in found] == [6, 3, 14]
+    assert found["best"]["p"] == pytest.approx(stats.binomtest(6, 15, 1 / 6).pvalue)
+    found = claims.mixture(paper)["TD3"]
+    assert found["fifth"] == pytest.approx(5 * -269.8 + 400)
+    assert found["std_then"] == pytest.approx((found["fifth"] + 100) / -np.sqrt(5))
+    assert found["std_then"] == pytest.approx(found["std"], rel=0.01)
+    kinds = claims.kinds(paper)
+    assert "| PPO | 0" in kinds["table"] and kinds["fisher"] == pytest.approx(1 / 126)
+    assert claims.worse_everywhere(paper)["counts"]["RandomNormalNoisyObservation(1.0)"] == {
+        "PPO": 3,
+        "SAC": 5,
+        "TD3": 6,
+    }
+
+
+def test_a_noise_in_all_three_algorithms_by_luck():
+    """P(consistent at one of six rates) cubed; a single rate has 6/32."""
+    found = claims.scaled_rewards(claims.read_paper(RESULTS / "paper"))
+    assert (6 / 32) ** 3 < found["this"] / 100 < 0.7**3
+    assert found["this"] < found["any"] < 15 * found["this"]
+
+
+# ------------------------------------------------------------------------------- the reward's scale
+
+
+def test_the_reward_scale_is_gymnasiums(monkeypatch):
+    """The sum that begins anew at termination is the one that NormalizeReward keeps."""
+    monkeypatch.setattr(reward_scale, "STEPS", 250)
+    kept = []
+
+    class Recorded(NormalizeReward):
+        def step(self, action):
+            result = super().step(action)
+            kept.append(float(self.discounted_reward[0]))
+            return result
+
+    def wrapped(env, noises, rates):
+        return Recorded(reward_scale_make_noisy(env, noises, rates), gamma=reward_scale.GAMMA)
+
+    reward_scale_make_noisy = reward_scale.make_noisy
+    plain = reward_scale.discounted_returns(reward_scale.NOISES[1])
+    assert plain["terminated"] == plain["any end"]
+    truncated = reward_scale.discounted_returns(reward_scale.NOISES[2])
+    assert truncated["any end"] == plain["any end"] != truncated["terminated"]
+    monkeypatch.setattr(reward_scale, "make_noisy", wrapped)
+    reward_scale.discounted_returns(reward_scale.NOISES[2])
+    np.testing.assert_allclose(kept, truncated["terminated"], rtol=1e-5)
