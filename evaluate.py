@@ -1,7 +1,6 @@
 """Test trained policies again: clean and under noise, in a window, or as a video.
 
-    python evaluate.py runs/Hopper-v5__* --noise "RandomNormalNoisyObservation(0.1)" \
-        "RandomNormalNoisyAction(0.2)" --noise-rate 0.2 1.0 --jobs 4
+    python evaluate.py runs/Hopper-v5__* --noise "RandomNormalNoisyAction(0.2)" --noise-rate 0.5 1
     python evaluate.py runs/Hopper-v5__sac_continuous_noisy__baseline__1 --render
     python evaluate.py runs --video videos
 
@@ -85,16 +84,20 @@ def reason(error):
 
 def find_runs(paths):
     """Return the runs that the paths name, each once; a folder stands for its finished runs."""
+    if not paths:
+        fail("name the runs to test, for example: python evaluate.py runs/Hopper-v5__*")
     folders = []
     for path in paths:
-        if path.name in ("logs", "choice.csv") or (path / "report.html").exists():
-            continue  # of benchmark.sh and of analyze.py
-        if path.is_dir() and is_run(path):
+        children = sorted(filter(is_run, path.iterdir())) if path.is_dir() else []
+        if children:
+            finished = [child for child in children if (child / "result.json").exists()]
+            if len(finished) < len(children):
+                print(f"{path}: unfinished runs are left out ({len(children) - len(finished)})")
+            folders += finished
+        elif is_run(path):
             folders.append(path)
-        elif path.is_dir() and any(map(is_run, path.iterdir())):
-            runs = [folder for folder in sorted(path.iterdir()) if is_run(folder)]
-            folders += [folder for folder in runs if (folder / "result.json").exists()]
-        else:
+        elif path.name not in ("logs", "choice.csv") and not (path / "report.html").exists():
+            # What is skipped is written by benchmark.sh and by analyze.py.
             fail(f"{path} is neither a run nor a folder of runs")
     if not folders:
         fail(f"there is no finished run in {', '.join(map(str, paths))}")
@@ -110,8 +113,8 @@ def read_run(folder):
         args = config["args"]
         noise = " + ".join(args["noise"]) or "no noise"
         trained_with = (args["env_id"], args["exp_name"], noise, rate_text(args["noise_rate"]))
-        max_episode_steps = args.get("max_episode_steps")
-        return Run(folder, config["algorithm"], args["env_id"], max_episode_steps, trained_with)
+        algorithm, limit = str(config["algorithm"]), args.get("max_episode_steps")
+        return Run(folder, algorithm, args["env_id"], limit, trained_with)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         fail(f"cannot read {folder / 'config.json'}: {type(error).__name__}: {reason(error)}")
 
@@ -164,10 +167,13 @@ def check(run, conditions):
 
 def play(run, noises, rates, args):
     """Play episodes; return their true returns and lengths, [(return, length), ...]."""
-    env, policy = load(run, "rgb_array" if args.video else "human" if args.render else None)
-    video = f"{run.folder.name}__{noise_slug(noises, rates) or 'clean'}"
+    name = f"{run.folder.name}__{noise_slug(noises, rates) or 'clean'}"
     if args.video:
-        env = RecordVideo(env, str(args.video / f".{video}"), episode_trigger=lambda i: True)
+        folder = args.video / f".{name}"
+        env, policy = load(run, "rgb_array")
+        env = RecordVideo(env, str(folder), episode_trigger=lambda episode: True)
+    else:
+        env, policy = load(run, "human" if args.render else None)
     env = make_noisy(env, noises, rates)
     results = []
     for episode in range(args.episodes):
@@ -179,8 +185,7 @@ def play(run, noises, rates, args):
         results.append((episodic_return, int(info["episode"]["l"])))
     env.close()
     if args.video:
-        folder = args.video / f".{video}"
-        (folder / "rl-video-episode-0.mp4").replace(args.video / f"{video}.mp4")
+        (folder / "rl-video-episode-0.mp4").replace(args.video / f"{name}.mp4")
         folder.rmdir()
     return results
 
@@ -306,6 +311,8 @@ def main(args):
     for run in runs:
         check(run, conditions)
     if args.video:
+        if len({run.folder.name for run in runs}) < len(runs):
+            fail("--video: two of these runs have the same name, and so would their videos")
         prepare_video(args.video)
     if args.video or args.render:
         show(runs, conditions, args)
@@ -323,6 +330,6 @@ def main(args):
 
 if __name__ == "__main__":
     try:
-        main(tyro.cli(Args))
+        main(tyro.cli(Args, description=__doc__))
     except KeyboardInterrupt:
         fail("stopped; the conditions that were played are stored", code=130)

@@ -75,9 +75,10 @@ def command(*options, **environment):
     return {"args": line, "env": env | environment, "text": True}
 
 
-def run(*options, **environment):
+def run(*options, cwd=None, **environment):
     """Call evaluate.py as a user does."""
-    return subprocess.run(capture_output=True, timeout=300, **command(*options, **environment))
+    line = command(*options, **environment)
+    return subprocess.run(capture_output=True, timeout=300, cwd=cwd, **line)
 
 
 # What is played
@@ -282,10 +283,24 @@ def test_all_of_a_folder_with_logs_and_an_analysis(runs, capsys):
     assert files(runs) == before
 
 
-def test_a_folder_stands_for_its_finished_runs(runs):
+def test_a_folder_stands_for_its_finished_runs(runs, capsys):
     (one(runs, "SAC") / "result.json").unlink()
+    runs = runs.rename(runs.parent / "two__words")  # which is no run's name here
+    (runs / "report.html").touch()  # analyze.py --out may be the same folder
     main(Args((runs, one(runs, "TD3")), episodes=1))
-    assert sum((run_dir / "robustness.csv").exists() for run_dir in runs.iterdir()) == 3
+    assert f"{runs}: unfinished runs are left out (1)" in capsys.readouterr().out
+    assert sum((run_dir / "robustness.csv").exists() for run_dir in runs.glob("Inv*")) == 3
+
+
+def test_an_environment_of_the_folder_that_it_is_called_from(runs, tmp_path):
+    run_dir = one(runs, "PPO")
+    limited = "gymnasium.envs.mujoco.inverted_pendulum_v5:InvertedPendulumEnv"
+    text = f"import gymnasium as gym\ngym.register('Mine-v0', '{limited}', max_episode_steps=3)\n"
+    (tmp_path / "my_envs.py").write_text(text)
+    other_environment(run_dir, "my_envs:Mine-v0")
+    result = run(run_dir, "--episodes", "2", "--jobs", "2", cwd=tmp_path)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert [row["episodic_length"] for row in stored(run_dir)] == ["3", "3"]
 
 
 # Videos
@@ -308,6 +323,12 @@ def test_videos(runs, tmp_path):
         assert video.shape[1:] == (480, 480, 3)
         assert video[0].std() > 10 and np.abs(video[0].astype(int) - video[-1]).max() > 50
     assert f"return {float(row['episodic_return']):.1f}, " in result.stdout
+
+
+def test_videos_of_runs_of_one_name(runs, tmp_path, capsys):
+    other = shutil.copytree(one(runs, "PPO"), tmp_path / "other" / one(runs, "PPO").name)
+    args = Args((one(runs, "PPO"), other), video=tmp_path / "videos")
+    refused(args, "the same name", tmp_path, capsys)
 
 
 def test_without_an_opengl_library(runs, tmp_path):
@@ -393,6 +414,7 @@ def test_bad_runs(runs, capsys, message):
         ({"seed": -1}, "--seed"),
         ({"render": True, "video": Path("v")}, "exclude each other"),
         ({"video": Path(__file__, "v")}, "cannot write to"),
+        ({"runs": ()}, "name the runs"),
         ({"runs": (Path("nowhere"),)}, "nowhere is neither a run nor a folder of runs"),
         ({"runs": (Path(__file__),)}, "is neither a run nor a folder of runs"),
         ({"runs": (ROOT / "docs",)}, "is neither a run nor a folder of runs"),
@@ -420,5 +442,6 @@ def refused(args, message, runs, capsys):
 def test_help_has_a_sentence_for_every_argument():
     result = run("--help")
     assert result.returncode == 0
+    assert "python evaluate.py runs --video videos" in result.stdout
     for name in ("--noise-rate", "--episodes", "--seed", "--jobs", "--render", "--video"):
         assert name in result.stdout
