@@ -564,8 +564,8 @@ class RandomNormalNoisyAction(NoiseWrapper):
     >>> _, _, _, _, info = env.step(np.zeros(1, np.float32))
     >>> info
     {'noise': ('RandomNormalNoisyAction',)}
-    >>> env.unwrapped.last_u  # what the environment received
-    np.float32(-0.34995687)
+    >>> print(f"{env.unwrapped.last_u:.3f}")  # what the environment received
+    -0.350
     """
 
     def __init__(self, env: Env, noise_rate: float | str, scale: float, *, loc: float = 0.0):
@@ -733,8 +733,13 @@ def _pair(noises: Sequence[str], rates: Sequence[float | str]) -> list[tuple[Noi
         canonical = canonical * len(noises)
     parsed = [parse_noise(noise) for noise in noises]
     pairs = [(noise, rate) for noise, rate in zip(parsed, canonical, strict=True) if rate != 0]
-    ordered = [pair for wrapper in _DYNAMICS for pair in pairs if pair[0].wrapper is wrapper]
-    return ordered + [pair for pair in pairs if pair[0].wrapper not in _DYNAMICS]
+    return sorted(pairs, key=_place)
+
+
+def _place(pair: tuple[Noise, float | str]) -> int:
+    """Return where make_noisy puts a noise: what changes the dynamics comes first."""
+    wrapper = pair[0].wrapper
+    return _DYNAMICS.index(wrapper) if wrapper in _DYNAMICS else len(_DYNAMICS)
 
 
 def canonical_noises(
