@@ -367,7 +367,8 @@ baseline: the first evaluation at which the mean over seeds reaches the baseline
     "statistics": f"""IQM: interquartile mean of the final returns over n seeds. Improvement: IQM
 of (return - baseline mean) / |baseline mean| over seeds and environments, minus that of the
 baseline's own returns. [ ]: 95 % intervals from a stratified bootstrap over seeds (Student's t
-times the bootstrap standard error; the baseline is resampled too). In simulated samples of one
+times the bootstrap standard error, with Satterthwaite's degrees of freedom: few seeds of the
+baseline widen it as much as few with noise). In simulated samples of one
 environment they held the true IQM in at least
 {", ".join(f"{c} % (n = {n})" for n, c in COVERAGE.items())} of the cases where returns were
 normal, skewed or 20 % of them in a low peak, but in
@@ -376,8 +377,8 @@ and narrow peak, as PPO's on HalfCheetah may be. P(improvement):
 probability that a noisy run beats a baseline run, averaged over environments, with Newcombe's
 interval. No interval for n < {MIN_SEEDS}. p: exact two-sided Mann-Whitney test, stratified by
 environment. It is the primary test: where an interval says otherwise, p decides. In a full grid
-the rows of all environments together are primary: in one environment five seeds cannot reach 0.05
-after the adjustment. p adjusted: Benjamini-Hochberg over one family, all configurations of an
+the rows of all environments together are primary: in one environment alone no configuration with
+five seeds can reach 0.05 on its own after the adjustment. p adjusted: Benjamini-Hochberg over one family, all configurations of an
 algorithm in one environment, or in all of them together; the verdict is better or worse where it
 is at most 0.05, and perhaps so where only p is. Smallest p adjusted: what one configuration alone
 could reach at most with its number of seeds. Detectable: the improvement that these seeds find at

@@ -162,9 +162,11 @@ def mann_whitney(x, y):
 
 
 def leave_one_seed_out(finals):
-    """Value of the best configuration without the luck of choosing it on its own seeds.
+    """Value of choosing the best configuration, without the luck of choosing on the same seeds.
 
-    The configuration that is best on all other seeds is measured on the seed s that was left out:
+    It values the procedure, not the configuration that is best on all seeds: another one may be
+    chosen each time. It is descriptive: the terms share seeds, so it has no honest interval. The
+    configuration that is best on all other seeds is measured on the seed s that was left out:
     mean over s of finals[argmax_c mean_{t != s} finals[c, t], s].
 
     finals (configs x seeds) -> float.
