@@ -378,10 +378,10 @@ probability that a noisy run beats a baseline run, averaged over environments, w
 interval. No interval for n < {MIN_SEEDS}. p: exact two-sided Mann-Whitney test, stratified by
 environment. It is the primary test: where an interval says otherwise, p decides. In a full grid
 the rows of all environments together are primary: in one environment alone no configuration with
-five seeds can reach 0.05 on its own after the adjustment. p adjusted: Benjamini-Hochberg over one family, all configurations of an
-algorithm in one environment, or in all of them together; the verdict is better or worse where it
-is at most 0.05, and perhaps so where only p is. Smallest p adjusted: what one configuration alone
-could reach at most with its number of seeds. Detectable: the improvement that these seeds find at
+five seeds can reach 0.05 on its own after the adjustment. p adjusted: Benjamini-Hochberg over one
+family, all configurations of an algorithm in one environment, or in all of them together; the
+verdict is better or worse where it is at most 0.05, and perhaps so where only p is. Smallest p
+adjusted: what one configuration alone could reach at most with its number of seeds. Detectable: the improvement that these seeds find at
 the 5 % level, uncorrected, with 80 % power; seeds needed: how many on each side the observed
 improvement takes. Both are for normal returns with the standard deviation of these seeds.""",
     "interactions": """Two noises together: interaction = mean with both - mean with the first -
