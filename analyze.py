@@ -376,14 +376,15 @@ normal, skewed or 20 % of them in a low peak, but in
 and narrow peak, as PPO's on HalfCheetah may be. P(improvement):
 probability that a noisy run beats a baseline run, averaged over environments, with Newcombe's
 interval. No interval for n < {MIN_SEEDS}. p: exact two-sided Mann-Whitney test, stratified by
-environment. It is the primary test: where an interval says otherwise, p decides. In a full grid
-the rows of all environments together are primary: in one environment alone no configuration with
-five seeds can reach 0.05 on its own after the adjustment. p adjusted: Benjamini-Hochberg over one
+environment. It is the primary test: where an interval says otherwise, p decides. In a full grid the
+rows of all environments together are primary: in one environment alone no configuration with five
+seeds can reach 0.05 on its own after the adjustment. p adjusted: Benjamini-Hochberg over one
 family, all configurations of an algorithm in one environment, or in all of them together; the
 verdict is better or worse where it is at most 0.05, and perhaps so where only p is. Smallest p
-adjusted: what one configuration alone could reach at most with its number of seeds. Detectable: the improvement that these seeds find at
-the 5 % level, uncorrected, with 80 % power; seeds needed: how many on each side the observed
-improvement takes. Both are for normal returns with the standard deviation of these seeds.""",
+adjusted: what one configuration alone could reach at most with its number of seeds. Detectable: the
+improvement that these seeds find at the 5 % level, uncorrected, with 80 % power; seeds needed: how
+many on each side the observed improvement takes. Both are for normal returns with the standard
+deviation of these seeds.""",
     "interactions": """Two noises together: interaction = mean with both - mean with the first -
 mean with the second + mean without noise, of the final test returns, where each of the four has at
 least 3 seeds (n is the smallest number), with a 95 % interval (Welch, Satterthwaite), and in
