@@ -19,15 +19,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from analyze_runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED
 from analyze_statistics import bootstrap_iqm, mann_whitney, probability_of_improvement
 from analyze_verdict import interval, p_value, percent, power
 
 LEVEL = 0.05  # of a verdict, two-sided, over all verdicts of one command
 BASELINE = ("", "0.0")
-FRESH_SEED = 1001  # the first seed of the confirmation; the search ends below
 LAST_TESTS = 3  # a run's score in the search is the mean over so many of its last tests
-COLUMNS = ["algorithm", "environment", "phase", "round", "noise", "noise_rate", "seeds", "score"]
-COLUMNS += ["survives"]
 
 
 class Round(NamedTuple):
@@ -103,7 +101,7 @@ def advance(noises, budget, confirm, returns):
         survivors = [noise for noise in noises if noise in best]
         rounds.append(Round(noises, last_seed, scores, survivors))
         noises = survivors
-    seeds = range(FRESH_SEED, FRESH_SEED + confirm)
+    seeds = range(FIRST_CONFIRMATION_SEED, FIRST_CONFIRMATION_SEED + confirm)
     return State(rounds, noises, seeds, missing([*noises, BASELINE], seeds, returns))
 
 
@@ -183,17 +181,18 @@ def verdict(name, noises, comparison, p_corrected, verdicts):
     text = f"{start}: {seeds}, {evidence}"
     if math.isfinite(comparison.detectable):
         difference = percent(comparison.detectable, sign="")
-        text += f"; so many seeds show a difference of {difference} in 80 % of all cases"
+        text += f"; with {comparison.seeds} seeds a difference of {difference} would have been seen"
+        text += " (80 % power)"
     return f"{text}."
 
 
 def rows(algorithm, environment, state, returns, helped):
-    """Return the lines of choice.csv for one finished choice, as dicts; see COLUMNS."""
+    """Return the lines of choice.csv for one finished choice, as dicts; see CHOICE_COLUMNS."""
     lines = []
 
     def add(phase, number, noise, seeds, score, survives):
         values = algorithm, environment, phase, number, *noise, seeds, score, survives
-        lines.append(dict(zip(COLUMNS, values, strict=True)))
+        lines.append(dict(zip(CHOICE_COLUMNS, values, strict=True)))
 
     for number, done in enumerate(state.rounds, start=1):
         for noise in done.noises:

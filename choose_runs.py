@@ -13,7 +13,7 @@ from statistics import fmean
 from typing import NamedTuple
 
 import choose
-from analyze_runs import read_config, read_evaluations
+from analyze_runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED, read_run
 from grid import Run, cell, cells, fail, make_run, result
 
 # What a run takes on one core until the finished ones tell: docs/sweeps.md
@@ -55,10 +55,10 @@ def follow(args, algorithm, env_id):
         fail(f"--budget must be at least {len(noises)}, a run for each noise, not {budget}")
     schedule = choose.schedule(len(noises), budget)
     last_seed = sum(seeds for _, seeds in schedule)
-    if last_seed >= choose.FRESH_SEED:
+    if last_seed >= FIRST_CONFIRMATION_SEED:
         fail(f"--budget {budget} is too large: the best noises would run with {last_seed} seeds")
     cell_of = {choose.BASELINE: ([], [])} | noises
-    runs, returns, times = {}, {}, []
+    runs, returns = {}, {}
     while True:
         state = choose.advance(list(noises), budget, args.confirm, returns)
         finished = {}
@@ -66,14 +66,15 @@ def follow(args, algorithm, env_id):
             run = make_run(args, algorithm, env_id, *cell_of[noise, rate], seed)
             runs[noise, rate, seed] = run
             if result(run)[0]:
-                finished[noise, rate, seed], seconds = read_run(run, seed)
-                times.append(seconds)
+                finished[noise, rate, seed] = read_return(run, seed)
         if not finished:
             break
         returns |= finished
     left = choose.number_of_runs(len(noises), budget, args.confirm) - len(returns)
-    expected = START_UP + args.total_timesteps / STEPS_PER_SECOND[algorithm]
-    core_hours = left * (fmean(times) if times else expected) / 3600
+    seconds = START_UP + args.total_timesteps / STEPS_PER_SECOND[algorithm]
+    if returns:
+        seconds = fmean(wall_time(runs[key]) for key in returns)
+    core_hours = left * seconds / 3600
     name = f"{algorithm.upper()} on {env_id}"
     return Choice(name, algorithm, env_id, schedule, args.confirm, state, runs, returns, core_hours)
 
@@ -110,20 +111,21 @@ def as_text(found):
     return " + ".join(noises), " + ".join(map(str, rates))
 
 
-def read_run(run, seed):
-    """Return what a finished run counts for, and how many seconds it has taken.
+def read_return(run, seed):
+    """Return what a finished run counts for.
 
     That is the mean over its last tests in the search, and its last test in the confirmation.
     """
-    try:
-        config = read_config(run.folder)
-        _, tests = read_evaluations(run.folder, config["episodes"], config["total"])
-        seconds = json.loads((run.folder / "result.json").read_text())["wall_time_seconds"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        fail(f"cannot read {run.folder} ({reason}); delete it to run it again")
-    count = 1 if seed >= choose.FRESH_SEED else choose.LAST_TESTS
-    return fmean(tests[-count:]), seconds
+    row = read_run(run.folder)
+    if row["status"] != "finished":
+        fail(f"{run.folder} cannot be used ({row['reason']}); delete it to run it again")
+    count = 1 if seed >= FIRST_CONFIRMATION_SEED else choose.LAST_TESTS
+    return fmean(row["returns"][-count:])
+
+
+def wall_time(run):
+    """Return how many seconds a finished run has taken."""
+    return json.loads((run.folder / "result.json").read_text())["wall_time_seconds"]
 
 
 # ---------------------------------------------------------------------------------------- in words
@@ -218,7 +220,7 @@ def write_choice(path, rows):
             rows = [r for r in old if (r["algorithm"], r["environment"]) not in ours] + rows
         temporary = path.with_suffix(".tmp")
         with open(temporary, "w", newline="") as file:
-            writer = csv.DictWriter(file, choose.COLUMNS, lineterminator="\n")
+            writer = csv.DictWriter(file, CHOICE_COLUMNS, lineterminator="\n")
             writer.writeheader()
             writer.writerows(rows)
         os.replace(temporary, path)

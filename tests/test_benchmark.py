@@ -592,9 +592,10 @@ def undisturbed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("undisturbed")
     args = parse_args("list", "/", [*CHOOSE, "--runs-dir", str(folder)])
     check(args)
-    while due := [c.runs[run] for c in choose_runs.choices(args) for run in c.state.due]:
-        for one in due:
-            stub_run.train([one.script, *one.arguments])
+    for _ in range(3):  # two rounds and the confirmation
+        for choice in choose_runs.choices(args):
+            for key in choice.state.due:
+                stub_run.train([choice.runs[key].script, *choice.runs[key].arguments])
     [sentence] = choose_runs.conclusion(choose_runs.choices(args), folder)
     return *chosen(folder), sentence
 

@@ -9,10 +9,9 @@ import pytest
 import stub_run
 
 import choose_runs
+from analyze_runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED
 from choose import (
     BASELINE,
-    COLUMNS,
-    FRESH_SEED,
     Comparison,
     advance,
     compare,
@@ -38,10 +37,14 @@ def play(noises, budget, table, confirm=CONFIRM):
     """Run a choice to its end; table (noises, and the baseline last; seeds) holds the returns."""
     place = {noise: i for i, noise in enumerate([*noises, BASELINE])}
     returns = {}
-    while (state := advance(noises, budget, confirm, returns)).due:
+    state = advance(noises, budget, confirm, returns)
+    while state.due:
         for noise, rate, seed in state.due:
-            column = seed - FRESH_SEED + SEARCH_SEEDS if seed >= FRESH_SEED else seed - 1
+            column = seed - 1
+            if seed >= FIRST_CONFIRMATION_SEED:
+                column = SEARCH_SEEDS + seed - FIRST_CONFIRMATION_SEED
             returns[noise, rate, seed] = table[place[noise, rate], column]
+        state = advance(noises, budget, confirm, returns)
     return state, returns
 
 
@@ -169,7 +172,8 @@ def test_verdicts_in_words():
     corrected = verdict("PPO on Pusher-v5", 90, good, 0.055, 5)
     assert "none of 90 noises could be shown to help; the best of them, Random" in corrected
     assert "p = 0.011, corrected for 5 verdicts 0.055; " in corrected
-    assert corrected.endswith("so many seeds show a difference of 20 % in 80 % of all cases.")
+    seen = "; with 10 seeds a difference of 20 % would have been seen (80 % power)."
+    assert corrected.endswith(seen)
     falling = good._replace(winner=("RandomNormalNoisyReward(1.0)", "1.0:0.0"))
     assert "RandomNormalNoisyReward(1.0) at 1.0 to 0.0 beats" in verdict("", 2, falling, 0.011, 1)
     assert verdict("PPO on X", 1, good._replace(p=0.3), 0.3, 1).startswith(
@@ -196,7 +200,7 @@ def test_rows_of_choice_csv():
     table = np.arange(4.0)[:, None] + np.zeros(SEARCH_SEEDS + CONFIRM)
     state, returns = play(named(3), 3, table)
     lines = rows("PPO", "X", state, returns, helped=False)
-    assert [list(line) for line in lines] == [COLUMNS] * len(lines)
+    assert [list(line) for line in lines] == [CHOICE_COLUMNS] * len(lines)
     search = "PPO X search"
     assert [" ".join(str(value) for value in line.values()) for line in lines] == [
         f"{search} 1 noise 0 1 0.0 no",
