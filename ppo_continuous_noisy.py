@@ -33,6 +33,7 @@ import numpy as np
 import torch
 import torch.nn as nn
 import tyro
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from tensorboard.plugins.hparams.summary_v2 import hparams_pb
 from torch.func import functional_call, grad_and_value
 from torch.utils.tensorboard import SummaryWriter
@@ -402,12 +403,11 @@ def fail(message, *lines, code=2):
 
 def read_args(words):
     """Read the command line; a whole number may be written as 1e6."""
-    words = [re.sub(r"^([1-9])e(\d)$", lambda m: m[1] + "0" * int(m[2]), word) for word in words]
-    return tyro.cli(
-        Args,
-        args=words,
-        description="\n  ".join([__doc__, "Noises:", *noisy.signatures()]),
-    )
+    in_full = [
+        re.sub(r"(^|=)([1-9])e(\d)$", lambda m: m[1] + m[2] + "0" * int(m[3]), w) for w in words
+    ]
+    noises = "\n  ".join(["Noises:", *noisy.signatures()])
+    return tyro.cli(Args, args=in_full, description=f"{__doc__}\n{noises}")
 
 
 def check(args):
@@ -422,6 +422,9 @@ def check(args):
         fail("--cuda: PyTorch finds no GPU; leave it out to run on the CPU")
     try:
         env_id = noisy.canonical_env_id(args.env_id)
+    except ValueError as error:
+        fail(f"--env-id: {error}")
+    try:
         noise, noise_rate = noisy.canonical_noises(args.noise, args.noise_rate)
     except ValueError as error:
         fail(*str(error).split("\n"))
@@ -430,20 +433,25 @@ def check(args):
 
 def add_noise(env, args):
     """Return the training environment; fail unless its spaces and its noise can be worked with."""
-    spaces = ("observations", env.observation_space, "fiu"), ("actions", env.action_space, "f")
-    for name, space, kinds in spaces:
-        if not isinstance(space, gym.spaces.Box) or space.dtype.kind not in kinds:
-            fail(f"--env-id {args.env_id}: needs Box {name}; this environment has {space}")
-    if len(env.action_space.shape) != 1:
-        fail(f"--env-id {args.env_id}: needs one-dimensional actions, not {env.action_space}")
+    observations, actions = env.observation_space, env.action_space
+    has = f"--env-id {args.env_id}: this environment has"
+    if not isinstance(observations, gym.spaces.Box) or observations.dtype.kind not in "fiu":
+        fail(f"{has} observations {observations}; needs Box observations of numbers")
+    if (
+        not isinstance(actions, gym.spaces.Box)
+        or actions.dtype.kind != "f"
+        or len(actions.shape) != 1
+    ):
+        fail(f"{has} actions {actions}; needs Box actions of floats in one dimension")
+    try:
+        noisy_env = noisy.make_noisy(env, args.noise, args.noise_rate)
+    except ValueError as error:
+        fail(f"--noise: {error}")
     if not isinstance(env.unwrapped.observation_space, gym.spaces.Box):
         print(f"{args.env_id}: observations are flattened to {env.observation_space}")
     if env.spec.max_episode_steps is None:
         print(f"{args.env_id} declares no time limit; --max-episode-steps sets one")
-    try:
-        return noisy.make_noisy(env, args.noise, args.noise_rate)
-    except ValueError as error:
-        fail(f"--noise: {error}")
+    return noisy_env
 
 
 def check_finite(step, observation, reward):
@@ -486,6 +494,7 @@ def compiled(function, args):
     try:
         if args.compile:
             torch.compile(torch.neg)(torch.zeros(8, device="cuda" if args.cuda else "cpu"))
+            torch.compiler.reset()  # forget what earlier runs of this process compiled
             return torch.compile(function, fullgraph=True, dynamic=False)
     except Exception as error:  # no C++ compiler, no Python headers, ...
         reason = str(getattr(error, "inner_exception", error)).strip()
@@ -619,6 +628,11 @@ class Run:
         values |= {"noise": " + ".join(self.args.noise), "noise_rate": max([0.0, *rates])}
         values = {k: v if isinstance(v, int | float) else str(v) for k, v in values.items()}
         experiment, _, end = hparams(values, {"eval/episodic_return_mean": 0})
+        plugin_data = experiment.value[0].metadata.plugin_data
+        data = HParamsPluginData.FromString(plugin_data.content)
+        for column in data.experiment.hparam_infos:
+            column.differs = column.name in first  # TensorBoard shows these columns first
+        plugin_data.content = data.SerializeToString()
         for summary in (experiment, hparams_pb(values, trial_id=self.folder.name), end):
             self.writer.file_writer.add_summary(summary)
 

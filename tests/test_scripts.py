@@ -24,7 +24,7 @@ import torch
 import ppo_continuous_noisy as ppo
 import sac_continuous_noisy as sac
 import td3_continuous_noisy as td3
-from noisy_wrappers import NoiseWrapper
+from noisy_wrappers import NoiseWrapper, signatures
 
 ROOT = Path(__file__).parent.parent
 SCRIPTS = {"SAC": sac, "TD3": td3, "PPO": ppo}
@@ -131,7 +131,7 @@ def test_the_test_environment_is_clean(algorithm, tmp_path):
     )
     with (
         mock.patch.object(script, "evaluate", wraps=script.evaluate) as evaluate,
-        mock.patch.object(script, "make_noisy", wraps=script.make_noisy) as make_noisy,
+        mock.patch.object(script.noisy, "make_noisy", wraps=script.noisy.make_noisy) as make_noisy,
     ):
         run_dir = run(algorithm, tmp_path, noise=noises, noise_rate=(1.0,))
     assert evaluate.call_count == 3
@@ -263,7 +263,8 @@ def test_other_arguments_need_overwrite(algorithm, tmp_path, capsys):
     message = capsys.readouterr().err
     assert stopped.value.code == 2
     assert message.count("\n") == 1 and message.startswith("error: ")
-    assert "gamma 0.99, not 0.5" in message and "--overwrite" in message
+    assert "gamma 0.99, not 0.5" in message
+    assert message.index("--exp-name") < message.index("--runs-dir") < message.index("--overwrite")
     assert (run_dir / "result.json").read_text() == before
     run(algorithm, tmp_path, gamma=0.5, overwrite=True)
     assert json.loads((run_dir / "config.json").read_text())["args"]["gamma"] == 0.5
@@ -349,15 +350,16 @@ def definitions(script):
     return {node.name: inspect.getsource(getattr(script, node.name)) for node in nodes}
 
 
-def main_block(script):
-    return Path(script.__file__).read_text().partition('\nif __name__ == "__main__":\n')[2]
+def run_block(script):
+    """Return the file from the comment on: helpers and main block."""
+    return Path(script.__file__).read_text().partition("\n# THE RUN: ")[2]
 
 
 def test_repeated_helpers_are_word_for_word_identical():
-    everywhere = "fail check make_env evaluate updater use_matmul_precision write_file write_json "
-    everywhere += "open_run save_checkpoint load_checkpoint RunLog"
-    off_policy = "mlp in_numpy TwinLinear Critic ReplayBuffer"
-    by_design = {"Args", "Actor", "load_policy", "critic_gradient", "actor_gradient", "train"}
+    everywhere = "make_env fail read_args check add_noise check_finite evaluate compiled writing "
+    everywhere += "use_matmul_precision Run"
+    off_policy = "mlp in_numpy TwinLinear Critic ReplayBuffer updater"
+    by_design = {"Args", "Actor", "load_policy", "critic_loss", "actor_loss", "train"}
     found = [definitions(script) for script in (sac, td3, ppo)]
     for name in everywhere.split():
         assert len({source[name] for source in found}) == 1, name
@@ -367,22 +369,28 @@ def test_repeated_helpers_are_word_for_word_identical():
     for one, other in ((0, 1), (0, 2), (1, 2)):
         common = found[one].keys() & found[other].keys()
         differ = {name for name in common if found[one][name] != found[other][name]}
-        assert differ <= by_design | {"mlp", "in_numpy"} if other == 2 else differ <= by_design
-    assert main_block(sac) == main_block(td3) == main_block(ppo) != ""
+        assert (
+            differ <= by_design | {"mlp", "in_numpy", "updater"}
+            if other == 2
+            else differ <= by_design
+        )
+    assert run_block(sac) == run_block(td3) == run_block(ppo) != ""
     assert sac.TEST_SEED == td3.TEST_SEED == ppo.TEST_SEED
 
 
 def test_arguments_that_scripts_share_have_one_meaning():
     """Defaults and help differ only where CleanRL's defaults do."""
-    pattern = re.compile(r'^    (\w+): (.+?) = (.+)\n    """([^"]+)"""', re.M)
+    pattern = re.compile(r"((?:^    # .+\n)*)^    (\w+): (.+?) = (.+?)(?:  # (.+))?$", re.M)
     per_algorithm = {"eval_frequency", "learning_starts", "matmul_precision", "policy_frequency"}
     per_algorithm.add("total_timesteps")
     meanings = {}
     for script in SCRIPTS.values():
         documented = pattern.findall(inspect.getsource(script.Args))
-        assert [name for name, *_ in documented] == [f.name for f in fields(script.Args)]
-        for name, *meaning in documented:
-            meanings.setdefault(name, set()).add(tuple(meaning))
+        assert [name for _, name, *_ in documented] == [f.name for f in fields(script.Args)]
+        for above, name, kind, default, behind in documented:
+            assert above or behind, name
+            above = "" if behind else above  # tyro takes what stands behind, if anything does
+            meanings.setdefault(name, set()).add((kind, default, above, behind))
     differ = {name for name, values in meanings.items() if len(values) > 1}
     assert differ - {"learning_rate"} <= per_algorithm
 
@@ -438,8 +446,12 @@ def test_compiled_and_plain_updates_agree(algorithm, tmp_path, capsys, monkeypat
     )
     if "not compiled" in (output := capsys.readouterr().out):
         pytest.skip(re.search(r"not compiled: .*", output)[0])
-    updates = {"SAC": "critic actor temperature", "TD3": "critic actor", "PPO": "ppo"}[algorithm]
-    assert {f"{name}_gradient" for name in updates.split()} <= set(graphs)
+    losses = {
+        "SAC": {"critic_loss", "actor_loss", "temperature_loss"},
+        "TD3": {"critic_loss", "actor_loss"},
+        "PPO": {"clipped_gradient"},
+    }
+    assert set(graphs) == losses[algorithm] | {"neg"}
     torch.testing.assert_close(policy(compiled), policy(plain), rtol=1e-4, atol=1e-5)
 
     if algorithm == "PPO":
@@ -462,6 +474,102 @@ def test_no_compiler_means_plain_updates(algorithm, tmp_path, capsys, monkeypatc
     torch.testing.assert_close(policy(fallback), policy(plain), rtol=0, atol=0)
 
 
+# ENVIRONMENTS THAT ARE UNUSUAL
+
+
+@each_script
+def test_dict_observations_are_flattened(algorithm, tmp_path, capsys):
+    noise = {"noise": ("RandomDropoutObservation(0.5)",), "noise_rate": (0.5,)}
+    run_dir = run(algorithm, tmp_path, env_id="toy_envs:DictObservation-v0", **noise)
+    assert capsys.readouterr().out.count("observations are flattened") == 1
+    env = SCRIPTS[algorithm].make_env("toy_envs:DictObservation-v0")
+    assert env.reset()[0].tolist() == [0, 0, 0]
+    assert env.step(env.action_space.sample())[0].tolist() == [1, 1, -1]
+    assert env.action_space.contains(SCRIPTS[algorithm].load_policy(run_dir, env)(env.reset()[0]))
+
+
+@each_script
+def test_reward_noise_works_beside_a_one_hot_observation(algorithm, tmp_path):
+    noise = {"noise": ("RandomNormalNoisyReward(0.5)",), "noise_rate": (0.5,)}
+    run(algorithm, tmp_path, env_id="toy_envs:OneHotObservation-v0", **noise)
+
+
+@each_script
+def test_rewards_of_shape_1_are_numbers(algorithm, tmp_path):
+    array = run(algorithm, tmp_path / "array", env_id="toy_envs:ArrayReward-v0")
+    plain = run(algorithm, tmp_path / "plain", env_id="toy_envs:Count-v0")
+    assert (array / "eval.csv").read_bytes() == (plain / "eval.csv").read_bytes()
+    torch.testing.assert_close(policy(array), policy(plain), rtol=0, atol=0)
+
+
+@each_script
+def test_a_time_limit_of_ones_own(algorithm, tmp_path, capsys):
+    limit = {"env_id": "toy_envs:Endless-v0", "max_episode_steps": 5}
+    run_dir = run(algorithm, tmp_path, **limit)
+    assert {row[2:] for row in evaluations(run_dir)} == {(5.0, 5)}
+    assert "time limit" not in capsys.readouterr().out
+    assert json.loads((run_dir / "config.json").read_text())["args"]["max_episode_steps"] == 5
+    run(algorithm, tmp_path / "none", env_id="toy_envs:NoLimit-v0")
+    assert capsys.readouterr().out.count("toy_envs:NoLimit-v0 declares no time limit") == 1
+
+
+@each_script
+def test_a_test_without_a_time_limit_can_be_stopped(algorithm):
+    script, asked = SCRIPTS[algorithm], []
+
+    def stop():
+        asked.append(True)
+        return len(asked) == 30
+
+    def act(observation):
+        return np.zeros(1, np.float32)
+
+    assert script.evaluate(act, script.make_env("toy_envs:Endless-v0"), 2, stop) is None
+    assert len(asked) == 30
+    assert (
+        script.evaluate(act, script.make_env("toy_envs:Count-v0"), 2, stop).tolist() == [[8, 8]] * 2
+    )
+    assert len(asked) == 30  # it has a time limit: it was not asked again
+
+
+@each_script
+def test_a_test_that_was_stopped_is_not_written(algorithm, tmp_path):
+    ends = {"env_id": "toy_envs:NoLimit-v0"}
+    stops = iter([False] * 25 + [True])
+    args = arguments(algorithm, tmp_path, **ends)
+    assert not SCRIPTS[algorithm].train(args, stop=lambda: next(stops))
+    whole = run(algorithm, tmp_path, **ends)
+    alone = run(algorithm, tmp_path / "alone", **ends)
+    assert (whole / "eval.csv").read_bytes() == (alone / "eval.csv").read_bytes()
+    torch.testing.assert_close(policy(whole), policy(alone), rtol=0, atol=0)
+
+
+@each_script
+def test_a_name_without_version_is_recorded_with_it(algorithm, tmp_path):
+    run_dir = run(algorithm, tmp_path, env_id="toy_envs:Tiny")
+    assert run_dir.name.startswith("toy_envs--Tiny-v0__")
+    assert json.loads((run_dir / "config.json").read_text())["args"]["env_id"] == "toy_envs:Tiny-v0"
+
+
+@each_script
+def test_a_rate_that_changes_follows_the_steps(algorithm, tmp_path):
+    script, rates = SCRIPTS[algorithm], []
+    noise = {"noise": ("RandomNormalNoisyReward(0.5)",), "noise_rate": ("1:0",)}
+    with mock.patch.object(script.noisy, "set_progress", wraps=script.noisy.set_progress) as spy:
+        run_dir = run(algorithm, tmp_path, env_id="toy_envs:Count-v0", **noise)
+    rates = [call.args[1] for call in spy.call_args_list]
+    assert rates == [step / 60 for step in range(8, 60, 8)]  # episodes of 8 steps
+    assert run_dir.name.endswith("RandomNormalNoisyReward_0.5_p1.0to0.0__1")
+    assert json.loads((run_dir / "config.json").read_text())["args"]["noise_rate"] == ["1.0:0.0"]
+    applied, of = json.loads((run_dir / "result.json").read_text())["noise_applied"][
+        "RandomNormalNoisyReward"
+    ]
+    steps = np.arange(60)
+    p = 1 - steps // 8 * 8 / 60
+    assert of == 60
+    assert abs(applied - p.sum()) < 4 * np.sqrt((p * (1 - p)).sum())
+
+
 # BAD INPUT
 
 OFF_POLICY_ONLY = ("SAC", "TD3")
@@ -472,10 +580,20 @@ BAD = [  # arguments, what the message names, of which scripts
     ({"env_id": "Ant-v1"}, "Ant-v1", SCRIPTS),
     ({"env_id": "toy_envs:Broken-v0"}, "first line second line", SCRIPTS),
     ({"env_id": "CartPole-v1"}, "Discrete(2)", SCRIPTS),
-    ({"env_id": "toy_envs:DiscreteAction-v0"}, "action space is a Box", SCRIPTS),
-    ({"env_id": "toy_envs:DictObservation-v0"}, "observation space is a Box", SCRIPTS),
-    ({"env_id": "toy_envs:IntegerAction-v0"}, "action space is a Box of floats", SCRIPTS),
-    ({"env_id": "toy_envs:BooleanObservation-v0"}, "observation space is a Box", SCRIPTS),
+    ({"env_id": "toy_envs:Silent-v0"}, "AssertionError", SCRIPTS),
+    ({"env_id": "toy_envs:DiscreteAction-v0"}, "needs Box actions", SCRIPTS),
+    ({"env_id": "toy_envs:SequenceObservation-v0"}, "needs Box observations", SCRIPTS),
+    ({"env_id": "toy_envs:IntegerAction-v0"}, "needs Box actions of floats", SCRIPTS),
+    ({"env_id": "toy_envs:BooleanObservation-v0"}, "needs Box observations", SCRIPTS),
+    (
+        {
+            "env_id": "toy_envs:OneHotObservation-v0",
+            "noise": ("RandomDropoutObservation(0.5)",),
+            "noise_rate": (0.1,),
+        },
+        "--noise",
+        SCRIPTS,
+    ),
     ({"env_id": "toy_envs:Unbounded-v0"}, "bounded actions", OFF_POLICY_ONLY),
     ({"noise": ("RandomNoise(1)",), "noise_rate": (0.1,)}, "RandomMixupObservation", SCRIPTS),
     ({"noise": ("RandomUniformScaleReward(0.5)",), "noise_rate": (0.1,)}, "high", SCRIPTS),
@@ -486,9 +604,16 @@ BAD = [  # arguments, what the message names, of which scripts
     ({"noise": NOISES, "noise_rate": (-0.1,)}, "-0.1", SCRIPTS),
     ({"noise": NOISES, "noise_rate": (math.nan,)}, "nan", SCRIPTS),
     ({"noise": NOISES, "noise_rate": (0.1, 0.2, 0.3)}, "3 noise rates", SCRIPTS),
-    ({"noise": NOISES}, "0 noise rates", SCRIPTS),
-    ({"noise_rate": (0.1,)}, "0 noises", SCRIPTS),
-    ({"env_id": "toy_envs:MatrixAction-v0"}, "action", SCRIPTS),
+    ({"noise": NOISES}, "--noise needs --noise-rate", SCRIPTS),
+    ({"noise_rate": (0.1,)}, "--noise-rate needs --noise", SCRIPTS),
+    ({"noise": NOISES, "noise_rate": ("1:2",)}, "1:2", SCRIPTS),
+    ({"noise": NOISES, "noise_rate": ("0.5:",)}, "0.5:", SCRIPTS),
+    ({"noise": NOISES, "noise_rate": ("a:b",)}, "a:b", SCRIPTS),
+    ({"max_episode_steps": 0}, "--max-episode-steps", SCRIPTS),
+    ({"torch_threads": 100_000}, "--torch-threads", SCRIPTS),
+    ({"torch_threads": 2**70}, "--torch-threads", SCRIPTS),
+    ({"target_kl": math.nan}, "--target-kl", ("PPO",)),
+    ({"env_id": "toy_envs:MatrixAction-v0"}, "in one dimension", SCRIPTS),
     ({"seed": -1}, "--seed", SCRIPTS),
     ({"seed": 2**64}, "--seed", SCRIPTS),
     ({"gamma": 1.1}, "--gamma", SCRIPTS),
@@ -517,7 +642,7 @@ BAD = [  # arguments, what the message names, of which scripts
     ({"noise_clip": -1.0}, "--noise-clip", ("TD3",)),
     ({"num_steps": 0}, "--num-steps", ("PPO",)),
     ({"num_steps": -1}, "--num-steps", ("PPO",)),
-    ({"num_steps": 61}, "--num-steps", ("PPO",)),
+    ({"num_steps": 61}, "--num-steps must be from 2 * --num-minibatches (6) to", ("PPO",)),
     ({"num_minibatches": 0}, "--num-minibatches", ("PPO",)),
     ({"num_minibatches": 13}, "--num-minibatches", ("PPO",)),
     ({"update_epochs": 0}, "--update-epochs", ("PPO",)),
@@ -528,8 +653,13 @@ BAD_CASES = [pytest.param(*case, a) for *case, of in BAD for a in of]
 
 
 def assert_one_line(stderr, word):
-    """Check an error that says what to do."""
-    assert stderr.startswith("error: ") and stderr.count("\n") == 1 and stderr.endswith("\n")
+    """Check an error that says what to do, in one line; a bad noise lists the wrappers below it."""
+    lines = stderr.split("\n")
+    assert stderr.startswith("error: ") and lines.pop() == ""
+    if "bad noise" in lines[0]:
+        assert lines[1:] == [f"  {signature}" for signature in signatures()]
+    else:
+        assert len(lines) == 1
     assert word in stderr
 
 
@@ -586,6 +716,29 @@ def test_bad_command(algorithm, options, word, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_module_beside_the_caller_and_steps_as_1e2(tmp_path):
+    (tmp_path / "my_envs.py").write_text("from toy_envs import *\n")
+    options = ["--env-id", "my_envs:Tiny-v0", "--total-timesteps", "1e2", "--no-compile"]
+    options += ["--learning-starts=5e1", "--eval-frequency", "0", "--eval-episodes", "1"]
+    result = command("SAC", *options, cwd=tmp_path)
+    assert (result.returncode, result.stderr) == (0, "")
+    [run_dir] = (tmp_path / "runs").iterdir()
+    args = json.loads((run_dir / "config.json").read_text())["args"]
+    assert (args["total_timesteps"], args["learning_starts"]) == (100, 50)
+    assert args["env_id"] == "my_envs:Tiny-v0"
+
+
+@each_script
+def test_help_has_examples_and_noises(algorithm):
+    result = command(algorithm, "--help")
+    assert result.returncode == 0
+    text = result.stdout
+    assert f"python {algorithm.lower()}_continuous_noisy.py --env-id HalfCheetah-v5" in text
+    assert "module:Name-v0" in text
+    for signature in signatures():
+        assert f"  {signature}\n" in text
+
+
 @pytest.mark.parametrize(
     ("algorithm", "options", "word"),
     [("TD3", ["--total-timesteps", "many"], "many"), ("SAC", ["--no-such-option"], "no-such")],
@@ -607,7 +760,7 @@ def test_nan_stops_the_run(algorithm, env_id, tmp_path, capsys):
     with pytest.raises(SystemExit) as stopped:
         run(algorithm, tmp_path, env_id=env_id, eval_frequency=0, total_timesteps=200)
     assert stopped.value.code == 1
-    assert_one_line(capsys.readouterr().err, "not ")
+    assert_one_line(capsys.readouterr().err, "step 70: ")
     [run_dir] = tmp_path.iterdir()
     assert not (run_dir / "result.json").exists()
     assert not (run_dir / "policy.pt").exists()
@@ -632,8 +785,8 @@ CURVES = {
 }
 CHARTS = "charts/SPS charts/episodic_return charts/episodic_length eval/episodic_return_mean "
 CHARTS += "eval/episodic_return_std eval/episodic_length_mean "
-CHARTS += "noise/RandomNormalNoisyReward/applied_fraction "
-CHARTS += "noise/RandomEarlyTermination/applied_fraction"
+CHARTS += "noise/RandomNormalNoisyReward/applied_fraction noise/RandomNormalNoisyReward/rate "
+CHARTS += "noise/RandomEarlyTermination/applied_fraction noise/RandomEarlyTermination/rate"
 
 
 @pytest.fixture(scope="module")
@@ -746,8 +899,13 @@ def test_tensorboard_knows_the_hyperparameters(tensorboard, commands):
     body["colParams"] = [{"metric": {"group": "", "tag": "eval/episodic_return_mean"}}]
     groups = tensorboard("/data/plugin/hparams/session_groups", body)["sessionGroups"]
     assert len(groups) == 3
+    assert {group["name"] for group in groups} == names  # readable, and one for each run
+    experiment = tensorboard("/data/plugin/hparams/experiment", {"experimentName": ""})
+    columns = [info["name"] for info in experiment["hparamInfos"]]
+    assert columns[:4] == ["env_id", "noise", "noise_rate", "seed"]
     for group in groups:
-        assert "RandomNormalNoisyReward(0.5)" in group["hparams"]["noise"]
+        noise = "RandomEarlyTermination(2, 4) + RandomNormalNoisyReward(0.5)"
+        assert group["hparams"]["noise"] == noise
         assert group["hparams"]["noise_rate"] == 0.5  # the highest, to sort runs by
         assert group["hparams"]["env_id"] == "toy_envs:Tiny-v0"
         [metric] = group["metricValues"]

@@ -6,6 +6,7 @@ order; they share nothing else, so equal final weights mean equal algorithms.
 
 import copy
 from dataclasses import replace
+from unittest import mock
 
 import gymnasium as gym
 import numpy as np
@@ -17,6 +18,7 @@ from gymnasium import wrappers
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.distributions import Normal
+from torch.func import functional_call, grad, grad_and_value
 
 import ppo_continuous_noisy as ppo
 import sac_continuous_noisy as sac
@@ -229,12 +231,17 @@ def plain_training(plain, env, args):
 
 
 def checkpoint(script, args, episodes, tmp_path):
-    """Stop the script after so many episodes and return its checkpoint, which holds everything."""
+    """Stop the script after so many episodes; return the networks' parts of its checkpoint."""
     ends = iter(range(1, 1000))
     args = replace(args, runs_dir=str(tmp_path), total_timesteps=1000)
     assert not script.train(args, stop=lambda: next(ends) == episodes)
     [path] = tmp_path.glob("*/checkpoint.pt")
-    return torch.load(path, weights_only=True)
+    networks = {
+        sac: ("actor", "critic", "target", "temperature"),
+        td3: ("actor", "critic", "target_actor", "target_critic"),
+    }[script]
+    state = torch.load(path, weights_only=True)["state"]
+    return dict(zip(networks, state, strict=False))
 
 
 def assert_equal_networks(state, *networks):
@@ -438,6 +445,13 @@ def random_batch(size):
     return [x.double() for x in (*batch, torch.arange(size) % 3 == 0)]
 
 
+def gradient_of(loss, network, *inputs):
+    """Return the gradient of a script's loss by the parameters of a network, and its curves."""
+    parameters = dict(network.named_parameters())
+    gradient, (_, curves) = grad_and_value(loss, has_aux=True)(parameters, *inputs)
+    return gradient, curves
+
+
 def assert_equal_gradients(gradient, loss, *networks):
     expected = torch.autograd.grad(loss, parameters(*networks))
     actual = tuple(parameters(*ordinary(gradient)))
@@ -461,8 +475,8 @@ def test_sac_gradients():
             patch.setattr("torch.distributions.normal._standard_normal", lambda *_, **__: noise)
             return loss(*arguments)
 
-    gradient, curves = sac.critic_gradient(
-        actor, critic, target, log_alpha, batch, noise, args.gamma
+    gradient, curves = gradient_of(
+        sac.critic_loss, critic, critic, target, actor, log_alpha, batch, noise, args.gamma
     )
     loss = expected(plain.critic_loss, batch)
     assert_equal_gradients(gradient, loss, plain.q1, plain.q2)
@@ -472,12 +486,13 @@ def test_sac_gradients():
     assert curves["qf_loss"].item() == pytest.approx(loss.item() / 2)
     assert (curves["qf1_loss"] + curves["qf2_loss"]).item() == pytest.approx(loss.item())
 
-    gradient, curves = sac.actor_gradient(actor, critic, log_alpha, batch[0], noise)
+    gradient, curves = gradient_of(sac.actor_loss, actor, actor, critic, log_alpha, batch[0], noise)
     loss = expected(plain.actor_loss, batch[0])
     assert_equal_gradients(gradient, loss, plain.actor)
     assert curves["actor_loss"].item() == pytest.approx(loss.item())
 
-    gradient, curves = sac.temperature_gradient(actor, log_alpha, batch[0], noise, -2.0)
+    temperature = nn.ParameterDict({"log_alpha": log_alpha})
+    gradient, curves = gradient_of(sac.temperature_loss, temperature, actor, batch[0], noise, -2.0)
     loss = expected(plain.alpha_loss, batch[0])
     [log_alpha_gradient] = torch.autograd.grad(loss, plain.log_alpha)
     torch.testing.assert_close(gradient["log_alpha"], log_alpha_gradient[0])
@@ -501,8 +516,8 @@ def test_td3_gradients_with_bounds_that_differ_between_dimensions():
         patch.setattr("torch.randn_like", lambda actions: noise)
         loss = plain.critic_loss(batch)
     clipped = (args.policy_noise * noise).clamp(-args.noise_clip, args.noise_clip)
-    gradient, curves = td3.critic_gradient(
-        critic, target_actor, target_critic, batch, clipped, args.gamma
+    gradient, curves = gradient_of(
+        td3.critic_loss, critic, critic, target_critic, target_actor, batch, clipped, args.gamma
     )
     assert_equal_gradients(gradient, loss, plain.q1, plain.q2)
     assert curves["qf_loss"].item() == pytest.approx(loss.item() / 2)
@@ -510,7 +525,7 @@ def test_td3_gradients_with_bounds_that_differ_between_dimensions():
     assert actions.min(0).values.tolist() == pytest.approx([-1, -0.5])
     assert actions.max(0).values.tolist() == pytest.approx([2, 0.3])
 
-    gradient, curves = td3.actor_gradient(actor, critic, batch[0])
+    gradient, curves = gradient_of(td3.actor_loss, actor, actor, critic, batch[0])
     loss = plain.actor_loss(batch[0])
     assert_equal_gradients(gradient, loss, plain.actor)
     assert curves["actor_loss"].item() == pytest.approx(loss.item())
@@ -532,7 +547,10 @@ def test_ppo_gradient(norm_adv, clip_vloss, max_grad_norm):
     old_logprobs = logprobs.detach() + 0.3 * torch.randn(64)
     old_values = values.detach() + 0.3 * torch.randn(64)
     minibatch = (observations, actions, old_logprobs, advantages, returns, old_values)
-    gradient, curves = ppo.ppo_gradient(agent, minibatch, args)
+    args.compile = False
+    update = ppo.updater(ppo.ppo_loss, agent, mock.Mock(), args)  # an optimizer that does nothing
+    curves = update(agent, minibatch, args)
+    gradient = {name: parameter.grad for name, parameter in agent.named_parameters()}
 
     plain.loss(minibatch).backward()
     nn.utils.clip_grad_norm_(plain.parameters(), max_grad_norm)
@@ -569,11 +587,12 @@ def test_only_bf16_computes_products_in_bfloat16(script, precision):
     network = nn.Linear(3, 2).requires_grad_(False)
     optimizer = torch.optim.Adam(network.parameters(), lr=0.5, fused=True)
 
-    def gradient_function(x):
-        return {"weight": torch.ones(2, 3), "bias": torch.ones(2)}, {"product": network(x)}
+    def loss(params, x):
+        product = functional_call(network, params, (x,))
+        return product.float().sum(), {"product": product}
 
     before = network.bias.clone()
-    curves = script.updater(gradient_function, optimizer, args)(torch.ones(4, 3))
+    curves = script.updater(loss, network, optimizer, args)(torch.ones(4, 3))
     expected = {"highest": torch.float32, "bf16": torch.bfloat16}[precision]
     assert curves["product"].dtype == expected
     torch.testing.assert_close(network.bias, before - 0.5)  # Adam's first step, in float32
@@ -583,18 +602,23 @@ def test_only_bf16_computes_products_in_bfloat16(script, precision):
 @pytest.mark.parametrize("strides", ["transposed", "expanded"])
 def test_a_gradient_of_any_strides_is_applied_as_it_is(script, strides):
     """The fused Adam of PyTorch 2.13 reads a gradient's memory as if it were contiguous."""
+    signs = torch.tensor([[1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
+
+    def loss(params):
+        if strides == "transposed":
+            value = (params["weight"].T * signs).sum()
+        else:
+            value = params["weight"].sum(1) @ signs[0]
+        return value + 0 * params["bias"].sum(), {}
+
     network = nn.Linear(3, 2).requires_grad_(False)
-    fused = torch.optim.Adam(network.parameters(), lr=0.5, fused=True)
-    gradient = {
-        "transposed": torch.tensor([[1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]]).T,
-        "expanded": torch.tensor([[1.0], [-1.0]]).expand(2, 3),
-    }[strides]
+    gradient = grad(loss, has_aux=True)(dict(network.named_parameters()))[0]["weight"]
     assert not gradient.is_contiguous()
     before = network.weight.clone()
-    gradients = {"weight": gradient, "bias": torch.zeros(2)}
-    script.updater(lambda: (gradients, {}), fused, script.Args(compile=False))()
+    optimizer = torch.optim.Adam(network.parameters(), lr=0.5, fused=True)
+    script.updater(loss, network, optimizer, script.Args(compile=False))()
     # Adam's first step is the learning rate, against the sign of the gradient
-    torch.testing.assert_close(network.weight, before - 0.5 * gradient)
+    torch.testing.assert_close(network.weight, before - 0.5 * gradient.sign())
 
 
 # PARTS

@@ -64,18 +64,69 @@ class Broken(Count):
         raise RuntimeError("first line\nsecond line")
 
 
+class Silent(Count):
+    """Its constructor raises an exception without a text."""
+
+    def __init__(self):
+        raise AssertionError
+
+
+class Parts(Count):
+    """Observes a dictionary of the step: as a number, twice, and perhaps as a category."""
+
+    def __init__(self, categories=False):
+        super().__init__()
+        spaces = {"position": Box(-np.inf, np.inf, (2,)), "speed": Box(-np.inf, np.inf, (1,))}
+        if categories:
+            spaces["phase"] = gym.spaces.Discrete(3)
+        self.observation_space = gym.spaces.Dict(spaces)
+
+    def observe(self):
+        observation = {
+            "position": np.full(2, self.steps, np.float32),
+            "speed": np.full(1, -self.steps, np.float32),
+            "phase": np.int64(self.steps % 3),
+        }
+        return {name: observation[name] for name in self.observation_space}
+
+
+class ArrayReward(Count):
+    """Its rewards are arrays of shape (1,), as those of environments made for batches."""
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = super().step(action)
+        return observation, np.array([reward], np.float32), terminated, truncated, info
+
+
+class Endless(Count):
+    """Ends its episodes after `length` steps, and never without; it declares no time limit."""
+
+    def __init__(self, length=np.inf):
+        super().__init__()
+        self.length = length
+
+    def step(self, action):
+        observation, reward, _, _, info = super().step(action)
+        return observation, reward, self.steps >= self.length, False, info
+
+
 def register(name, entry_point, steps, **kwargs):
     gym.register(f"{name}-v0", entry_point, max_episode_steps=steps, kwargs=kwargs)
 
 
-dictionary = gym.spaces.Dict(position=Box(-1.0, 1.0, (2,)))
+sequence = gym.spaces.Sequence(Box(-1.0, 1.0, (2,)))
 register("Tiny", Tiny, 8)
 register("Count", Count, 8)
 register("Square", Count, 8, shape=(2, 2))
 register("NanReward", Count, 8, break_reward_at=70)
 register("NanObservation", Count, 8, break_observation_at=70)
 register("NanLate", Count, 8, break_reward_at=130)
-register("DictObservation", Other, 8, observation_space=dictionary)
+register("DictObservation", Parts, 8)
+register("OneHotObservation", Parts, 8, categories=True)
+register("SequenceObservation", Other, 8, observation_space=sequence)
+register("ArrayReward", ArrayReward, 8)
+register("Endless", Endless, None)
+register("NoLimit", Endless, None, length=20)
 register("DiscreteAction", Other, 8, action_space=gym.spaces.Discrete(3))
 register("IntegerAction", Other, 8, action_space=Box(-1, 1, (1,), np.int32))
 register("BooleanObservation", Other, 8, observation_space=Box(0, 1, (1,), np.bool_))
@@ -83,3 +134,4 @@ register("Unbounded", Other, 8, action_space=Box(-np.inf, np.inf, (1,)))
 register("MatrixAction", Other, 8, action_space=Box(-1.0, 1.0, (2, 2)))
 register("DoubleAction", Other, 8, action_space=Box(-1.0, 1.0, (1,), np.float64))
 register("Broken", Broken, 8)
+register("Silent", Silent, 8)
