@@ -15,6 +15,7 @@ import os
 import pickle
 import pkgutil
 import random
+import re
 import resource
 import runpy
 import shutil
@@ -118,6 +119,19 @@ def at(target, number, action):
 
 def die(*args):
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Nth:
+    """Act at the number-th call that is about the file `name`."""
+
+    def __init__(self, name, number, action):
+        self.name, self.number, self.action = name, number, action
+
+    def __call__(self, *args):
+        if self.name in Path(args[0]).name:
+            self.number -= 1
+            if self.number == 0:
+                self.action(*args)
 
 
 def die_half_way(value, file):
@@ -310,13 +324,14 @@ KILLS = {
         None,
         die_flushing_checkpoint,
     ),
-    "the first one on the disk, not in place": ("os.replace", 1, die),
+    "the first one on the disk, not in place": ("os.replace", None, Nth("checkpoint", 1, die)),
     "mid-episode, after an evaluation that the checkpoint lacks": (TRAINING_STEP, 80, die),
     "the next checkpoint half written": ("torch.save", 1, die_half_way),
-    "the next but one not in place": ("os.replace", 2, die),
+    "the next but one not in place": ("os.replace", None, Nth("checkpoint", 2, die)),
     "mid-episode": (TRAINING_STEP, 71, die),
     "the policy half written": ("torch.save", None, die_half_way_in_policy),
-    "the result not in place": ("os.replace", 2, die),
+    "a test not in place": ("os.replace", None, Nth("eval", 2, die)),  # the first is on resuming
+    "the result not in place": ("os.replace", None, Nth("result", 1, die)),
 }
 
 
@@ -331,7 +346,7 @@ def test_killed_again_and_again_it_ends_as_if_left_alone(algorithm, env_id, alon
         if (path / "checkpoint.pt").exists():
             checkpoint = torch.load(path / "checkpoint.pt", weights_only=True)
             steps.append(checkpoint["step"])
-            cut |= (path / "eval.csv").stat().st_size > checkpoint["log"]["csv_size"]
+            cut |= len((path / "eval.csv").read_text()) > len(checkpoint["log"][EVAL_CSV])
     assert steps == sorted(steps) and len(set(steps)) > 2, steps
     assert any(step % 60 for step in steps)  # in mid-rollout, for PPO
     assert cut  # there were rows of eval.csv newer than the checkpoint
@@ -364,7 +379,8 @@ def test_killed_while_every_step_ends_an_episode_it_logs_each_once(algorithm, tm
 def test_events_are_on_the_disk_before_the_checkpoint_is(algorithm, alone, tmp_path):
     slow = ("tensorboard.summary.writer.record_writer.RecordWriter.write", None, wait)
     words = options(algorithm, tmp_path)
-    result = run(algorithm, words, slow, ("os.replace", 2, die_once_in_place))
+    in_place = ("os.replace", None, Nth("checkpoint", 1, die_once_in_place))
+    result = run(algorithm, words, slow, in_place)
     assert result.code == -signal.SIGKILL and (folder(tmp_path) / "checkpoint.pt").exists()
     assert run(algorithm, words).code == 0
     assert outcome(folder(tmp_path)) == alone(algorithm)
@@ -407,11 +423,15 @@ def test_a_signal_ends_the_episode_and_the_run_resumes(algorithm, number, code, 
     words = options(algorithm, tmp_path)
     result = run(algorithm, words, (TRAINING_STEP, 65, send(number)))
     assert (result.code, result.err) == (code, "")
+    stopping = "stopping at the end of this episode; Ctrl-C again to discard everything since step"
+    [saved] = re.findall(rf"^{stopping} (\d+)$", result.out, re.M)
+    assert 40 <= int(saved) < 65  # a checkpoint is due from step 40 on
     checkpoint = torch.load(folder(tmp_path) / "checkpoint.pt", weights_only=True)
     assert 65 <= checkpoint["step"] < 100
     assert not (folder(tmp_path) / "policy.pt").exists()
     result = run(algorithm, words, (TRAINING_STEP, 70, send(number)))
     assert (result.code, result.err) == (code, "")
+    assert f"resumed at step {checkpoint['step']}\n" in result.out
     assert run(algorithm, words).code == 0
     assert_finished(folder(tmp_path))
     assert outcome(folder(tmp_path)) == alone(algorithm)
@@ -447,46 +467,63 @@ def test_a_signal_stops_a_run_that_has_an_evaluation_due_at_every_episode(algori
 # A field that was not saved, or not loaded, would have kept an old value: here one field at a time
 # of a checkpoint is as it was in an earlier one, and the run must end differently.
 
-NETWORKS = "actor critic actor_optimizer critic_optimizer"
-BUFFER = "observations actions rewards terminated final position size"
-ROLLOUT = "observations noise actions rewards dones discounted_return"
-FIELDS = {
-    "sac": f"{NETWORKS} target temperature alpha_optimizer".split()
-    + [f"buffer.{name}" for name in BUFFER.split()]
-    + ["generators.0", "generators.1", "generators.2"],  # sampling, actions, environment
-    "td3": f"{NETWORKS} target_actor target_critic".split()
-    + [f"buffer.{name}" for name in BUFFER.split()]
-    + ["generators.0", "generators.1", "generators.2"],
-    "ppo": ["agent", "optimizer", "generators.0", "generators.1"]  # minibatches, environment
-    + [f"rollout.{name}" for name in ROLLOUT.split()]
-    + [f"{stats}.{x}" for stats in ("observation_stats", "return_stats") for x in ("mean", "var")]
-    + ["observation_stats.count", "return_stats.count"],
+STATE = {  # the order of the list "state" in a checkpoint; the noise wrappers follow
+    "sac": "actor critic target temperature q_optimizer actor_optimizer alpha_optimizer buffer",
+    "td3": "actor critic target_actor target_critic q_optimizer actor_optimizer buffer",
+    "ppo": "agent optimizer rollout observation_stats return_stats",
+}
+LOG = ["returns", "seconds", "eval_csv"]
+EVAL_CSV = LOG.index("eval_csv")
+GENERATORS = {  # of minibatches, of actions and of the environment
+    "sac": ["sampling", "actions", "environment"],
+    "td3": ["sampling", "actions", "environment"],
+    "ppo": ["minibatches", "environment"],
+}
+INSIDE = {  # the parts of which each field is tested on its own
+    "buffer": "observations actions rewards terminated final position size",
+    "rollout": "observations noise actions rewards dones discounted_return",
+    "observation_stats": "mean var count",
+    "return_stats": "mean var count",
 }
 WRAPPERS = [noise.partition("(")[0] for noise in NOISE]
 WRAPPERS[1] += "_2"
-WRAPPER = ("gate", "noise", "opportunities", "times_applied")
-for fields in FIELDS.values():
-    fields += ["step", "torch", "log.returns", "log.csv_size"]
-    fields += [f"{wrapper}.{name}" for wrapper in WRAPPERS for name in WRAPPER]
+INSIDE |= {wrapper: "gate noise opportunities times_applied" for wrapper in WRAPPERS}
 INERT = {"format", "run", "log.seconds"}
 INERT |= {"RandomMixupObservation.noise"}  # mixup draws none
 INERT |= {"RandomEarlyTermination_2.gate", "RandomEarlyTermination_2.noise"}  # always the same
 
 
-def names(checkpoint):
-    """The fields of a checkpoint; a network, an optimizer, a generator is one field."""
-    whole = {name for name in checkpoint if name not in ("buffer", "rollout", "log", "generators")}
-    whole = {name for name in whole if not name.startswith("Random") and "stats" not in name}
-    for name in set(checkpoint) - whole:
-        inner = checkpoint[name]
-        whole |= {f"{name}.{x}" for x in (range(len(inner)) if isinstance(inner, list) else inner)}
-    return whole
+def paths(algorithm):
+    """Return {name of a field: its keys in the nested checkpoint}."""
+    found = {name: (name,) for name in ("format", "run", "step", "torch")}
+    lists = {"generators": GENERATORS[algorithm], "log": LOG}
+    for name, fields in lists.items():
+        found |= {f"{name}.{field}": (name, i) for i, field in enumerate(fields)}
+    for i, part in enumerate([*STATE[algorithm].split(), *WRAPPERS]):
+        if part in INSIDE:
+            found |= {f"{part}.{field}": ("state", i, field) for field in INSIDE[part].split()}
+        else:
+            found[part] = ("state", i)
+    return found
+
+
+FIELDS = {algorithm: paths(algorithm) for algorithm in ALGORITHMS}
+
+
+def leaves(algorithm, checkpoint):
+    """Return the keys of a checkpoint's fields; a network, an optimizer, a generator is one."""
+    parts = [*STATE[algorithm].split(), *WRAPPERS]
+    found = {(name,) for name in checkpoint.keys() - {"state", "generators", "log"}}
+    found |= {(name, i) for name in ("generators", "log") for i in range(len(checkpoint[name]))}
+    for i, part in enumerate(checkpoint["state"]):
+        found |= {("state", i, key) for key in part} if parts[i] in INSIDE else {("state", i)}
+    return found
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_a_checkpoint_holds_no_other_fields(algorithm, checkpoints):
     _, checkpoint = checkpoints(algorithm, LATE)
-    assert names(checkpoint) == INERT.union(FIELDS[algorithm])
+    assert leaves(algorithm, checkpoint) == set(FIELDS[algorithm].values())
 
 
 def ending(algorithm, runs_dir, checkpoint, tmp_path):
@@ -513,15 +550,14 @@ def test_an_unchanged_checkpoint_gives_the_same_run(
     "algorithm, field", [(name, x) for name in FIELDS for x in FIELDS[name] if x not in INERT]
 )
 def test_every_field_of_a_checkpoint_is_needed(algorithm, field, alone, checkpoints, tmp_path):
-    exploring = (algorithm, field) in (("sac", "generators.1"), ("td3", "generators.1"))
+    exploring = field == "generators.actions"
     runs_dir, checkpoint = checkpoints(algorithm, EXPLORING if exploring else LATE)
     _, earlier = checkpoints(algorithm, EARLY)
-    checkpoint, outer = dict(checkpoint), checkpoint
-    *path, last = (int(x) if x.isdigit() else x for x in field.split("."))
-    target = checkpoint
-    for name in path:
-        target[name] = outer[name].copy()
-        target, outer, earlier = target[name], outer[name], earlier[name]
+    *path, last = FIELDS[algorithm][field]
+    checkpoint = target = dict(checkpoint)
+    for key in path:
+        target[key] = target[key].copy()
+        target, earlier = target[key], earlier[key]
     target[last] = earlier[last]
     try:
         ended = ending(algorithm, runs_dir, checkpoint, tmp_path)
@@ -592,8 +628,8 @@ def test_what_is_no_whole_checkpoint_is_refused(algorithm, stopped, capsys):
 def test_a_checkpoint_of_another_run_is_refused(algorithm, stopped, checkpoints, tmp_path, capsys):
     words, path = stopped
     checkpoint = torch.load(path, weights_only=True)
-    torch.save(checkpoint | {"format": 2}, path)
-    assert "2" in refused(algorithm, words, capsys)
+    torch.save(checkpoint | {"format": 1}, path)
+    assert "format 1" in refused(algorithm, words, capsys)
     assert not train(algorithm, options(algorithm, tmp_path / "seed", seed=2), episodes=3)
     shutil.copy(folder(tmp_path / "seed") / "checkpoint.pt", path)
     assert path.parent.name[:-1] + "2" in refused(algorithm, words, capsys)
@@ -631,14 +667,19 @@ def test_a_checkpoint_cannot_run_code(algorithm, stopped, tmp_path, capsys):
     assert not trace.exists()
 
 
+@pytest.mark.parametrize("damage", ["cut", "missing", "foreign"])
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_a_checkpoint_without_its_eval_csv_is_refused(algorithm, stopped, capsys):
+def test_a_damaged_eval_csv_is_healed(algorithm, damage, stopped, alone):
     words, path = stopped
     log = path.with_name("eval.csv")
-    log.write_bytes(log.read_bytes()[:-1])
-    assert "eval.csv" in refused(algorithm, words, capsys)
-    log.unlink()
-    assert "eval.csv" in refused(algorithm, words, capsys)
+    if damage == "cut":
+        log.write_bytes(log.read_bytes()[:-1])
+    elif damage == "missing":
+        log.unlink()
+    else:
+        log.write_text("an essay")
+    assert train(algorithm, words)
+    assert outcome(path.parent) == alone(algorithm)
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
