@@ -229,34 +229,32 @@ def luck_of_the_consistent(luck):
 
 def rates(paper):
     """How often each noise rate is the best, consistent, or worse everywhere."""
-    counts = {"p": [f"{rate:g}" for rate in RATES]}
-    ones = {}
-    for name, table in (
-        ("best", paper["best"]),
-        ("consistent", paper["consistent"]),
-        ("consistently worse", paper["consistently_worse"]),
-    ):
-        found = table["noise_rate"].astype(float)
-        counts[f"{name} ({len(found)})"] = [(found == rate).sum() for rate in RATES]
-        tail = stats.binomtest(int((found == 1).sum()), len(found), 1 / len(RATES))
-        ones[name.replace(" ", "_")] = {"count": (found == 1).sum(), "p": tail.pvalue}
-    names = list(counts)
-    table = pd.DataFrame(counts)
-    text = tabulate(table.values, ["noise rate", *names[1:]], "pipe", disable_numparse=True)
-    return {"table": text, "one": ones, "expected": len(paper["best"]) / len(RATES)}
+    columns, ones = {"noise rate": [f"{rate:g}" for rate in RATES]}, {}
+    for name in ("best", "consistent", "consistently_worse"):
+        found = paper[name]["noise_rate"].astype(float)
+        columns[f"{name.replace('_', ' ')} ({len(found)})"] = [(found == r).sum() for r in RATES]
+        count = int((found == 1).sum())
+        test = stats.binomtest(count, len(found), 1 / len(RATES))
+        ones[name] = {"count": count, "p": test.pvalue}
+    expected = len(paper["best"]) / len(RATES)
+    return {"table": markdown(columns), "one": ones, "expected": expected}
+
+
+def kind(noise):
+    """Say what a noise perturbs: "RandomNormalNoisyReward(1.0)" -> "reward"."""
+    wrapper = noise.split("(")[0]
+    if wrapper.endswith("Observation"):
+        return "observation"
+    return "reward" if wrapper.endswith("Reward") else "dynamics"
 
 
 def kinds(paper):
     """What the best noises perturb, for each algorithm."""
     best = paper["best"]
-    kind = [
-        next((kind for kind in KINDS if noise.split("(")[0].endswith(kind.title())), "dynamics")
-        for noise in best["noise"]
-    ]
-    counts = pd.crosstab(best["algorithm"], pd.Series(kind, index=best.index))
+    counts = pd.crosstab(best["algorithm"], best["noise"].map(kind))
     counts = counts.reindex(columns=list(KINDS))
     columns = {"": counts.index} | {
-        f"{kind} ({number} of the 15 noises)": counts[kind] for kind, number in KINDS.items()
+        f"{name} ({number} of the 15 noises)": counts[name] for name, number in KINDS.items()
     }
     exact = stats.fisher_exact(counts.loc[["PPO", "TD3"], ["reward", "observation"]])
     return {
@@ -443,7 +441,7 @@ def five_noises(base, noisy, paper_base, paper_noisy, percent, statistics):
     text = markdown(
         {
             "": names,
-            "noise": cells("`{}`, p = {}", noise["noise"], noise["noise_rate"].str.rstrip("0.")),
+            "noise": cells("`{}`, p = {:g}", noise["noise"], noise["noise_rate"].astype(float)),
             "the paper": cells("{} ({:+.1f} %)", spell(paper_noisy), percent),
             "ours": cells("{} ({:+.1f} %)", spell(x), 100 * gain / y["mean"].abs()),
             **improvements(tested),
@@ -646,7 +644,7 @@ def reward_scale():
 def numbers():
     """Compute all that the page says."""
     paper, luck = with_luck(read_paper(HERE / "paper"))
-    best = plain(paper["best"]).query("algorithm == 'PPO'").set_index("environment")
+    best = plain(paper["best"]).query("algorithm == 'PPO'").set_index("environment").sort_index()
     best = best.assign(n=PAPER_SEEDS["PPO"])
     paper_base, paper_noisy = (
         best[[f"{name}_mean", f"{name}_std", "n"]].set_axis(["mean", "std", "n"], axis=1)
