@@ -54,7 +54,7 @@ from analyze_statistics import (
     probability_of_improvement,
     steps_to_reach,
 )
-from analyze_verdict import power, sentences, verdict
+from analyze_verdict import power, sentences, tally, verdict
 
 
 @dataclass
@@ -493,15 +493,15 @@ def no_finished_run(runs_dir):
 
 
 def shortened(verdicts, lines=15):
-    """Yield the sentences of each algorithm and environment, or the first ones of many."""
-    groups = verdicts.groupby(["algorithm", "environment"], sort=False)["sentence"]
+    """Yield the sentences of each algorithm and environment, or the first ones and a tally."""
+    groups = verdicts.groupby(["algorithm", "environment"], sort=False)
     if len(groups) == 0:
         yield "There is no noise to compare with a baseline yet."
-    for (algorithm, environment), group in groups:
+    for _, group in groups:
         first = max(1, lines // len(groups))
-        yield from group[:first]
+        yield from group["sentence"][:first]
         if len(group) > first:
-            yield f"({len(group) - first} more for {algorithm}, {environment}: in the report)"
+            yield f"({tally(group['verdict'])}; the report has them all)"
 
 
 def main(args):

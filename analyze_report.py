@@ -16,6 +16,7 @@ from matplotlib.patches import Rectangle
 from tabulate import tabulate
 
 from analyze_runs import rate_order
+from analyze_verdict import tally
 
 matplotlib.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
 matplotlib.rcParams["svg.hashsalt"] = "noisy"  # equal figures are equal files
@@ -462,7 +463,10 @@ def write_report(out, verdicts, tables, drawn, overview, problems, notes):
     pages.filters["breakable"] = breakable
     page = pages.get_template("report.html.jinja")
     groups = verdicts.groupby(["algorithm", "environment"], sort=False)
-    verdicts = [group[["verdict", "sentence"]].to_dict("records") for _, group in groups]
+    verdicts = []
+    for _, group in groups:
+        lines = group[["verdict", "sentence"]].to_dict("records")
+        verdicts.append({"lines": lines, "tally": tally(group["verdict"])})
     html = page.render(
         verdicts=verdicts, sections=full, overview=overview, problems=problems, notes=notes
     )

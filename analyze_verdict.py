@@ -187,6 +187,13 @@ def sentence(row):
     return f"{start} is {row['verdict']} than no noise: {evidence(row)}."
 
 
+def tally(verdicts):
+    """Count verdicts in words: "3 comparisons: 1 perhaps better, 2 no clear difference"."""
+    counts = verdicts.value_counts()
+    parts = [f"{counts[name]} {name}" for name in VERDICTS if name in counts]
+    return f"{len(verdicts)} comparisons: {', '.join(parts)}"
+
+
 def sentences(studies, statistics):
     """Return a frame of algorithm, environment, verdict and sentence for all that was tested.
 

@@ -142,3 +142,16 @@ def test_seeds_without_spread_and_a_baseline_of_zero_are_no_error():
     assert said["sentence"].iloc[0].endswith("difference: +0.0 % [0.0, 0.0], p = 1.")
     _, said = judge([-1.0, 0, 1, 0, 0], {"0.10": [10.0, 11, 12, 13, 14]})
     assert said["sentence"].iloc[0].endswith("than no noise: p = 0.0079, the only comparison.")
+
+
+def test_of_many_comparisons_the_first_are_shown_and_all_are_counted():
+    four = np.arange(100.0, 104)
+    noisy = {f"{rate:.2f}": four + rate for rate in np.linspace(0, 1, 20)}
+    noisy["0.99"] = four + 50
+    _, said = judge(four, noisy)
+    lines = list(analyze.shortened(said))
+    assert len(lines) == 16 and "at rate 0.99 is perhaps better" in lines[0]
+    assert lines[-1].startswith("(21 comparisons: 1 perhaps better, 20 no clear difference;")
+    assert list(analyze.shortened(said[:0])) == [
+        "There is no noise to compare with a baseline yet."
+    ]
