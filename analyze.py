@@ -100,6 +100,12 @@ def frame(name, rows):
     return pd.DataFrame(list(rows), columns=COLUMNS[name].split())
 
 
+def row_keys(algorithm, environment, config):
+    """Return the columns that say what a row is about."""
+    noise, rate = config
+    return {"algorithm": algorithm, "environment": environment, "noise": noise, "noise_rate": rate}
+
+
 def summary_rows(study):
     """Yield the final mean and std of every configuration, against the baseline of its env."""
     for (e, env), config in product(enumerate(study.environments), study.returns):
@@ -107,14 +113,21 @@ def summary_rows(study):
         if n == 0:
             continue
         base_mean, base_std, base_n = mean_std(study.final(BASELINE)[:, e])
-        row = dict(zip(KEYS, (study.algorithm, env, *config), strict=True))
-        row |= {"n": n, "mean": mean, "std": std}
-        row |= {"n_baseline": base_n, "baseline_mean": base_mean, "baseline_std": base_std}
+        row = {
+            **row_keys(study.algorithm, env, config),
+            "n": n,
+            "mean": mean,
+            "std": std,
+            "n_baseline": base_n,
+            "baseline_mean": base_mean,
+            "baseline_std": base_std,
+        }
         if config != BASELINE:
             row["improvement_percent"] = improvement_percent(mean, base_mean)
             row["std_change_percent"] = improvement_percent(std, base_std)
         curves = study.returns[config][..., e]
-        yield row | {"steps_to_baseline": steps_to_reach(curves, study.steps, base_mean)}
+        row["steps_to_baseline"] = steps_to_reach(curves, study.steps, base_mean)
+        yield row
 
 
 def best_rows(study, summary):
@@ -169,34 +182,38 @@ def early_rows(study):
     stride = 200_000 if total >= 1_000_000 else total / 5
     wanted = np.arange(1, round(total / stride) + 1) * stride
     places = np.unique(np.searchsorted(study.steps, wanted, side="right") - 1)
+    places = places[places >= 0]
     noises = sorted({noise for noise, _ in study.returns if noise})
     for (e, env), noise in product(enumerate(study.environments), noises):
-        configs = [config for config in study.returns if config[0] in ("", noise)]
-        if not any(np.isfinite(study.final(c)[:, e]).any() for c in configs if c[0]):
+        configs = [config for config in study.returns if config[0] == noise]
+        if not any(np.isfinite(study.final(config)[:, e]).any() for config in configs):
             continue  # not tried here: the baseline alone would be no comparison
-        for i, config in product(places[places >= 0], configs):
+        for i, config in product(places, [BASELINE, *configs]):
             mean, std, n = mean_std(study.returns[config][i, :, e])
-            row = dict(zip(KEYS, (study.algorithm, env, noise, config[1]), strict=True))
-            row |= {"steps_millions": study.steps[i] / 1e6, "mean": mean, "std": std, "n": n}
-            if n:
-                yield row
+            if n > 0:
+                yield {
+                    **row_keys(study.algorithm, env, (noise, config[1])),
+                    "steps_millions": study.steps[i] / 1e6,
+                    "mean": mean,
+                    "std": std,
+                    "n": n,
+                }
 
 
 def statistics_rows(study):
     """Yield IQM, improvement, probability of improvement and test, per env and over several."""
-    envs = np.array(study.environments)
-    pusher = np.array([env.startswith("Pusher") for env in envs])
-    scopes = [(env, envs == env) for env in envs]
+    everywhere = list(range(len(study.environments)))
+    others = [e for e in everywhere if not study.environments[e].startswith("Pusher")]
+    scopes = {env: [e] for e, env in enumerate(study.environments)}
     if study.phase != "confirmation":  # there each environment has its one comparison
-        if len(envs) > 1:
-            scopes.append(("all", np.full(len(envs), True)))
-        if pusher.any() and (~pusher).sum() > 1:
-            scopes.append(("all but Pusher", ~pusher))
-    for (scope, chosen), config in product(scopes, study.returns):
+        scopes["all"] = everywhere
+        if others != everywhere:
+            scopes["all but Pusher"] = others
+    for (scope, chosen), config in product(scopes.items(), study.returns):
         x, y = study.final(config)[:, chosen], study.final(BASELINE)[:, chosen]
         here = np.isfinite(x).any(axis=0)
         both = here & np.isfinite(y).any(axis=0)
-        row = dict(zip(KEYS, (study.algorithm, scope, *config), strict=True))
+        row = row_keys(study.algorithm, scope, config)
         if scope.startswith("all"):
             if config == BASELINE or both.sum() < 2:
                 continue
@@ -204,25 +221,32 @@ def statistics_rows(study):
             continue
         else:  # returns of different environments have no common scale
             row["n"] = np.isfinite(x).sum()
-            row |= zip(("iqm", "iqm_low", "iqm_high"), bootstrap_iqm(x), strict=True)
-        yield row | (against_baseline(x[:, both], y[:, both]) if config != BASELINE else {})
+            row["iqm"], row["iqm_low"], row["iqm_high"] = bootstrap_iqm(x)
+        if config != BASELINE and both.any():
+            row |= against_baseline(x[:, both], y[:, both])
+        yield row
 
 
 def against_baseline(x, y):
     """Return the part of a row of statistics that compares x with y, both (seeds x envs)."""
-    if x.shape[1] == 0:
-        return {}
-    row = {"environments": x.shape[1]}
-    row |= {"n": np.isfinite(x).sum(axis=0).min(), "n_baseline": np.isfinite(y).sum(axis=0).min()}
-    names = ("improvement_iqm_percent", "improvement_low", "improvement_high")
-    row |= zip(names, bootstrap_iqm(x, y), strict=True)
-    p, low, high = probability_of_improvement(x, y)
-    names = ("probability_of_improvement", "probability_low", "probability_high")
-    row |= zip(names, (p, low, high), strict=True)
-    row |= zip(("p", "smallest_p"), mann_whitney(x, y), strict=True)
+    improvement, improvement_low, improvement_high = bootstrap_iqm(x, y)
+    probability, probability_low, probability_high = probability_of_improvement(x, y)
+    p, smallest_p = mann_whitney(x, y)
+    row = {
+        "environments": x.shape[1],
+        "n": np.isfinite(x).sum(axis=0).min(),
+        "n_baseline": np.isfinite(y).sum(axis=0).min(),
+        "improvement_iqm_percent": improvement,
+        "improvement_low": improvement_low,
+        "improvement_high": improvement_high,
+        "probability_of_improvement": probability,
+        "probability_low": probability_low,
+        "probability_high": probability_high,
+        "p": p,
+        "smallest_p": smallest_p,
+    }
     if x.shape[1] == 1:
-        found = power(x[:, 0], y[:, 0], row["improvement_iqm_percent"])
-        row |= zip(("detectable_percent", "seeds_needed"), found, strict=True)
+        row["detectable_percent"], row["seeds_needed"] = power(x[:, 0], y[:, 0], improvement)
     return row
 
 
@@ -235,17 +259,15 @@ def adjust(statistics, confirmations=()):
     """
     tested = statistics[statistics["p"].notna()]
     confirmed = tested["algorithm"].isin(confirmations)
-    families = [family for _, family in tested[~confirmed].groupby(["algorithm", "environment"])]
-    for family in [*families, tested[confirmed]]:
-        p = family["p"].to_numpy(float)
-        alone = np.minimum(1, family["smallest_p"].astype(float) * len(family))
-        if family["algorithm"].isin(confirmations).any():
-            adjusted = holm(p)
-        else:
-            adjusted = stats.false_discovery_control(p)
-        statistics.loc[family.index, "p_adjusted"] = adjusted
+    families = [(tested[confirmed], holm)] if confirmed.any() else []
+    for _, family in tested[~confirmed].groupby(["algorithm", "environment"]):
+        families.append((family, stats.false_discovery_control))
+    for family, correct in families:
+        number = len(family)
+        statistics.loc[family.index, "p_adjusted"] = correct(family["p"].to_numpy(float))
+        alone = np.minimum(1, family["smallest_p"].astype(float) * number)
         statistics.loc[family.index, "smallest_p_adjusted"] = alone
-        statistics.loc[family.index, "comparisons"] = len(family)
+        statistics.loc[family.index, "comparisons"] = number
     statistics["verdict"] = [verdict(row) for _, row in statistics.iterrows()]
     return statistics
 
@@ -270,7 +292,7 @@ def interaction_rows(study):
         value, error, low, high = contrast(cells, [1, -1, -1, 1])
         percent = 100 / abs(alone.mean()) if alone.mean() else np.nan
         yield {
-            **dict(zip(KEYS, (study.algorithm, environment, *config), strict=True)),
+            **row_keys(study.algorithm, environment, config),
             "n": min(map(len, cells)),
             "both_mean": both.mean(),
             "first_mean": first.mean(),
@@ -504,70 +526,84 @@ def shortened(verdicts, lines=15):
             yield f"({tally(group['verdict'])}; the report has them all)"
 
 
+def overview_of(runs, studies):
+    """Say in words what was analysed."""
+    parts = [f"Finished runs: {(runs['status'] == 'finished').sum()}."]
+    for study in studies:
+        parts.append(
+            f"{study.algorithm}: {study.steps[-1]:,} steps, seeds: {len(study.seeds)}, "
+            f"environments: {len(study.environments)}, "
+            f"noise configurations: {len(study.returns) - 1}."
+        )
+    return " ".join(parts)
+
+
+def write_results(out, verdicts, tables, studies, overview, problems, notes):
+    """Write all tables, all figures and the report."""
+    out.mkdir(parents=True, exist_ok=True)
+    for name, (table, caption) in tables.items():
+        write_table(out, name, table, caption)
+    drawn = []
+    for name, figure, caption in figures(studies, tables):
+        write_figure(out, name, figure)
+        drawn.append((name, caption))
+    write_report(out, verdicts, tables, drawn, overview, problems, notes)
+
+
+def print_results(out, verdicts, tables, overview, problems, notes):
+    """Print the verdicts, the main table, and what to know about them."""
+    for line in shortened(verdicts):
+        print(line)
+    if "robustness_score" in tables:
+        for line in robustness_sentences(tables["robustness_score"][0]):
+            print(line)
+    best, caption = tables["best"]
+    print(f"\n{overview}\n\nBest noise tried (may be worse than none)\n")
+    print(f"{text_table('best', best)}\n\n{caption}\n")
+    for note in family_notes(tables["statistics"][0]) + notes:
+        print(f"note: {note}")
+    if problems:
+        missing, _ = tables["missing"]
+        print(f"\nWARNING: {problems}\n{text_table('missing', missing.head(20))}")
+        print(f"All of them: {out / 'missing.csv'}")
+    print(f"\nOpen {out / 'report.html'}")
+
+
 def main(args):
     """Read the runs, write tables, figures and report, and print verdicts and main table."""
     if not args.runs_dir.is_dir():
         fail(f"no folder {args.runs_dir}")
     try:
         paper = read_paper(args.compare) if args.compare else None
+        choice = read_choice(args.runs_dir)
     except ValueError as error:
         fail(error)
     out = output_folder(args)
     runs = read_runs(args.runs_dir)
-    studies, notes = make_studies(runs)
-    missing, number = left_out(runs)  # the number of runs of each status
+    missing, number = left_out(runs)
     counts = ", ".join(f"{n} {status}" for status, n in number.items())
     problems = f"Runs left out: {sum(number.values())} ({counts})." if number else ""
+    studies, notes = make_studies(runs)
     if not studies:
         if len(missing):
             print(text_table("missing", missing))
         no_finished_run(args.runs_dir)
-    tables = make_tables(studies, paper)
+    robustness, unreadable = read_robustness(args.runs_dir, runs)
+    notes += unreadable
+    tables = make_tables(studies, paper) | robustness_tables(robustness)
     tables["missing"] = (missing, CAPTIONS["missing"])
-    try:
-        choice = read_choice(args.runs_dir)
-    except ValueError as error:
-        fail(error)
     if choice is not None:
         tables["choice"] = (choice, CAPTIONS["choice"])
     verdicts = sentences(studies, tables["statistics"][0])
-    overview = [f"Finished runs: {(runs['status'] == 'finished').sum()}."]
-    overview += [
-        f"{study.algorithm}: {study.steps[-1]:,} steps, seeds: {len(study.seeds)}, environments: "
-        f"{len(study.environments)}, noise configurations: {len(study.returns) - 1}."
-        for study in studies
-    ]
-    overview = " ".join(overview)
-    robustness, problems_there = read_robustness(args.runs_dir, runs)
-    tables |= robustness_tables(robustness)
-    notes += problems_there
-    drawn = []
+    overview = overview_of(runs, studies)
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        for name, (table, caption) in tables.items():
-            write_table(out, name, table, caption)
-        for name, figure, caption in figures(studies, tables):
-            write_figure(out, name, figure)
-            drawn.append((name, caption))
-        write_report(out, verdicts, tables, drawn, overview, problems, notes)
+        write_results(out, verdicts, tables, studies, overview, problems, notes)
     except OSError as error:
         fail(f"--out: {error}")
     old = sorted(path.name for path in out.glob("*.csv") if path.stem not in tables)
     if old:
         notes.append(f"{out} also holds an earlier analysis, not renewed: {', '.join(old)}")
-    for line in shortened(verdicts):
-        print(line)
-    if "robustness_score" in tables:
-        for line in robustness_sentences(tables["robustness_score"][0]):
-            print(line)
-    print(f"\n{overview}\n\nBest noise tried (may be worse than none)\n")
-    print(f"{text_table('best', tables['best'][0])}\n\n{tables['best'][1]}\n")
-    for note in family_notes(tables["statistics"][0]) + notes:
-        print(f"note: {note}")
-    if problems:
-        print(f"\nWARNING: {problems}\n{text_table('missing', missing.head(20))}")
-        print(f"All of them: {out / 'missing.csv'}")
-    print(f"\nOpen {out / 'report.html'}")
+    print_results(out, verdicts, tables, overview, problems, notes)
 
 
 if __name__ == "__main__":
