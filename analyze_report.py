@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from tabulate import tabulate
 
-from analyze_runs import rate_order
+from analyze_runs import BASELINE, rate_order
 from analyze_verdict import tally
 
 matplotlib.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
@@ -78,27 +78,33 @@ def cell(name, value):
     return f"{value:z,.0f}" if whole else f"{value:z,.1f}"  # z: no "-0"
 
 
+def merged(title, parts, table, text):
+    """Return one column of text for the columns `parts`; a value that does not exist is a dash."""
+    columns = [text[name] for name in parts]
+    if len(parts) == 3:
+        interval = columns[0] + " [" + columns[1] + ", " + columns[2] + "]"
+        result = interval.where(table[parts[1]].notna(), columns[0])
+    elif title.endswith("(baseline)"):
+        result = columns[0] + " (" + columns[1] + ")"
+    else:
+        result = columns[0] + " \u00b1 " + columns[1]
+    return result.where(table[parts[0]].notna(), "\u2013")
+
+
 def shown(name, table):
     """Return `table` as a person reads it: all text, related columns in one, rates side by side."""
     table = table.reset_index(drop=True).drop(columns=ONLY_CSV.get(name, []))
     text = pd.DataFrame({c: [cell(c, v) for v in table[c]] for c in table}, dtype=object)
     for title, parts in MERGED.items():
         if parts[-1] in text:
-            first, *rest = (text[c] for c in parts)
-            both = first + " \u00b1 " + rest[0]
-            if title.endswith("(baseline)"):
-                both = first + " (" + rest[0] + ")"
-            if len(parts) == 3:
-                both = first + " [" + rest[0] + ", " + rest[1] + "]"
-                both = both.where(table[parts[1]].notna(), first)
-            text[parts[0]] = both.where(table[parts[0]].notna(), "\u2013")
+            text[parts[0]] = merged(title, parts, table, text)
             text = text.drop(columns=list(parts[1:])).rename(columns={parts[0]: title})
     if name == "early_performance" and len(text):
         text["mean"] += " (" + text.pop("n") + ")"
         keys = ["algorithm", "environment", "noise", "steps_millions"]
         text = text.pivot(index=keys, columns="noise_rate", values="mean").fillna("\u2013")
         text = text[sorted(text.columns, key=rate_order)].reset_index()
-    return text.rename(columns=lambda c: c.replace("_", " ").replace("percent", "%"))
+    return text.rename(columns=lambda column: column.replace("_", " ").replace("percent", "%"))
 
 
 def text_table(name, table):
@@ -186,22 +192,25 @@ def curves_figure(study, noise):
     There is a panel for each environment in which this noise was tried.
     """
     configs = [config for config in study.returns if config[0] in ("", noise)]
+    noisy = [config[0] == noise for config in configs]
+    counts = np.stack([np.isfinite(study.final(config)).sum(axis=0) for config in configs])
+    tried = np.flatnonzero(counts[noisy].any(axis=0))
+    labels = []
+    for (name, rate), n in zip(configs, counts[:, tried], strict=True):
+        seeds = span(n[n > 0])  # in the panels that have the line
+        labels.append(f"rate {rate} (n = {seeds})" if name else f"no noise (n = {seeds})")
+    fig, axes, add_legend = panels([study.environments[e] for e in tried], labels)
     unit, word = (1e6, "millions") if study.steps[-1] >= 1e6 else (1e3, "thousands")
     x, every = study.steps / unit, max(1, len(study.steps) // 8)
-    counts = np.stack([np.isfinite(study.final(config)).sum(axis=0) for config in configs])
-    tried = np.flatnonzero(counts[[config[0] == noise for config in configs]].any(axis=0))
-    labels = [f"rate {c[1]}" if c[0] else "no noise" for c in configs]
-    seeds = [span(n[n > 0]) for n in counts[:, tried]]  # in the panels that have the line
-    labels = [f"{a} (n = {n})" for a, n in zip(labels, seeds, strict=True)]
-    fig, axes, add_legend = panels([study.environments[e] for e in tried], labels)
     for (e, ax), (i, config) in product(zip(tried, axes, strict=True), enumerate(configs)):
         curves = study.returns[config][:, :, e]
         curves = curves[:, np.isfinite(curves[-1])]
         mean = curves.mean(axis=1) if curves.size else np.full(len(x), np.nan)
         std = curves.std(axis=1, ddof=1) if curves.shape[1] > 1 else 0
         color, line, marker = line_style(i, len(configs))
+        width = 1.8 if config == BASELINE else 1.1
         marks = {"marker": marker, "markevery": (min(i, every - 1), every), "markersize": 4.5}
-        ax.plot(x, mean, line, color=color, linewidth=1.1 if i else 1.8, label=config[1], **marks)
+        ax.plot(x, mean, line, color=color, linewidth=width, label=config[1], **marks)
         ax.fill_between(x, mean - std, mean + std, color=color, alpha=0.07, linewidth=0)
         ax.set_xlabel(f"training steps ({word})")
     add_legend()
@@ -212,24 +221,25 @@ def curves_figure(study, noise):
 
 def ablation_figure(study, summary, noises):
     """Draw bars of the final return: a wrapper's parameters side by side, grouped by noise rate."""
-    groups = [summary[summary["noise"] == noise] for noise in ["", *noises]]
-    rates = sorted({rate for group in groups[1:] for rate in group["noise_rate"]}, key=rate_order)
-    seeds = [span(group["n"]) for group in groups]
-    labels = [f"{a} (n = {n})" for a, n in zip(["no noise", *noises], seeds, strict=True)]
+    baseline = summary[summary["noise"] == ""]
+    groups = [summary[summary["noise"] == noise] for noise in noises]
+    rates = sorted({rate for group in groups for rate in group["noise_rate"]}, key=rate_order)
+    labels = [f"no noise (n = {span(baseline['n'])})"]
+    for noise, group in zip(noises, groups, strict=True):
+        labels.append(f"{noise} (n = {span(group['n'])})")
     fig, axes, add_legend = panels(study.environments, labels)
     width = 0.8 / len(noises)
-    cells = zip(axes, study.environments, strict=True)
-    for (ax, env), (i, group) in product(cells, enumerate(groups)):
-        rows = group[group["environment"] == env].set_index("noise_rate")
-        rows = rows.reindex(rates if i else ["0.00"])
-        place = np.arange(len(rates)) + width * (i - 1 - (len(noises) - 1) / 2) if i else -1
-        look = {"color": str(0.85 - 0.4 * (i - 1) / (len(noises) - 1)) if i else "white"}
-        look |= {"hatch": ["", "", "//", "..", "xx"][i % 5], "edgecolor": "black", "linewidth": 0.6}
-        spread = {"yerr": rows["std"].fillna(0), "capsize": 2, "error_kw": {"elinewidth": 0.8}}
-        ax.bar(place, rows["mean"], width if i else 0.6, label=env, **look, **spread)
-        if i == 0:
-            ax.axhline(rows["mean"].iloc[0], color="black", linewidth=0.6, linestyle=":")
-            ax.axhline(0, color="black", linewidth=0.6)
+    for ax, env in zip(axes, study.environments, strict=True):
+        rows = baseline[baseline["environment"] == env].set_index("noise_rate").reindex(["0.00"])
+        bars(ax, [-1], rows, 0.6, color="white", hatch="", label=labels[0])
+        ax.axhline(rows["mean"].iloc[0], color="black", linewidth=0.6, linestyle=":")
+        ax.axhline(0, color="black", linewidth=0.6)
+        for i, group in enumerate(groups):
+            rows = group[group["environment"] == env].set_index("noise_rate").reindex(rates)
+            place = np.arange(len(rates)) + width * (i - (len(noises) - 1) / 2)
+            grey = str(0.85 - 0.4 * i / (len(noises) - 1))
+            hatch = ["", "//", "..", "xx", ""][i % 5]
+            bars(ax, place, rows, width, color=grey, hatch=hatch, label=labels[i + 1])
         ax.set_xticks([-1, *range(len(rates))], ["none", *rates])
         ax.set_xlabel("noise rate")
     add_legend()
@@ -237,6 +247,12 @@ def ablation_figure(study, summary, noises):
     caption = f"{study.algorithm}, {wrapper}: final test return by parameters and noise rate. "
     caption += "Bars: mean over n seeds, whiskers \u00b1 one standard deviation; dotted: no noise."
     return f"ablation_{slug(study.algorithm)}_{wrapper}", fig, caption
+
+
+def bars(ax, place, rows, width, **look):
+    """Draw bars of the means with whiskers of one standard deviation."""
+    whiskers = {"yerr": rows["std"].fillna(0), "capsize": 2, "error_kw": {"elinewidth": 0.8}}
+    ax.bar(place, rows["mean"], width, edgecolor="black", linewidth=0.6, **whiskers, **look)
 
 
 def heatmap(grid, framed=None, below=0.9):
@@ -351,7 +367,6 @@ def robustness_heatmap(algorithm, environment, rows, clean):
         same=rows["tested_on"] == "the same noise",
     )
     # Rows and columns stand in the order of the table, which is that of noises and rates.
-    cells = cells.drop_duplicates(["trained", "tested"])
     order = {"index": cells["trained"].unique(), "columns": cells["tested"].unique()}
     axes = {"index": "trained", "columns": "tested"}
     grid = cells.pivot(**axes, values="score").reindex(**order)
@@ -362,10 +377,12 @@ def robustness_heatmap(algorithm, environment, rows, clean):
     for label in ax.get_xticklabels():
         label.set(ha="right", rotation_mode="anchor")
     ax.set_title(f"{algorithm} on {environment}: trained with (rows), tested with (columns)")
-    caption = f"{algorithm} on {environment} ({span(rows['n'])} seeds): mean return with the noise "
-    caption += "of the column, for policies trained with the noise of the row, in percent of the "
-    caption += "clean return of policies trained without noise. Framed: tested on the noise of "
-    caption += f"training. The colours end at \u00b1 {limit} %."
+    caption = (
+        f"{algorithm} on {environment} ({span(rows['n'])} seeds): mean return under the noise "
+    )
+    caption += "of the column, of policies trained with the noise of the row, as its difference "
+    caption += "from the clean return of policies trained without noise, in percent of that. "
+    caption += f"Framed: tested on the noise of training. The colours end at \u00b1 {limit} %."
     return f"robustness_heatmap_{slug(algorithm)}_{slug(environment)}", fig, caption
 
 
