@@ -229,7 +229,7 @@ def test_a_full_disk_leaves_the_previous_file(runs, monkeypatch, capsys):
 # The table
 
 
-def test_the_table_of_known_returns(trained, capsys):
+def test_the_table_of_known_returns(capsys):
     def a_run(noise, rate):
         return evaluate.Run(Path(noise, str(len(cells))), "PPO", "E", None, ("E", "x", noise, rate))
 
@@ -240,12 +240,13 @@ def test_the_table_of_known_returns(trained, capsys):
         ("no noise", "0.00", [40, 20], [4, 3]),  # means 30 and 3.5
         ("no noise", "0.00", [10, 90], [-5, 0]),  # means 50 and -2.5
     ]:
-        # A third episode is stored and not asked for.
-        results = {("", "0.0"): [*clean, 1000], ("A(1) + B(2)", "0.1 + 0.1"): [*noisy, 1000]}
+        # A third episode is stored and not asked for; the second number is the length.
         cells[a_run(noise, rate)] = {
-            key: [(value, 1) for value in values] for key, values in results.items()
+            ("", "0.0"): [(value, 1) for value in (*clean, 1000)],
+            ("A(1) + B(2)", "0.1 + 0.1"): [(value, 1) for value in (*noisy, 1000)],
         }
-    evaluate.print_table(list(cells), results, cells, episodes=2)
+    conditions = [("", "0.0"), ("A(1) + B(2)", "0.1 + 0.1")]
+    evaluate.print_table(list(cells), conditions, cells, episodes=2)
     lines = [re.split(r" {2,}", line.strip()) for line in capsys.readouterr().out.splitlines()]
     assert lines[0][-2:] == ["clean", "A(1) +"]
     assert lines[1:3] == [["B(2)"], ["at 0.1 +"]]
@@ -333,6 +334,7 @@ def test_videos_of_runs_of_one_name(runs, tmp_path, capsys):
 
 
 def test_without_an_opengl_library(runs, tmp_path):
+    """PyOpenGL is told to load a library that does not exist."""
     run_dir = one(runs, "PPO")
     result = run(run_dir, "--video", tmp_path / "videos", PYOPENGL_PLATFORM="none")
     assert result.returncode == 2 and not result.stdout
