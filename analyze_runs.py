@@ -172,14 +172,13 @@ def labels(base, group):
     for name, version in versions:
         newest[name] = max(newest[name], version, key=lambda text: int(text or -1))
     result = []
-    for text, (env, version), phase in zip(
-        group["settings"], versions, group["phase"], strict=True
-    ):
-        parts = [f"{name}={settings[text].get(name)}" for name in differing]
+    for run in group.itertuples():
+        parts = [f"{name}={settings[run.settings].get(name)}" for name in differing]
+        env, version = split_version(run.environment)
         if version != newest[env]:
             parts.append(f"environments v{version}")
-        if phase:
-            parts.append(phase)
+        if run.phase:
+            parts.append(run.phase)
         result.append(f"{base} [{', '.join(parts)}]" if parts else base)
     return result
 
@@ -210,10 +209,12 @@ def missing_runs(runs):
         if group["phase"].iloc[0] == "search":
             continue
         cells = group.groupby(KEYS[1:])["seed"].agg(set).to_dict()
-        noisy = [seeds for (_, *config), seeds in cells.items() if tuple(config) != BASELINE]
-        counts = Counter(seed for seeds in noisy or cells.values() for seed in seeds)
-        expected = {seed for seed, n in counts.items() if 2 * n >= len(noisy or cells)}
-        baselines = {(env, *BASELINE) for env, *_ in cells}
+        baselines = {(env, *BASELINE) for env, _, _ in cells}
+        usual = [seeds for key, seeds in cells.items() if key not in baselines]
+        if not usual:
+            usual = list(cells.values())
+        counts = Counter(seed for seeds in usual for seed in seeds)
+        expected = {seed for seed, n in counts.items() if 2 * n >= len(usual)}
         for key in sorted(cells.keys() | baselines, key=lambda key: (key[0], order(key[1:]))):
             for seed in sorted(expected - cells.get(key, set())):
                 rows.append((algorithm, *key, int(seed), "missing", "no run folder"))
@@ -240,15 +241,16 @@ def left_out(runs):
                 "reason": few(group["reason"]),
             }
         )
-    return pd.DataFrame(rows, columns=["status", *KEYS, "seeds", "run", "reason"]), Counter(
-        out["status"]
-    )
+    table = pd.DataFrame(rows, columns=["status", *KEYS, "seeds", "run", "reason"])
+    return table, Counter(out["status"])
 
 
 def few(texts):
-    """Join different texts, or give the first and the number of the others."""
-    first, *others = list(dict.fromkeys(texts)) or [""]
-    return f"{first} and {len(others)} more" if len(others) > 1 else ", ".join([first, *others])
+    """Join one or two different texts; of more, give the first and the number of the others."""
+    different = list(dict.fromkeys(texts))
+    if len(different) > 2:
+        return f"{different[0]} and {len(different) - 1} more"
+    return ", ".join(different)
 
 
 def ranges(numbers):
@@ -316,8 +318,8 @@ def version_notes(algorithm, versions):
         counts = Counter(str(version.get(name)) for version in versions)
         if len(counts) > 1:
             found = ", ".join(f"{version} (n = {n})" for version, n in sorted(counts.items()))
-            what = (
-                "of different code versions" if name == "git commit" else f"with different {name}"
-            )
+            what = f"with different {name}"
+            if name == "git commit":
+                what = "of different code versions"
             notes.append(f"{algorithm}: some rows average runs {what}: {found}")
     return notes
