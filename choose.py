@@ -5,9 +5,9 @@ is computed from them and from nothing else, so a choice can be interrupted anyw
 the returns from the run folders and names the runs that are due; benchmark.sh starts them.
 
 The search is sequential halving (Karnin, Koren and Somekh, 2013, "Almost Optimal Exploration in
-Multi-Armed Bandits", Algorithm 1, https://proceedings.mlr.press/v28/karnin13.html). An arm is a
-noise with its rate, a pull is a training run with a seed of its own. Ours keeps the runs of earlier
-rounds, while the original ranks by those of the present round alone: runs are dear.
+Multi-Armed Bandits", https://proceedings.mlr.press/v28/karnin13.html). An arm is a noise with its
+rate, a pull is a training run with a seed of its own. Runs are dear: a noise is judged by all its
+runs so far, those of earlier rounds included.
 
 The best of many looks better than it is on the seeds that chose it. So the winner meets the
 baseline on fresh seeds, in one comparison that is fixed beforehand.

@@ -132,17 +132,20 @@ def wall_time(run):
 
 
 def plan(found):
-    """Yield lines that say, before a batch starts, what is due and what all of it will take."""
-    if not any(choice.state.due for choice in found):
-        return
-    for choice in found:
-        yield describe(choice)
+    """Return lines that say, before a batch starts, what is due and what all of it will take."""
+    if any(choice.state.due for choice in found):
+        return [*map(describe, found), total(found)]
+    return []
+
+
+def total(found):
+    """Say how many runs all choices take, and what is left of them."""
     search = sum(noises * seeds for choice in found for noises, seeds in choice.schedule)
     confirm = sum(2 * choice.confirm for choice in found)
     finished = sum(len(choice.returns) for choice in found)
     hours = sum(choice.core_hours for choice in found)
     hours = f"{hours:.1f}" if hours >= 0.1 else f"{hours:.2g}"
-    yield (
+    return (
         f"{search + confirm} runs in all, {search} to search and {confirm} to confirm; "
         f"{finished} are done, about {hours} core-hours are left"
     )
@@ -155,7 +158,7 @@ def describe(choice):
     if not state.due:
         return f"{choice.name}: all runs are done"
     seeds = f"seeds {state.seeds[0]} to {state.seeds[-1]}" if len(state.seeds) > 1 else "seed 1"
-    due = f"{seeds}; {len(state.due)} runs to do"
+    due = f"{seeds}; runs to do: {len(state.due)}"
     if number <= rounds:
         noises = f"{len(state.noises)} of {choice.schedule[0][0]} noises"
         return f"{choice.name}, round {number} of {rounds}: {noises}, {due}"
@@ -164,13 +167,14 @@ def describe(choice):
 
 
 def standing(found):
-    """Yield lines that say where each choice stands, and which noises are still in the running."""
+    """Yield lines that say where each choice stands, which noises survive, and what is left."""
     for choice in found:
         yield describe(choice)
         if choice.state.rounds:
             scores = choice.state.rounds[-1].scores
             for noise in sorted(choice.state.noises, key=scores.get, reverse=True):
                 yield f"  {scores[noise]:10.2f}  {choose.spelled(noise)}"
+    yield total(found)
 
 
 def conclusion(found, runs_dir):

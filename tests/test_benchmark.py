@@ -630,7 +630,7 @@ def test_a_failing_run_stops_its_choice_and_no_other(tmp_path, stub):
     command = [*CHOOSE, "--algos", "ppo", "sac", "--confirm", "5", "--runs-dir", tmp_path]
     result = run(*command, env=stub | {"STUB_FAILS": "*ppo*Dropout*"})
     assert result.code == 1 and "exit 1" in result.out and "error: this one fails" in result.out
-    assert "PPO on Pendulum-v1, round 1 of 2: 3 of 3 noises, seed 1; 1 runs to do" in result.out
+    assert "PPO on Pendulum-v1, round 1 of 2: 3 of 3 noises, seed 1; runs to do: 1" in result.out
     assert '--exclude "RandomDropoutObservation(0.9)@1.0"' in result.out
     assert result.out.splitlines()[-1] == "SAC on Pendulum-v1: all runs are done"
     assert not (tmp_path / "choice.csv").exists()
@@ -655,7 +655,7 @@ def test_a_dry_run_of_choose_prints_the_batch_that_is_due(tmp_path, stub):
         subprocess.run(line.replace(sys.executable, stub["PYTHON"]), shell=True, check=True)
     second = run(*command, "--dry-run")
     assert [" --seed 2 " in line for line in second.out.splitlines()] == [True, True]
-    assert "round 2 of 2: 2 of 3 noises, seeds 1 to 2; 2 runs to do" in second.err
+    assert "round 2 of 2: 2 of 3 noises, seeds 1 to 2; runs to do: 2" in second.err
     # The three finished runs say that they have taken 36 seconds each; ten are left.
     assert "3 are done, about 0.1 core-hours are left" in second.err
 
