@@ -329,7 +329,8 @@ def interval_figure(study, statistics):
         ax.hlines(place, low, high, color="0.6", linewidth=5)
         ax.plot(middle, place, "|", color="black", markersize=11, markeredgewidth=2)
         ax.axvline(neutral, color="black", linewidth=0.8, linestyle="--")
-        ax.set_ylim(min(-0.6, len(rows) - 7), len(rows) - 0.4)  # a few rows stay at the top
+        margin = 0.6 + max(0, 4 - len(rows)) / 2  # a few rows stay close together
+        ax.set_ylim(-margin, len(rows) - 1 + margin)
     left.set_yticks(place, [broken(label) for label in labels])
     left.set_xlabel("improvement over the baseline, IQM (%)")
     right.set_xlabel("probability of improvement")
