@@ -250,7 +250,7 @@ submit() { # the array's indices are line numbers, counted from the offset of it
       fail "sbatch refused runs $((offset + 1)) to $((offset + n)); submitted before: ${ids[*]}"
   done
   ids=("${ids[@]%%;*}") # behind a semicolon stands the cluster's name
-  echo "submitted; to stop: scancel ${ids[*]}" >&2
+  [ "$stopped" -ne 0 ] || echo "submitted; to stop: scancel ${ids[*]}" >&2
 }
 run_slurm() { # the arrays are over when squeue answers and does not name them
   local queue
@@ -286,7 +286,8 @@ run_todo() {
   printf '%s\n' "$todo" >"$list"
   if [ "$executor" = slurm ]; then
     submit
-    [ -n "$wait" ] || exit 0
+    [ -n "$wait" ] || exit "$stopped"
+    [ "${#ids[@]}" -gt 0 ] || return 0 # stopped before the first array
   fi
   trap - PIPE
   set -m

@@ -431,6 +431,20 @@ def test_slurm_requeues_before_the_time_limit(slurm, tmp_path):
     assert not second[0].startswith("step=1000/"), "not resumed"
 
 
+def test_ctrl_c_before_slurm_has_an_array(slurm, tmp_path):
+    scontrol = shutil.which("scontrol", path=PATH)
+    slow = f'#!/bin/sh\ntouch {tmp_path}/called\nsleep 2\nexec {scontrol} "$@"\n'
+    (tmp_path / "scontrol").write_text(slow)
+    (tmp_path / "scontrol").chmod(0o755)
+    grid = [*GRID, "--runs-dir", tmp_path / "runs", "--executor", "slurm", "--wait"]
+    sweep = start(*grid, env=slurm | {"PATH": f"{tmp_path}:{PATH}"})
+    wait_for((tmp_path / "called").exists, "the first call of Slurm")
+    sweep.send_signal(signal.SIGINT)
+    _, err = sweep.communicate(timeout=PATIENCE)
+    assert sweep.returncode == 130 and "submitted" not in err and "error" not in err
+    assert not list(tmp_path.glob("runs/*__*"))
+
+
 # THE GRID
 
 
@@ -532,6 +546,8 @@ def test_rates_of_ones_own_and_pairs():
         [(early, "1.0:0.0"), (reward, "0.1"), (drop, "0.5")],
         [(early, "1.0:0.0"), (reward, "0.1"), (drop, "1.0:0.0")],
     ]
+    lines = dry_run("custom", *GRID[1:7], "--noises", f"{A}@0.1")
+    assert [line.noise_rate for line in lines] == [[], ["0.1"]]
     three = ["--noises", A, "RandomEarlyTermination(50)", "RandomDropoutObservation(0.9)"]
     lines = dry_run("custom", *GRID[1:7], *three, "--noise-rates", "0.5", "--combine")
     assert [len(line.noise) for line in lines] == [0, 1, 1, 1, 2, 2, 2]
