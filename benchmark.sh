@@ -235,29 +235,35 @@ stop_parallel() { # HUP: parallel starts no more runs, and waits for those that 
 }
 
 submit() { # the array's indices are line numbers, counted from the offset of its part
-  local size offset n
-  size=$(scontrol show config | awk '$1 == "MaxArraySize" {print $3}')
+  local size offset n id
+  size=$(scontrol show config | awk '$1 == "MaxArraySize" {print $3}') || true
+  [ "$stopped" -eq 0 ] || return 0
   [ "${size:-0}" -gt 0 ] || fail "scontrol show config does not tell MaxArraySize"
   read -ra slurm_options <<<"$slurm_args"
-  ids=()
   for ((offset = 0; offset < count && stopped == 0; offset += size)); do
     n=$((count - offset < size ? count - offset : size))
-    ids+=("$(sbatch --parsable --array="0-$((n - 1))${jobs:+%$jobs}" --requeue \
-      --signal=B:USR1@180 --ntasks=1 --cpus-per-task=1 --job-name=noisy-sweep \
+    id=$(sbatch --parsable --array="0-$((n - 1))${jobs:+%$jobs}" --requeue --signal=B:USR1@180 \
+      --ntasks=1 --cpus-per-task=1 --job-name=noisy-sweep \
       --open-mode=append --output="$logs/slurm-%A.out" \
       ${slurm_options[@]+"${slurm_options[@]}"} \
-      --wrap "exec ./benchmark.sh slurm-task $(printf %q "$list") $offset")") ||
+      --wrap "exec ./benchmark.sh slurm-task $(printf %q "$list") $offset") || {
+      [ "$stopped" -eq 0 ] || break # Ctrl-C ends sbatch, too
       fail "sbatch refused runs $((offset + 1)) to $((offset + n)); submitted before: ${ids[*]}"
+    }
+    ids+=("${id%%;*}")
   done
-  ids=("${ids[@]%%;*}") # behind a semicolon stands the cluster's name
-  [ "$stopped" -ne 0 ] || echo "submitted; to stop: scancel ${ids[*]}" >&2
+  if [ "$stopped" -eq 0 ]; then
+    echo "submitted; to stop: scancel ${ids[*]}" >&2
+  elif [ "${#ids[@]}" -gt 0 ]; then
+    stop_slurm
+  fi
 }
 run_slurm() { # the arrays are over when squeue answers and does not name them
   local queue
   until queue=$(squeue --noheader --user="$(id -un)" --format=%F 2>/dev/null) &&
     ! grep -qxF "$(printf '%s\n' "${ids[@]}")" <<<"$queue"; do sleep 5; done
 }
-stop_slurm() { scancel "${ids[@]%%;*}"; }
+stop_slurm() { scancel "${ids[@]}"; }
 
 # Were this command killed, the executor would start run after run: the guard stops it then
 guard() { # a killed command may stay as a zombie: it is dead when the guard has another parent

@@ -431,18 +431,26 @@ def test_slurm_requeues_before_the_time_limit(slurm, tmp_path):
     assert not second[0].startswith("step=1000/"), "not resumed"
 
 
-def test_ctrl_c_before_slurm_has_an_array(slurm, tmp_path):
-    scontrol = shutil.which("scontrol", path=PATH)
-    slow = f'#!/bin/sh\ntouch {tmp_path}/called\nsleep 2\nexec {scontrol} "$@"\n'
-    (tmp_path / "scontrol").write_text(slow)
-    (tmp_path / "scontrol").chmod(0o755)
-    grid = [*GRID, "--runs-dir", tmp_path / "runs", "--executor", "slurm", "--wait"]
-    sweep = start(*grid, env=slurm | {"PATH": f"{tmp_path}:{PATH}"})
-    wait_for((tmp_path / "called").exists, "the first call of Slurm")
-    sweep.send_signal(signal.SIGINT)
+@pytest.mark.parametrize("program", ["scontrol", "sbatch"])
+def test_ctrl_c_while_arrays_are_submitted(program, slurm, tmp_path):
+    """On a terminal Ctrl-C reaches Slurm's programs, too: here the second call of one."""
+    wanted = 2 if program == "sbatch" else 1
+    (tmp_path / program).write_text(
+        f"#!/bin/sh\necho >>{tmp_path}/calls\n"
+        f"[ $(wc -l <{tmp_path}/calls) -lt {wanted} ] || sleep 100\n"
+        f'exec {shutil.which(program, path=PATH)} "$@"\n'
+    )
+    (tmp_path / program).chmod(0o755)
+    grid = [*GRID, "--runs-dir", tmp_path / "runs", "--executor", "slurm", *FOREVER, *ON_SIGNAL]
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    env = slurm | {"PATH": f"{tmp_path}:{PATH}"}
+    sweep = start(*grid, env=env, start_new_session=True, **streams)
+    calls = tmp_path / "calls"
+    wait_for(lambda: calls.exists() and calls.read_text().count("\n") == wanted, program)
+    os.killpg(sweep.pid, signal.SIGINT)
     _, err = sweep.communicate(timeout=PATIENCE)
     assert sweep.returncode == 130 and "submitted" not in err and "error" not in err
-    assert not list(tmp_path.glob("runs/*__*"))
+    wait_for(lambda: not output(["squeue", "--noheader"], slurm), "the first array's end")
 
 
 # THE GRID
