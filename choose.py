@@ -133,15 +133,6 @@ def compare(winner, seeds, returns):
     return Comparison(winner, len(seeds), improvement, low, high, probability, p, detectable)
 
 
-def holm(p_values):
-    """Correct p-values for their number with the method of Holm (1979)."""
-    corrected, largest = [0.0] * len(p_values), 0.0
-    for rank, i in enumerate(np.argsort(p_values)):
-        largest = max(largest, min(1.0, (len(p_values) - rank) * p_values[i]))
-        corrected[i] = largest
-    return corrected
-
-
 def helps(comparison, p_corrected):
     """Tell whether the noise was shown to be better than none."""
     return p_corrected <= LEVEL and comparison.probability > 0.5

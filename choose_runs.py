@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import choose
 from analyze_runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED, read_run
+from analyze_statistics import holm
 from grid import Run, cell, cells, fail, make_run, result
 
 # What a run takes on one core until the finished ones tell: docs/sweeps.md
@@ -190,7 +191,7 @@ def conclusion(found, runs_dir):
     for choice in found:
         [winner] = choice.state.noises
         comparisons.append(choose.compare(winner, choice.state.seeds, choice.returns))
-    corrected = choose.holm([comparison.p for comparison in comparisons])
+    corrected = holm([comparison.p for comparison in comparisons])
     rows = []
     for choice, comparison, p in zip(found, comparisons, corrected, strict=True):
         names = choice.algorithm.upper(), choice.env_id

@@ -21,7 +21,7 @@ from analyze import make_tables  # noqa: E402
 from analyze_compare import PAPER_CONFIGURATIONS, PAPER_SEEDS, read_paper, with_luck  # noqa: E402
 from analyze_luck import CONSISTENT_PERCENT, DRAWS, draw_improvements  # noqa: E402
 from analyze_runs import KEYS, make_studies, read_runs  # noqa: E402
-from analyze_statistics import mann_whitney  # noqa: E402
+from analyze_statistics import holm, mann_whitney  # noqa: E402
 
 FIXED_SEEDS = range(1, 11)
 FRESH_SEEDS = range(11, 31)
@@ -134,13 +134,6 @@ def welch(x, y):
     values = [z[name].to_numpy(float) for z in (x, y) for name in ("mean", "std", "n")]
     p = stats.ttest_ind_from_stats(*values, equal_var=False).pvalue
     return (x["mean"] - y["mean"]) / standard_error(x, y), p
-
-
-def holm(p):
-    """Correct p-values (n,) for n tests with Holm's step-down method."""
-    order, adjusted = np.argsort(p), np.empty(len(p))
-    adjusted[order] = np.maximum.accumulate(np.sort(p) * np.arange(len(p), 0, -1))
-    return np.minimum(1, adjusted)
 
 
 def power(effect, std, n, other_std, other_n):

@@ -11,6 +11,7 @@ import stub_run
 
 import choose_runs
 from analyze_runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED
+from analyze_statistics import holm
 from choose import (
     BASELINE,
     Comparison,
@@ -18,7 +19,6 @@ from choose import (
     compare,
     fewest_seeds,
     helps,
-    holm,
     number_of_runs,
     rows,
     schedule,
@@ -149,12 +149,6 @@ def test_the_choice_is_as_good_as_a_grid_of_ten_seeds():
 
 
 # THE VERDICT
-
-
-def test_holm_by_hand():
-    assert holm([0.03]) == [0.03]
-    assert holm([0.01, 0.04, 0.03]) == [pytest.approx(p) for p in (0.03, 0.06, 0.06)]
-    assert holm([0.9, 0.5]) == [1.0, 1.0]
 
 
 def test_fewest_seeds():

@@ -35,10 +35,6 @@ def test_cleanrls_deviations_are_those_of_a_population():
     assert hopper["std"] / claims_std == pytest.approx(returns.std(ddof=1) / returns.std())
 
 
-def test_holm_by_hand():
-    np.testing.assert_allclose(claims.holm([0.01, 0.04, 0.03, 0.5]), [0.04, 0.09, 0.09, 0.5])
-
-
 def test_welch_is_scipys():
     rng = np.random.default_rng(0)
     runs = pd.DataFrame({"environment": ["a"] * 5 + ["b"] * 7, "test": rng.normal(size=12)})
