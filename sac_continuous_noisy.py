@@ -23,7 +23,6 @@ import sys
 import time
 import zipfile
 from dataclasses import asdict, dataclass, replace
-from datetime import timedelta
 from pathlib import Path
 from typing import Literal
 
@@ -33,8 +32,7 @@ import numpy as np
 import torch
 import torch.nn as nn
 import tyro
-from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
-from tensorboard.plugins.hparams.summary_v2 import hparams_pb
+from gymnasium.spaces import Box
 from torch.func import functional_call, grad_and_value
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
@@ -84,12 +82,10 @@ class Args:
 
 def make_env(env_id, **kwargs):
     """Make the clean environment, whose observations and actions are vectors."""
-    try:
+    with fail_on(Exception, f"--env-id {env_id}"):  # its constructor may raise anything
         env = gym.make(env_id, disable_env_checker=True, **kwargs)
-    except Exception as error:  # an environment's constructor may raise anything
-        fail(f"--env-id {env_id}: {str(error) or type(error).__name__}")
     space = env.observation_space
-    if space.is_np_flattenable and (not isinstance(space, gym.spaces.Box) or len(space.shape) != 1):
+    if space.is_np_flattenable and (not isinstance(space, Box) or len(space.shape) != 1):
         env = gym.wrappers.FlattenObservation(env)
     return gym.wrappers.TransformReward(env, lambda reward: np.asarray(reward).item())
 
@@ -255,7 +251,9 @@ def temperature_loss(params, actor, observations, noise, target_entropy):
 def updater(loss, network, optimizer, args):
     """Return update(*inputs) -> curves: one optimizer step on loss(network parameters, *inputs)."""
     parameters = dict(network.named_parameters())
-    gradient_of = compiled(grad_and_value(loss, has_aux=True), args)
+    gradient_of = grad_and_value(loss, has_aux=True)
+    if args.compile:
+        gradient_of = torch.compile(gradient_of, fullgraph=True, dynamic=False)
     bf16 = torch.autocast("cuda" if args.cuda else "cpu", enabled=args.matmul_precision == "bf16")
 
     def update(*inputs):
@@ -272,16 +270,15 @@ def updater(loss, network, optimizer, args):
 
 def train(args, stop=lambda: False):
     """Train one agent; return False if stop(), asked whenever an episode ends, ended it early."""
-    args = check(args)
-    env = add_noise(make_env(args.env_id, max_episode_steps=args.max_episode_steps), args)
-    test_env = make_env(args.env_id, max_episode_steps=args.max_episode_steps)  # never sees noise
+    args, env, test_env = check(args)
     if not np.isfinite([env.action_space.low, env.action_space.high]).all():
-        fail(f"--env-id {args.env_id}: SAC needs bounded actions, not {env.action_space}")
+        fail(f"SAC needs bounded actions; {args.env_id} has {env.action_space}")
     torch.set_num_threads(args.torch_threads)
     device = torch.device("cuda" if args.cuda else "cpu")
     run = Run(args, "SAC", use_matmul_precision(args.matmul_precision, device), env)
     if run.is_finished:
         return True
+    args.compile = can_compile(args)
 
     # SETUP: the updates take gradients of explicit parameters, autograd need not follow the rest
     torch.manual_seed(args.seed)
@@ -390,17 +387,24 @@ def fail(message, *lines, code=2):
     raise SystemExit(code)
 
 
+@contextlib.contextmanager
+def fail_on(errors, what, advice="", code=2):
+    """Turn such errors into one line: what failed, what the error says, and what to do."""
+    try:
+        yield
+    except errors as error:
+        fail(f"{what}: {str(error) or type(error).__name__}{advice}", code=code)
+
+
 def read_args(words):
     """Read the command line; a whole number may be written as 1e6."""
-    in_full = [
-        re.sub(r"(^|=)([1-9])e(\d)$", lambda m: m[1] + m[2] + "0" * int(m[3]), w) for w in words
-    ]
+    in_full = [re.sub(r"(?<![^=])\d+e\d$", lambda n: f"{float(n[0]):.0f}", word) for word in words]
     noises = "\n  ".join(["Noises:", *noisy.signatures()])
     return tyro.cli(Args, args=in_full, description=f"{__doc__}\n{noises}")
 
 
 def check(args):
-    """Return the arguments with the full names of environment and noises; fail if one is wrong."""
+    """Return the arguments in full, the noisy environment and a clean one; fail if one is wrong."""
     at_most = {"gamma": 1, "gae_lambda": 1, "tau": 1, "torch_threads": os.cpu_count()}
     for name, value in asdict(args).items():
         may_be_zero = type(value) is float or name in ("seed", "eval_frequency", "learning_starts")
@@ -411,36 +415,23 @@ def check(args):
         fail("--cuda: PyTorch finds no GPU; leave it out to run on the CPU")
     try:
         env_id = noisy.canonical_env_id(args.env_id)
-    except ValueError as error:
-        fail(f"--env-id: {error}")
-    try:
         noise, noise_rate = noisy.canonical_noises(args.noise, args.noise_rate)
+        env = make_env(env_id, max_episode_steps=args.max_episode_steps)
+        test_env = make_env(env_id, max_episode_steps=args.max_episode_steps)  # never sees noise
+        noisy_env = noisy.make_noisy(env, noise, noise_rate)
     except ValueError as error:
         fail(*str(error).split("\n"))
-    return replace(args, env_id=env_id, noise=noise, noise_rate=noise_rate)
-
-
-def add_noise(env, args):
-    """Return the training environment; fail unless its spaces and its noise can be worked with."""
     observations, actions = env.observation_space, env.action_space
-    has = f"--env-id {args.env_id}: this environment has"
-    if not isinstance(observations, gym.spaces.Box) or observations.dtype.kind not in "fiu":
-        fail(f"{has} observations {observations}; needs Box observations of numbers")
-    if (
-        not isinstance(actions, gym.spaces.Box)
-        or actions.dtype.kind != "f"
-        or len(actions.shape) != 1
-    ):
-        fail(f"{has} actions {actions}; needs Box actions of floats in one dimension")
-    try:
-        noisy_env = noisy.make_noisy(env, args.noise, args.noise_rate)
-    except ValueError as error:
-        fail(f"--noise: {error}")
-    if not isinstance(env.unwrapped.observation_space, gym.spaces.Box):
-        print(f"{args.env_id}: observations are flattened to {env.observation_space}")
+    if not isinstance(observations, Box) or observations.dtype.kind not in "fiu":
+        fail(f"needs Box observations of numbers; {env_id} has {observations}")
+    if not isinstance(actions, Box) or actions.dtype.kind != "f" or len(actions.shape) != 1:
+        fail(f"needs Box actions of floats in one dimension; {env_id} has {actions}")
+    if not isinstance(env.unwrapped.observation_space, Box):
+        print(f"{env_id}: observations are flattened to {observations}")
     if env.spec.max_episode_steps is None:
-        print(f"{args.env_id} declares no time limit; --max-episode-steps sets one")
-    return noisy_env
+        print(f"{env_id} declares no time limit; --max-episode-steps sets one")
+    args = replace(args, env_id=env_id, noise=noise, noise_rate=noise_rate)
+    return args, noisy_env, test_env
 
 
 def check_finite(step, observation, reward):
@@ -450,10 +441,8 @@ def check_finite(step, observation, reward):
 
 
 def evaluate(policy, env, episodes, stop=lambda: False):
-    """Play test episodes from fixed initial states -> (N, 2), their returns and lengths.
-
-    Without a time limit a test may never end: there, and only there, stop() ends it -> None.
-    """
+    """Play test episodes from fixed initial states -> (N, 2): returns, lengths; None if stopped."""
+    # without a time limit a test may never end: there, and only there, stop() ends it
     endless = env.spec is not None and env.spec.max_episode_steps is None
     results = np.zeros((episodes, 2))
     for episode in range(episodes):
@@ -478,26 +467,17 @@ def use_matmul_precision(precision, device):
     return precision
 
 
-def compiled(function, args):
-    """Return a function that is compiled at its first call, if torch.compile works here."""
+def can_compile(args):
+    """Return whether torch.compile is wanted and works here; if it does not, say why."""
     try:
         if args.compile:
             torch.compile(torch.neg)(torch.zeros(8, device="cuda" if args.cuda else "cpu"))
             torch.compiler.reset()  # forget what earlier runs of this process compiled
-            return torch.compile(function, fullgraph=True, dynamic=False)
     except Exception as error:  # no C++ compiler, no Python headers, ...
         reason = str(getattr(error, "inner_exception", error)).strip()
         print("not compiled:", reason.partition("\n")[0])
-    return function
-
-
-@contextlib.contextmanager
-def writing(path):
-    """Turn what the operating system (or torch.save) says into one line that names the file."""
-    try:
-        yield
-    except (OSError, RuntimeError) as error:
-        fail(f"cannot write {path}: {error}", code=1)
+        return False
+    return args.compile
 
 
 class Run:
@@ -508,93 +488,94 @@ class Run:
     def __init__(self, args, algorithm, precision, env):
         """Open the folder; fail if another process uses it, or if it holds a different run."""
         name = noisy.run_name(args.env_id, args.exp_name, args.noise, args.noise_rate, args.seed)
-        self.args, self.folder, self.noise = (
-            args,
-            Path(args.runs_dir, name),
-            noisy.noise_wrappers(env),
-        )
-        self.returns, self.start, self.last_test = [], time.time(), ""
+        self.args, self.folder, self.start = args, Path(args.runs_dir, name), time.time()
+        self.noise, self.returns, self.last_test = noisy.noise_wrappers(env), [], ""
         self.eval_csv = "step,episode,episodic_return,episodic_length\n"
-        try:
+        with fail_on(OSError, "--runs-dir"):
             self.folder.mkdir(parents=True, exist_ok=True)
             self.lock = open(self.folder / ".lock", "w")  # noqa: SIM115
-            fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until the process ends
-        except BlockingIOError:
-            fail(f"{self.folder} is in use by another process")
-        except OSError as error:
-            fail(f"--runs-dir: {error}")
+        with fail_on(BlockingIOError, f"{self.folder} is in use by another process"):
+            fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
         self._remove("[!.]*" if args.overwrite else "*.tmp")
-        config = {"algorithm": algorithm, "args": asdict(args), "matmul_precision": precision}
         if any(self.folder.glob("*.json")) or (self.folder / "checkpoint.pt").exists():
-            self._compare(json.loads(json.dumps(config["args"])))
+            config = self._old_config()
         else:
-            git = 'git -C "$0" describe --always --dirty --abbrev=40 --exclude="*"'
-            git = subprocess.run(["/bin/sh", "-c", git, Path(__file__).parent], capture_output=True)
+            describe = 'git describe --always --dirty --abbrev=40 --exclude="*"'
+            here = Path(__file__).parent
+            git = subprocess.run(describe, shell=True, cwd=here, capture_output=True, text=True)
             versions = {module.__name__: module.__version__ for module in (torch, gym, mujoco, np)}
-            config["versions"] = {**versions, "python": sys.version.split()[0]}
-            config["git_commit"] = git.stdout.decode().strip() or None
+            config = {
+                "algorithm": algorithm,
+                "args": asdict(args),
+                "matmul_precision": precision,
+                "versions": {**versions, "python": sys.version.split()[0]},
+                "git_commit": git.stdout.strip() or None,
+            }
             self._write("config.json", json.dumps(config, indent=2) + "\n")
-        self.is_finished = (self.folder / "result.json").exists()
+        result = self.folder / "result.json"
+        self.is_finished = result.exists()
         if self.is_finished:
+            with fail_on(Exception, f"cannot read {result}", "; --overwrite starts afresh"):
+                mean = json.loads(result.read_text())["final_return_mean"]
+                print(f"{self.folder} is finished: mean test return {mean:.1f}")
             self._remove("checkpoint.pt")
-            print(f"{self.folder} is finished")
+        elif precision not in config["matmul_precision"].split(", "):
+            used = config["matmul_precision"]
+            print(f"this processor multiplies in {precision} precision; the run used {used} so far")
+            config["matmul_precision"] = f"{used}, {precision}"
+            self._write("config.json", json.dumps(config, indent=2) + "\n")
 
-    def _compare(self, new):
-        path = self.folder / "config.json"
-        try:
-            old = json.loads(path.read_text())["args"]
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            fail(f"cannot read {path} ({type(error).__name__}: {error}); --overwrite starts afresh")
-        free = ("runs_dir", "overwrite", "torch_threads", "compile", "checkpoint_frequency")
-        names = [name for name in new if name not in free and old.get(name) != new[name]]
-        if names:
-            differences = "; ".join(f"{name} {old.get(name)}, not {new[name]}" for name in names)
+    def _old_config(self):
+        path, new = self.folder / "config.json", asdict(self.args)
+        for name in ("runs_dir", "overwrite", "torch_threads", "compile", "checkpoint_frequency"):
+            del new[name]  # may differ
+        with fail_on(Exception, f"cannot read {path}", "; --overwrite starts afresh"):
+            config = json.loads(path.read_text())
+            old = {name: config["args"].get(name) for name in new}
+        differ = [f"{name} {old[name]}, not {new[name]}" for name in new if old[name] != new[name]]
+        if differ:
             advice = "choose another --exp-name or --runs-dir; --overwrite deletes that run"
-            fail(f"{self.folder} holds a run with {differences}: {advice}")
+            fail(f"{self.folder} holds a run with {'; '.join(differ)}: {advice}")
+        return config
 
     def resume(self, state, generators):
         """Restore the last checkpoint of objects and random generators; return its step, or 0."""
         self.state, self.generators = [*state, *self.noise.values()], generators
-        step = self._load()
-        if step == 0:
+        path, step = self.folder / "checkpoint.pt", 0
+        if path.exists():
+            with fail_on(Exception, f"cannot resume from {path}", "; --overwrite starts afresh"):
+                step = self._load(path)
+            print(f"resumed at step {step}")
+        else:
             self._remove("events.*")
         self._write("eval.csv", self.eval_csv)
-        with writing(self.folder):  # what was logged after the checkpoint is purged
-            self.writer = SummaryWriter(str(self.folder), purge_step=step + 1 if step else None)
+        with self._writing("events.*"):  # what was logged after the checkpoint is purged
+            self.writer = SummaryWriter(str(self.folder), purge_step=step + 1)
         if step == 0:
             self._log_hyperparameters()
         Run.saved_step, self.printed = step, time.time()
-        total, is_terminal = self.args.total_timesteps, sys.stdout.isatty()
-        self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=not is_terminal)
+        total = self.args.total_timesteps
+        self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None)  # on terminals
         return step
 
-    def _load(self):
-        path = self.folder / "checkpoint.pt"
-        if not path.exists():
-            return 0
-        try:
-            damaged = zipfile.ZipFile(path).testzip()  # torch.load checks no checksums
-            if damaged:
-                raise ValueError(f"{damaged} is damaged")
-            checkpoint = torch.load(path, weights_only=True)
-            if (checkpoint["format"], checkpoint["run"]) != (2, self.folder.name):
-                raise ValueError(f"format {checkpoint['format']} of {checkpoint['run']}")
-            for part, state in zip(self.state, checkpoint["state"], strict=True):
-                part.load_state_dict(state)
-            for generator, state in zip(self.generators, checkpoint["generators"], strict=True):
-                generator.bit_generator.state = state
-            torch.set_rng_state(checkpoint["torch"])
-            self.returns, seconds, self.eval_csv = checkpoint["log"]
-        except Exception as error:  # a damaged file may raise anything
-            reason = str(error).strip().partition("\n")[0] or type(error).__name__
-            fail(f"cannot resume from {path} ({reason}); --overwrite starts afresh")
-        print(f"resumed at step {checkpoint['step']}")
+    def _load(self, path):
+        if zipfile.ZipFile(path).testzip():  # torch.load checks no checksums
+            raise ValueError("it is damaged")
+        checkpoint = torch.load(path, weights_only=True)
+        if (checkpoint["format"], checkpoint["run"]) != (2, self.folder.name):
+            raise ValueError(f"it has format {checkpoint['format']} of {checkpoint['run']}")
+        for part, state in zip(self.state, checkpoint["state"], strict=True):
+            part.load_state_dict(state)
+        for generator, state in zip(self.generators, checkpoint["generators"], strict=True):
+            generator.bit_generator.state = state
+        torch.set_rng_state(checkpoint["torch"])
+        self.returns, seconds, self.eval_csv = checkpoint["log"]
         self.start = time.time() - seconds
         return checkpoint["step"]
 
     def save(self, step):
         """Write a checkpoint: all that resuming needs, between two episodes."""
-        with writing(f"events.* in {self.folder}"):
+        with self._writing("events.*"):
             self.writer.flush()  # to be no older than the checkpoint
         checkpoint = {
             "format": 2,
@@ -609,31 +590,24 @@ class Run:
         Run.saved_step = step
 
     def _log_hyperparameters(self):
-        first = ("noise", "noise_rate", "env_id", "seed")  # what tells runs apart
-        values = {name: getattr(self.args, name) for name in first} | asdict(self.args)
-        table = "".join(f"|{name}|{value}|\n" for name, value in values.items())
+        table = "".join(f"|{name}|{value}|\n" for name, value in asdict(self.args).items())
         self.writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + table)
-        rates = [wrapper.noise_rate for wrapper in self.noise.values()]
-        values |= {"noise": " + ".join(self.args.noise), "noise_rate": max([0.0, *rates])}
-        values = {k: v if isinstance(v, int | float) else str(v) for k, v in values.items()}
-        experiment, _, end = hparams(values, {"eval/episodic_return_mean": 0})
-        plugin_data = experiment.value[0].metadata.plugin_data
-        data = HParamsPluginData.FromString(plugin_data.content)
-        for column in data.experiment.hparam_infos:
-            column.differs = column.name in first  # TensorBoard shows these columns first
-        plugin_data.content = data.SerializeToString()
-        for summary in (experiment, hparams_pb(values, trial_id=self.folder.name), end):
+        # for the table HPARAMS: what tells the runs of a folder apart
+        columns = {name: getattr(self.args, name) for name in ("env_id", "exp_name", "seed")}
+        columns["noise"] = " + ".join(self.args.noise)
+        columns["noise_rate"] = max([0.0, *(w.noise_rate for w in self.noise.values())])
+        for summary in hparams(columns, {"eval/episodic_return_mean": 0}):
             self.writer.file_writer.add_summary(summary)
 
     def log(self, step, values):
         """Log {tag: value} and the speed to TensorBoard; show the progress every ten seconds."""
         total, sps = self.args.total_timesteps, step / (time.time() - self.start)
-        with writing(f"events.* in {self.folder}"):
+        with self._writing("events.*"):
             for tag, value in {**values, "charts/SPS": sps}.items():
                 self.writer.add_scalar(tag, value, step)
         self.bar.update(step - self.bar.n)
         if self.bar.disable and time.time() - self.printed > 10:
-            eta = timedelta(seconds=round((total - step) / sps))
+            eta = tqdm.format_interval((total - step) / sps)
             print(f"step={step}/{total} sps={sps:.0f} {self.last_test}eta={eta}")
             self.printed = time.time()
 
@@ -669,7 +643,7 @@ class Run:
     def finish(self, step, policy):
         """Write policy.pt and, last of all, result.json; the checkpoint has served."""
         seconds = time.time() - self.start
-        with writing(f"events.* in {self.folder}"):
+        with self._writing("events.*"):
             self.writer.close()
         result = {
             "final_return_mean": self.mean,
@@ -690,19 +664,21 @@ class Run:
         for path in filter(Path.is_file, self.folder.glob(pattern)):
             path.unlink()
 
+    def _writing(self, name):
+        return fail_on((OSError, RuntimeError), f"cannot write {self.folder / name}", code=1)
+
     def _write(self, name, content):
         # whole or not at all: a kill or a full disk leaves the previous file
-        path = self.folder / name
-        temporary = path.with_suffix(".tmp")
+        temporary = (self.folder / name).with_suffix(".tmp")
         try:
-            with writing(path), open(temporary, "wb") as file:
+            with self._writing(name), open(temporary, "wb") as file:
                 if isinstance(content, str):
                     file.write(content.encode())
                 else:
                     torch.save(content, file)
                 file.flush()
                 os.fsync(file.fileno())
-                temporary.replace(path)
+                temporary.replace(self.folder / name)
         finally:
             temporary.unlink(missing_ok=True)
 

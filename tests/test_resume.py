@@ -825,6 +825,23 @@ def test_a_finished_run_says_so_and_changes_nothing(algorithm, alone, tmp_path):
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_another_precision_is_said_and_recorded(algorithm, tmp_path, monkeypatch, capsys):
+    words, said = options(algorithm, tmp_path), []
+    for precision, episodes in (("medium", EARLY), ("highest", EARLY), ("highest", math.inf)):
+        use = functools.partial(lambda effective, *_: effective, precision)
+        monkeypatch.setattr(script(algorithm), "use_matmul_precision", use)
+        train(algorithm, words, episodes)
+        said.append("highest precision; the run used medium so far" in capsys.readouterr().out)
+    assert said == [False, True, False]
+    assert_finished(folder(tmp_path))
+    monkeypatch.setattr(script(algorithm), "use_matmul_precision", lambda *_: "high")
+    train(algorithm, words)  # finished: it does not multiply any more
+    assert "precision" not in capsys.readouterr().out
+    config = json.loads((folder(tmp_path) / "config.json").read_text())
+    assert config["matmul_precision"] == "medium, highest"
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_a_run_needs_no_git(algorithm, tmp_path):
     moments = ("gymnasium.make", 1, uninstall_git), (TRAINING_STEP, 1, send(signal.SIGTERM))
     result = run(algorithm, options(algorithm, tmp_path), *moments)

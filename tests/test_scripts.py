@@ -243,11 +243,12 @@ def test_run_folder(algorithm, tmp_path, capsys):
     }
 
     # the same again, in another spelling: finished, and nothing is written
+    mean = result["final_return_mean"]
     before = {path: path.stat().st_mtime_ns for path in run_dir.iterdir()}
     capsys.readouterr()
     noise = {"noise": ("RandomEarlyTermination(2,4)", "RandomNormalNoisyReward(.50)")}
     run(algorithm, tmp_path, exp_name="an experiment", seed=7, noise_rate=(0.25, 0.5), **noise)
-    assert capsys.readouterr().out == f"{run_dir} is finished\n"
+    assert capsys.readouterr().out == f"{run_dir} is finished: mean test return {mean:.1f}\n"
     lock = run_dir / ".lock"
     after = {path: path.stat().st_mtime_ns for path in run_dir.iterdir()}
     assert after.keys() == before.keys()
@@ -270,6 +271,25 @@ def test_other_arguments_need_overwrite(algorithm, tmp_path, capsys):
     assert json.loads((run_dir / "config.json").read_text())["args"]["gamma"] == 0.5
     assert len(list(run_dir.glob("events*"))) == 1
     assert len(evaluations(run_dir)) == 9
+
+
+@pytest.mark.parametrize("content", ["", "{}", "[]", '{"final_return_mean": 1'])
+@each_script
+def test_a_result_that_cannot_be_read_is_no_result(algorithm, content, tmp_path, capsys):
+    short = {"total_timesteps": 12, "eval_frequency": 0, "learning_starts": 5}
+    short = {name: short[name] for name in short.keys() & asdict(SCRIPTS[algorithm].Args()).keys()}
+    result = run(algorithm, tmp_path, **short) / "result.json"
+    whole = result.read_text()
+    result.write_text(content)
+    with pytest.raises(SystemExit) as stopped:
+        run(algorithm, tmp_path, **short)
+    assert stopped.value.code == 2
+    line = capsys.readouterr().err
+    assert_one_line(line, f"cannot read {result}: ")
+    assert "--overwrite" in line
+    assert result.read_text() == content
+    run(algorithm, tmp_path, overwrite=True, **short)
+    assert json.loads(result.read_text()).keys() == json.loads(whole).keys()
 
 
 @each_script
@@ -356,7 +376,7 @@ def run_block(script):
 
 
 def test_repeated_helpers_are_word_for_word_identical():
-    everywhere = "make_env fail read_args check add_noise check_finite evaluate compiled writing "
+    everywhere = "make_env fail fail_on read_args check check_finite evaluate can_compile "
     everywhere += "use_matmul_precision Run"
     off_policy = "mlp in_numpy TwinLinear Critic ReplayBuffer updater"
     by_design = {"Args", "Actor", "load_policy", "critic_loss", "actor_loss", "train"}
@@ -470,7 +490,8 @@ def test_no_compiler_means_plain_updates(algorithm, tmp_path, capsys, monkeypatc
     plain = run(algorithm, tmp_path / "plain")
     monkeypatch.setattr(torch, "compile", no_compiler)
     fallback = run(algorithm, tmp_path / "fallback", compile=True)
-    assert "not compiled: no compiler\n" in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert "not compiled: no compiler\n" in output and output.count("not compiled") == 1
     torch.testing.assert_close(policy(fallback), policy(plain), rtol=0, atol=0)
 
 
@@ -576,7 +597,7 @@ OFF_POLICY_ONLY = ("SAC", "TD3")
 BAD = [  # arguments, what the message names, of which scripts
     ({"env_id": "NoSuchEnv-v0"}, "NoSuchEnv", SCRIPTS),
     ({"env_id": "no_such_module:Env-v0"}, "no_such_module", SCRIPTS),
-    ({"env_id": ""}, "--env-id", SCRIPTS),
+    ({"env_id": ""}, "there is no environment ''", SCRIPTS),
     ({"env_id": "Ant-v1"}, "Ant-v1", SCRIPTS),
     ({"env_id": "toy_envs:Broken-v0"}, "first line second line", SCRIPTS),
     ({"env_id": "CartPole-v1"}, "Discrete(2)", SCRIPTS),
@@ -591,7 +612,7 @@ BAD = [  # arguments, what the message names, of which scripts
             "noise": ("RandomDropoutObservation(0.5)",),
             "noise_rate": (0.1,),
         },
-        "--noise",
+        "RandomDropoutObservation cannot perturb categories",
         SCRIPTS,
     ),
     ({"env_id": "toy_envs:Unbounded-v0"}, "bounded actions", OFF_POLICY_ONLY),
@@ -811,7 +832,7 @@ def test_command_line(algorithm, commands):
     assert json.loads((run_dir / "config.json").read_text())["args"]["seed"] == 1
     again = command(algorithm, *line)
     assert (again.returncode, again.stderr) == (0, "")
-    assert again.stdout == f"{run_dir} is finished\n"
+    assert again.stdout.startswith(f"{run_dir} is finished: ") and again.stdout.count("\n") == 1
 
 
 @pytest.fixture(scope="module")
@@ -902,7 +923,7 @@ def test_tensorboard_knows_the_hyperparameters(tensorboard, commands):
     assert {group["name"] for group in groups} == names  # readable, and one for each run
     experiment = tensorboard("/data/plugin/hparams/experiment", {"experimentName": ""})
     columns = [info["name"] for info in experiment["hparamInfos"]]
-    assert columns[:4] == ["env_id", "noise", "noise_rate", "seed"]
+    assert columns == ["env_id", "exp_name", "noise", "noise_rate", "seed"]
     for group in groups:
         noise = "RandomEarlyTermination(2, 4) + RandomNormalNoisyReward(0.5)"
         assert group["hparams"]["noise"] == noise
