@@ -16,7 +16,6 @@ import fcntl
 import json
 import math
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -380,9 +379,18 @@ def fail_on(errors, what, advice="", code=2):
 
 def read_args(words):
     """Read the command line; a whole number may be written as 1e6."""
-    in_full = [re.sub(r"(?<![^=])\d+e\d$", lambda n: f"{float(n[0]):.0f}", word) for word in words]
     noises = "\n  ".join(["Noises:", *noisy.signatures()])
-    return tyro.cli(Args, args=in_full, description=f"{__doc__}\n{noises}")
+    words = [in_digits(word) for word in words]
+    return tyro.cli(Args, args=words, description=f"{__doc__}\n{noises}")
+
+
+def in_digits(word):
+    """Write 1e6 in digits, also in --total-timesteps=1e6."""
+    start, equals, number = word.rpartition("=")
+    with contextlib.suppress(ValueError):  # it is no number
+        if "e" in number.lower() and float(number).is_integer():
+            return f"{start}{equals}{float(number):.0f}"
+    return word
 
 
 def check(args):
@@ -418,8 +426,10 @@ def check(args):
 
 def check_finite(step, observation, reward):
     """Fail if the environment returned NaN or infinity."""
-    if not (math.isfinite(reward) and np.isfinite(observation).all()):
-        fail(f"step {step}: not finite: the environment's reward {reward} or {observation}", code=1)
+    if not math.isfinite(reward):
+        fail(f"step {step}: the environment returned the reward {reward}", code=1)
+    if not np.isfinite(observation).all():
+        fail(f"step {step}: the environment returned the observation {observation}", code=1)
 
 
 def evaluate(policy, env, episodes, stop=lambda: False):

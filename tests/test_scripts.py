@@ -739,13 +739,13 @@ def test_bad_command(algorithm, options, word, tmp_path):
 
 def test_a_module_beside_the_caller_and_steps_as_1e2(tmp_path):
     (tmp_path / "my_envs.py").write_text("from toy_envs import *\n")
-    options = ["--env-id", "my_envs:Tiny-v0", "--total-timesteps", "1e2", "--no-compile"]
+    options = ["--env-id", "my_envs:Tiny-v0", "--total-timesteps", "1.2E2", "--no-compile"]
     options += ["--learning-starts=5e1", "--eval-frequency", "0", "--eval-episodes", "1"]
     result = command("SAC", *options, cwd=tmp_path)
     assert (result.returncode, result.stderr) == (0, "")
     [run_dir] = (tmp_path / "runs").iterdir()
     args = json.loads((run_dir / "config.json").read_text())["args"]
-    assert (args["total_timesteps"], args["learning_starts"]) == (100, 50)
+    assert (args["total_timesteps"], args["learning_starts"]) == (120, 50)
     assert args["env_id"] == "my_envs:Tiny-v0"
 
 
