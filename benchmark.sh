@@ -97,7 +97,8 @@ run_one() {
   local child=$! status=0
   trap : TERM INT
   trap '[ -n "$asked" ] || kill -TERM "$child" || true; asked=1' USR1
-  while kill -0 "$child" 2>/dev/null; do wait "$child" && status=0 || status=$?; done
+  while kill -0 "$child" 2>/dev/null; do wait "$child" || true; done # a signal interrupts wait
+  wait "$child" || status=$?
   echo "# $(date '+%F %T') $HOSTNAME: exit=$status"
   return "$status"
 }
