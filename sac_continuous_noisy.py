@@ -253,7 +253,8 @@ def updater(loss, network, optimizer, args):
     gradient_of = grad_and_value(loss, has_aux=True)
     if args.compile:
         gradient_of = torch.compile(gradient_of, fullgraph=True, dynamic=False)
-    bf16 = torch.autocast("cuda" if args.cuda else "cpu", enabled=args.matmul_precision == "bf16")
+    device_type = "cuda" if args.cuda else "cpu"
+    bf16 = torch.autocast(device_type, torch.bfloat16, enabled=args.matmul_precision == "bf16")
 
     def update(*inputs):
         with bf16:
