@@ -190,10 +190,9 @@ class ReplayBuffer:
         """Draw (s, a, r, s', terminated) uniformly: float32 tensors with batch_size rows."""
         oldest = self.position - self.size
         rows = (oldest + rng.integers(self.size, size=batch_size)) % self.rows
-        arrays = [getattr(self, name).take(rows, axis=0) for name in self.ARRAYS]
+        arrays = [getattr(self, name)[rows] for name in self.ARRAYS]
         observations, actions, rewards, terminated = map(torch.from_numpy, arrays)
-        next_observations = self.observations.take((rows + 1) % self.rows, axis=0)
-        next_observations = torch.from_numpy(next_observations)
+        next_observations = torch.from_numpy(self.observations[(rows + 1) % self.rows])
         for i, row in enumerate(rows.tolist()):
             if row in self.final:
                 next_observations[i] = self.final[row]
