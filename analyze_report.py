@@ -57,6 +57,7 @@ ONLY_CSV = {
     "luck": ["consistent_by_luck_95", "consistently_worse_by_luck_95"],
     "compare_luck": ["consistent_by_luck_95", "consistently_worse_by_luck_95"],
     "statistics": ["environments", "comparisons", "smallest_p", "smallest_p_adjusted"],
+    "robustness_score": ["smallest_p"],
 }
 for _name in ("mean", "average improvement %"):
     MERGED[f"paper: {_name}"] = tuple(f"paper_{column}" for column in MERGED[_name])

@@ -16,19 +16,22 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from scipy import stats
 
 from analyze_runs import BASELINE, KEYS, order, rate_text
 from analyze_statistics import contrast, holm, improvement_percent, mann_whitney, mean_std
-from analyze_verdict import p_value
+from analyze_verdict import LEVEL, POWER, p_value
 
 FILES = ("robustness.csv", "robustness.csv.gz")
 HEADER = ["noise", "noise_rate", "episode", "episodic_return", "episodic_length"]
 CONDITION = ["test_noise", "test_rate"]
 CLEAN = BASELINE  # a condition is (noise, rate), as a configuration is
+DETECTABLE = stats.norm.ppf(1 - LEVEL / 2) + stats.norm.ppf(POWER)  # in standard errors
 RUN_COLUMNS = [*KEYS, "seed", *CONDITION, "mean", "cvar"]
 COLUMNS = [*KEYS, *CONDITION, "tested_on", "n", "mean", "std", "change_percent", "cvar"]
 SCORE_COLUMNS = [*KEYS, "n", "n_baseline", "conditions", "score", "baseline_score"]
 SCORE_COLUMNS += ["difference", "difference_low", "difference_high", "p", "p_holm"]
+SCORE_COLUMNS += ["smallest_p", "detectable"]
 SCORE_COLUMNS += ["clean_change_percent", "cvar_score", "baseline_cvar_score"]
 SCORE_COLUMNS += ["worst_score", "baseline_worst_score", "worst_condition"]
 
@@ -39,7 +42,9 @@ have no wrapper of the training (and neither reward noise nor early termination)
 mean return of a run under a condition and C the mean clean return of the policies trained without
 noise. Baseline score: the same of the policies trained without noise, under the same conditions.
 [ ]: 95 % interval (Welch, Satterthwaite). p: exact Mann-Whitney test between the two, stratified by
-environment; Holm: corrected for the training configurations of an algorithm. Rows of one
+environment; Holm: corrected for the training configurations of an algorithm; smallest p: what these
+numbers of seeds could reach at most; detectable: the difference that they find with 80 % power, for
+normal scores. Rows of one
 environment are secondary where there is one of all. Clean change: how much better or worse the
 policies are without any noise, so that a better policy is not taken for a more robust one. Worst:
 the lowest score under one condition. CVaR: the score of the worst tenth of the episodes of each
@@ -105,6 +110,12 @@ def is_unseen(condition, config):
     return bool(tested) and not inert and not tested & wrappers(config[0])
 
 
+def is_seen(condition, config):
+    """Tell whether a test condition consists of wrappers that were in training."""
+    tested = wrappers(condition[0])
+    return bool(tested) and tested <= wrappers(config[0])
+
+
 def tested_on(condition, config):
     """Say in words how a test condition is related to the training configuration."""
     if condition == CLEAN:
@@ -145,20 +156,21 @@ def condition_rows(runs):
                 yield row
 
 
-def environment_scores(runs, config):
+def environment_scores(runs, config, counts):
     """Score a configuration and the baseline in one environment, or return None.
 
-    runs: those of one algorithm and environment. The result is a dict with arrays: `x` (seeds) and
-    `y` (baseline seeds) are scores, `x_cvar` and `y_cvar` the same of the worst tenth of the
-    episodes, `clean` (seeds) is the change of the clean return in percent; `x_conditions` and
-    `y_conditions` are Series with the mean score under each condition.
+    runs: those of one algorithm and environment. counts(condition, config) tells which conditions
+    count. The result is a dict with arrays: `x` (seeds) and `y` (baseline seeds) are scores,
+    `x_cvar` and `y_cvar` the same of the worst tenth of the episodes, `clean` (seeds) is the change
+    of the clean return in percent; `x_conditions` and `y_conditions` are Series with the mean score
+    under each condition.
     """
     x, y = by_run(runs, config, "mean"), by_run(runs, BASELINE, "mean")
     if x.empty or y.empty or CLEAN not in x or CLEAN not in y:
         return None
     shared = x.columns.intersection(y.columns)
     whole = [c for c in shared if x[c].notna().all() and y[c].notna().all()]
-    conditions = [condition for condition in whole if is_unseen(condition, config)]
+    conditions = [condition for condition in whole if counts(condition, config)]
     clean = y[CLEAN].mean()
     if not conditions or clean == 0:
         return None
@@ -179,15 +191,18 @@ def environment_scores(runs, config):
     }
 
 
-def score_rows(runs):
-    """Yield the score of every configuration with noise: over all environments, then in each."""
+def score_rows(runs, counts=is_unseen):
+    """Yield the score of every configuration with noise: over all environments, then in each.
+
+    counts(condition, config) tells whether a test condition counts for a training configuration.
+    """
     for algorithm, group in runs.groupby("algorithm"):
         for config in configurations(group):
             if config == BASELINE:
                 continue
             scores = {}
             for environment, same in group.groupby("environment"):
-                found = environment_scores(same, config)
+                found = environment_scores(same, config, counts)
                 if found:
                     scores[environment] = found
             if len(scores) > 1:
@@ -201,8 +216,10 @@ def score_row(algorithm, scope, config, scores):
     found = list(scores.values())
     cells = [part["x"] for part in found] + [part["y"] for part in found]
     weights = [1 / len(found)] * len(found) + [-1 / len(found)] * len(found)
-    difference, _, low, high = contrast(cells, weights)
-    p, _ = mann_whitney(stacked(part["x"] for part in found), stacked(part["y"] for part in found))
+    difference, error, low, high = contrast(cells, weights)
+    p, smallest_p = mann_whitney(
+        stacked(part["x"] for part in found), stacked(part["y"] for part in found)
+    )
     worst = {
         (environment, *condition): value
         for environment, part in scores.items()
@@ -225,6 +242,8 @@ def score_row(algorithm, scope, config, scores):
         "difference_low": low,
         "difference_high": high,
         "p": p,
+        "smallest_p": smallest_p,
+        "detectable": DETECTABLE * error,
         "clean_change_percent": average("clean"),
         "worst_score": min(worst.values()),
         "baseline_worst_score": min(part["y_conditions"].min() for part in found),
@@ -270,13 +289,18 @@ def robustness_sentences(scores):
     for row in scores[primary(scores)].itertuples():
         where = "all environments together" if row.environment == "all" else row.environment
         verdict = "no clear difference in robustness to new noise"
-        if row.p <= 0.05:
+        if row.p <= LEVEL:
             more = "more" if row.difference > 0 else "less"
-            verdict = f"{'' if row.p_holm <= 0.05 else 'perhaps '}{more} robust to new noise"
+            verdict = f"{'' if row.p_holm <= LEVEL else 'perhaps '}{more} robust to new noise"
+        limit = ""
+        if row.smallest_p > LEVEL:
+            limit = f"; {row.n} seeds against {row.n_baseline} cannot show any"
+        elif row.p > LEVEL and row.detectable > 0:
+            limit = f"; a difference of {row.detectable:.0f} would have been seen (80 % power)"
         corrected = p_value(row.p_holm).removeprefix("= ")
         yield (
             f"{row.algorithm} on {where}, trained with {row.noise} at rate {row.noise_rate}: "
             f"{verdict} (score {row.score:.0f} against {row.baseline_score:.0f} without noise in "
             f"training, p {p_value(row.p)}, Holm {corrected}; clean return "
-            f"{row.clean_change_percent:+.0f} %)."
+            f"{row.clean_change_percent:+.0f} %){limit}."
         )

@@ -82,6 +82,8 @@ def test_score_and_conditions_by_hand(tmp_path, capsys):
     half = stats.t.ppf(0.975, 3) * np.std([27, 26.5, 26, 25.5], ddof=1) / 2
     assert push["difference_low"] == pytest.approx(13.75 - half)
     assert push["p"] == pytest.approx(2 / 70)  # C(8, 4) = 70
+    assert push["smallest_p"] == pytest.approx(2 / 70)
+    assert push["detectable"] == pytest.approx(2.801585 * np.std([27, 26.5, 26, 25.5], ddof=1) / 2)
     assert push["p_holm"] == pytest.approx(2 * 2 / 70)
     assert push["clean_change_percent"] == pytest.approx(-10)
     assert push["worst_score"] == pytest.approx(-40) and push["baseline_worst_score"] == -60
@@ -137,6 +139,32 @@ def test_environments_count_equally_and_the_test_is_stratified(tmp_path):
     assert every["worst_condition"] == f"{SENSOR} at 0.20 on Pusher-v5"
     assert every["worst_score"] == pytest.approx(-52) and every["n"] == 3
     assert scores["p_holm"].isna().tolist() == [False, True, True]  # the others are secondary
+
+
+def test_sentences_say_what_the_seeds_could_have_shown(tmp_path, capsys):
+    alike = {("", 0.0): HOPPER["", 0.0], (PUSH, 1.0): dict(HOPPER["", 0.0])}
+    alike[PUSH, 1.0][SENSOR, "0.2"] = [78, 79, 81, 82]
+    write_tests(tmp_path / "runs", alike, "Hopper-v5")
+    run(tmp_path, out="four")
+    error = np.std([78, 79, 81, 82], ddof=1) / 2 / 2  # of the score: the mean of two conditions
+    limit = f"; a difference of {2.801585 * error:.0f} would have been seen (80 % power)."
+    assert limit in capsys.readouterr().out
+    for folder in (tmp_path / "runs").glob(f"*{PUSH}*__[34]"):
+        shutil.rmtree(folder)
+    run(tmp_path, out="two")
+    assert "; 2 seeds against 4 cannot show any." in capsys.readouterr().out
+
+
+def test_the_score_on_noise_of_the_training(tmp_path):
+    write_tests(tmp_path, HOPPER, "Hopper-v5")
+    found, _ = analyze_robustness.read_robustness(tmp_path, analyze_runs.read_runs(tmp_path))
+    rows = analyze_robustness.score_rows(found, analyze_robustness.is_seen)
+    by_noise = {line["noise"]: line for line in rows}
+    assert by_noise[PUSH]["conditions"] == 1  # not both together: the sensor noise is new
+    assert by_noise[PUSH]["score"] == pytest.approx(-5)
+    assert by_noise[PUSH]["baseline_score"] == pytest.approx(62.5 - 100)
+    assert by_noise[SENSOR]["conditions"] == 2
+    assert by_noise[SENSOR]["score"] == pytest.approx((5 - 30) / 2)
 
 
 def test_conditions_that_a_run_lacks_do_not_count(tmp_path):
