@@ -333,3 +333,5 @@ if __name__ == "__main__":
         main(tyro.cli(Args, description=__doc__))
     except KeyboardInterrupt:
         fail("stopped; the conditions that were played are stored", code=130)
+    except FloatingPointError as error:  # from the environment
+        fail(error, code=1)

@@ -30,7 +30,7 @@ import math
 import numbers
 import re
 import zlib
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -45,6 +45,8 @@ __version__ = "0.1.0"
 
 __all__ = [
     "WRAPPERS",
+    "EnvState",
+    "FiniteNumbers",
     "Noise",
     "NoiseWrapper",
     "ObservationNoise",
@@ -61,8 +63,10 @@ __all__ = [
     "RewardNoise",
     "canonical_env_id",
     "canonical_noises",
+    "make_flat",
     "make_noisy",
     "noise_slug",
+    "noise_statistics",
     "noise_wrappers",
     "parse_noise",
     "run_name",
@@ -632,6 +636,52 @@ class RecordEpisodeStatistics(gym.wrappers.RecordEpisodeStatistics[Any, Any]):
             raise ValueError(_RECORDED) from error
 
 
+class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Makes rewards floats, and raises FloatingPointError where the environment returns NaN.
+
+    Infinity is an error, too. A learner that is given such a number is lost from there on, and says
+    so much later or never. The reward may be an array of one number.
+
+    >>> env = FiniteNumbers(gym.make("Pendulum-v1", disable_env_checker=True))
+    >>> _ = env.reset(seed=0)
+    >>> env.step(np.array([np.nan]))
+    Traceback (most recent call last):
+    FloatingPointError: step 1 of an episode: the environment returned the reward nan
+    """
+
+    def __init__(self, env: Env):
+        """Wrap an environment with Box observations."""
+        gym.Wrapper.__init__(self, env)
+        RecordConstructorArgs.__init__(self)
+        self._steps = 0
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
+        """Reset the environment and check the first observation."""
+        self._steps = 0
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._check_observation(observation)
+        return observation, info
+
+    def step(self, action: Any) -> Step:
+        """Step the environment and check the observation and the reward."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        number = float(np.asarray(reward).item())
+        self._steps += 1
+        if not math.isfinite(number):
+            raise FloatingPointError(
+                f"step {self._steps} of an episode: the environment returned the reward {number}"
+            )
+        self._check_observation(observation)
+        return observation, number, terminated, truncated, info
+
+    def _check_observation(self, observation: NDArray[Any]) -> None:
+        if not np.isfinite(observation).all():
+            raise FloatingPointError(
+                f"step {self._steps} of an episode: the environment returned the observation "
+                f"{np.asarray(observation).tolist()}"
+            )
+
+
 @dataclass(frozen=True)
 class Noise:
     """A wrapper and its parameters, without environment and rate.
@@ -800,6 +850,39 @@ def make_noisy(
     return env
 
 
+def make_flat(env: Env) -> Env:
+    """Prepare an environment for networks, whose inputs and outputs are vectors.
+
+    Observations that are no vector (dictionaries, tuples, arrays, categories) are flattened to one
+    by ``gymnasium.wrappers.FlattenObservation``; :class:`FiniteNumbers` makes rewards floats and
+    stops at NaN. Noise belongs around the result: ``make_noisy(make_flat(env), ...)``.
+
+    >>> make_flat(gym.make("Pendulum-v1").unwrapped)
+    <FiniteNumbers<PendulumEnv<Pendulum-v1>>>
+    >>> make_flat(gym.make("CartPole-v1"))
+    Traceback (most recent call last):
+    ValueError: needs Box actions of floats in one dimension; CartPole-v1 has Discrete(2)
+
+    Raises:
+        ValueError: actions that are no vector of floats, or observations that cannot become one.
+    """
+    name = env.spec.id if env.spec else str(env)
+    space = env.observation_space
+    is_vector = isinstance(space, gym.spaces.Box) and len(space.shape) == 1
+    if space.is_np_flattenable and not is_vector:
+        env = gym.wrappers.FlattenObservation(env)
+    observations, actions = env.observation_space, env.action_space
+    if not isinstance(observations, gym.spaces.Box) or observations.dtype.kind not in "fiu":
+        raise ValueError(f"needs Box observations of numbers; {name} has {observations}")
+    if (
+        not isinstance(actions, gym.spaces.Box)
+        or actions.dtype.kind != "f"
+        or len(actions.shape) != 1
+    ):
+        raise ValueError(f"needs Box actions of floats in one dimension; {name} has {actions}")
+    return FiniteNumbers(env)
+
+
 def set_progress(env: Env, fraction: float) -> None:
     """Say what fraction of training is done, for rates that change; call it before a ``reset()``.
 
@@ -833,6 +916,74 @@ def noise_wrappers(env: Env) -> dict[str, NoiseWrapper]:
         count[name] += 1
         found[name if count[name] == 1 else f"{name}_{count[name]}"] = layer
     return found
+
+
+def noise_statistics(env: Env) -> dict[str, float]:
+    """Return the rate and the realised rate of an environment's noise wrappers, for a log.
+
+    >>> env = make_noisy(gym.make("CartPole-v1"), ["RandomNormalNoisyReward(1)"], [1.0])
+    >>> _ = env.reset(), env.step(0)
+    >>> noise_statistics(env)
+    {'RandomNormalNoisyReward/rate': 1.0, 'RandomNormalNoisyReward/applied_fraction': 1.0}
+    """
+    statistics = {}
+    for name, wrapper in noise_wrappers(env).items():
+        statistics[f"{name}/rate"] = wrapper.noise_rate
+        statistics[f"{name}/applied_fraction"] = wrapper.applied_fraction
+    return statistics
+
+
+class EnvState:
+    """What an environment carries from one episode to the next, to resume training.
+
+    That is the random generators of the environment and of its action space, the random streams and
+    the counters of its noise wrappers, and the returns that RecordEpisodeStatistics remembers.
+    ``generators`` are further ones to keep beside them. An environment of one's own that carries
+    more than its generator ``np_random`` does not go on exactly.
+
+    >>> env = make_noisy(gym.make("Pendulum-v1"), ["RandomNormalNoisyObservation(1)"], [0.5])
+    >>> _ = env.reset(seed=1)
+    >>> saved = EnvState(env).state_dict()
+    >>> first, _ = env.reset()
+    >>> EnvState(env).load_state_dict(saved)
+    >>> bool((env.reset()[0] == first).all())
+    True
+    """
+
+    def __init__(self, env: Env, *generators: np.random.Generator):
+        """Look at an environment that has been reset with a seed."""
+        self.env = env
+        self.generators = generators
+
+    def _generators(self) -> list[np.random.Generator]:
+        environment, actions = self.env.unwrapped.np_random, self.env.action_space.np_random
+        return [environment, actions, *self.generators]
+
+    def _returns(self) -> deque[float]:
+        recorded = self.env.has_wrapper_attr("return_queue")
+        return self.env.get_wrapper_attr("return_queue") if recorded else deque()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state, to be taken between two episodes."""
+        return {
+            "generators": [generator.bit_generator.state for generator in self._generators()],
+            "noise": [wrapper.state_dict() for wrapper in noise_wrappers(self.env).values()],
+            "returns": list(self._returns()),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a :meth:`state_dict`; the next call of the environment must be ``reset()``.
+
+        Raises:
+            ValueError: a state of another number of generators or noise wrappers.
+        """
+        for generator, stream in zip(self._generators(), state["generators"], strict=True):
+            generator.bit_generator.state = stream
+        wrappers = noise_wrappers(self.env).values()
+        for wrapper, part in zip(wrappers, state["noise"], strict=True):
+            wrapper.load_state_dict(part)
+        self._returns().clear()
+        self._returns().extend(state["returns"])
 
 
 def noise_slug(noises: Sequence[str], rates: Sequence[float | str]) -> str:

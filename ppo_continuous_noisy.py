@@ -31,7 +31,6 @@ import numpy as np
 import torch
 import torch.nn as nn
 import tyro
-from gymnasium.spaces import Box
 from torch.func import functional_call, grad_and_value
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
@@ -86,11 +85,7 @@ class Args:
 def make_env(env_id, **kwargs):
     """Make the clean environment, whose observations and actions are vectors."""
     with fail_on(Exception, f"--env-id {env_id}"):  # its constructor may raise anything
-        env = gym.make(env_id, disable_env_checker=True, **kwargs)
-    space = env.observation_space
-    if space.is_np_flattenable and (not isinstance(space, Box) or len(space.shape) != 1):
-        env = gym.wrappers.FlattenObservation(env)
-    return gym.wrappers.TransformReward(env, lambda reward: np.asarray(reward).item())
+        return noisy.make_flat(gym.make(env_id, disable_env_checker=True, **kwargs))
 
 
 def mlp(inputs, outputs, std):
@@ -268,7 +263,7 @@ def train(args, stop=lambda: False):
     run = Run(args, "PPO", use_matmul_precision(args.matmul_precision, device), env)
     if run.is_finished:
         return True
-    args.compile = can_compile(args)
+    args.compile = args.compile and can_compile(device)
 
     # SETUP: the updates take gradients of explicit parameters, autograd need not follow the rest
     torch.manual_seed(args.seed)
@@ -284,7 +279,7 @@ def train(args, stop=lambda: False):
 
     # RESUME: between two episodes an environment carries over no more than its generator
     state = [agent, optimizer, rollout, observation_stats, return_stats]
-    start = run.resume(state, generators=[rng, env.unwrapped.np_random])
+    start = run.resume([*state, noisy.EnvState(env, rng)])
     if start > 0:
         noisy.set_progress(env, start / total_steps)
         observation, _ = env.reset()
@@ -303,7 +298,6 @@ def train(args, stop=lambda: False):
         # STEP
         action = rollout.actions[step].clip(low, high)
         observation, reward, terminated, truncated, info = env.step(action)
-        check_finite(global_step, observation, reward)
         observation_stats.update(observation)
 
         # STORE
@@ -347,8 +341,8 @@ def train(args, stop=lambda: False):
 
             curves["clipfrac"] = torch.stack(clipfracs).mean()
             curves["explained_variance"] = 1 - (returns - values).var() / returns.var().clamp(1e-8)
-            run.log_losses(global_step, curves)
-            run.log(global_step, {"charts/learning_rate": optimizer.param_groups[0]["lr"]})
+            charts = {"learning_rate": optimizer.param_groups[0]["lr"]}
+            run.log(global_step, charts=charts, losses=curves, noise=noisy.noise_statistics(env))
 
             # TEST: if one fell due during the rollout; eval.csv has the step at which it fell due
             due = args.eval_frequency and global_step - global_step % args.eval_frequency
@@ -390,35 +384,32 @@ def load_policy(run_dir, env):
 # THE RUN: arguments, tests, speed, files; word for word the same in the three scripts.
 
 
-def fail(message, *lines, code=2):
-    """Exit after a line that says what is wrong and what to do, and more lines if there are."""
-    print("\n".join(["error: " + " ".join(str(message).split()), *lines]), file=sys.stderr)
+def fail(message, code=2):
+    """Exit after a line that says what is wrong and what to do."""
+    print(f"error: {message}", file=sys.stderr)
     raise SystemExit(code)
 
 
 @contextlib.contextmanager
-def fail_on(errors, what, advice="", code=2):
-    """Turn such errors into one line: what failed, what the error says, and what to do."""
+def fail_on(errors, message, code=2):
+    """Turn such errors into one line: the message, and what the error says."""
     try:
         yield
     except errors as error:
-        fail(f"{what}: {str(error) or type(error).__name__}{advice}", code=code)
+        reason = " ".join(str(error).split()) or type(error).__name__
+        fail(f"{message}: {reason}", code)
 
 
-def read_args(words):
+def read_args():
     """Read the command line; a whole number may be written as 1e6."""
+    words = sys.argv[1:]
+    for i, word in enumerate(words):
+        flag, equals, number = word.rpartition("=")
+        with contextlib.suppress(ValueError):  # it is no number
+            if "e" in number.lower() and float(number).is_integer():
+                words[i] = f"{flag}{equals}{float(number):.0f}"
     noises = "\n  ".join(["Noises:", *noisy.signatures()])
-    words = [in_digits(word) for word in words]
     return tyro.cli(Args, args=words, description=f"{__doc__}\n{noises}")
-
-
-def in_digits(word):
-    """Write 1e6 in digits, also in --total-timesteps=1e6."""
-    start, equals, number = word.rpartition("=")
-    with contextlib.suppress(ValueError):  # it is no number
-        if "e" in number.lower() and float(number).is_integer():
-            return f"{start}{equals}{float(number):.0f}"
-    return word
 
 
 def check(args):
@@ -434,36 +425,22 @@ def check(args):
     try:
         env_id = noisy.canonical_env_id(args.env_id)
         noise, noise_rate = noisy.canonical_noises(args.noise, args.noise_rate)
-        env = make_env(env_id, max_episode_steps=args.max_episode_steps)
         test_env = make_env(env_id, max_episode_steps=args.max_episode_steps)  # never sees noise
-        noisy_env = noisy.make_noisy(env, noise, noise_rate)
+        env = make_env(env_id, max_episode_steps=args.max_episode_steps)
+        env = noisy.make_noisy(env, noise, noise_rate)
     except ValueError as error:
-        fail(*str(error).split("\n"))
-    observations, actions = env.observation_space, env.action_space
-    if not isinstance(observations, Box) or observations.dtype.kind not in "fiu":
-        fail(f"needs Box observations of numbers; {env_id} has {observations}")
-    if not isinstance(actions, Box) or actions.dtype.kind != "f" or len(actions.shape) != 1:
-        fail(f"needs Box actions of floats in one dimension; {env_id} has {actions}")
-    if not isinstance(env.unwrapped.observation_space, Box):
-        print(f"{env_id}: observations are flattened to {observations}")
+        fail(error)
+    if not isinstance(env.unwrapped.observation_space, gym.spaces.Box):
+        print(f"{env_id}: observations are flattened to {test_env.observation_space}")
     if env.spec.max_episode_steps is None:
         print(f"{env_id} declares no time limit; --max-episode-steps sets one")
-    args = replace(args, env_id=env_id, noise=noise, noise_rate=noise_rate)
-    return args, noisy_env, test_env
-
-
-def check_finite(step, observation, reward):
-    """Fail if the environment returned NaN or infinity."""
-    if not math.isfinite(reward):
-        fail(f"step {step}: the environment returned the reward {reward}", code=1)
-    if not np.isfinite(observation).all():
-        fail(f"step {step}: the environment returned the observation {observation}", code=1)
+    return replace(args, env_id=env_id, noise=noise, noise_rate=noise_rate), env, test_env
 
 
 def evaluate(policy, env, episodes, stop=lambda: False):
     """Play test episodes from fixed initial states -> (N, 2): returns, lengths; None if stopped."""
     # without a time limit a test may never end: there, and only there, stop() ends it
-    endless = env.spec is not None and env.spec.max_episode_steps is None
+    endless = env.spec.max_episode_steps is None
     results = np.zeros((episodes, 2))
     for episode in range(episodes):
         observation, _ = env.reset(seed=TEST_SEED + episode)
@@ -487,17 +464,16 @@ def use_matmul_precision(precision, device):
     return precision
 
 
-def can_compile(args):
-    """Return whether torch.compile is wanted and works here; if it does not, say why."""
+def can_compile(device):
+    """Return whether torch.compile works here; if it does not, say why."""
     try:
-        if args.compile:
-            torch.compile(torch.neg)(torch.zeros(8, device="cuda" if args.cuda else "cpu"))
-            torch.compiler.reset()  # forget what earlier runs of this process compiled
+        torch.compile(torch.neg)(torch.zeros(8, device=device))
+        torch.compiler.reset()  # forget what earlier runs of this process compiled
+        return True
     except Exception as error:  # no C++ compiler, no Python headers, ...
         reason = str(getattr(error, "inner_exception", error)).strip()
         print("not compiled:", reason.partition("\n")[0])
         return False
-    return args.compile
 
 
 class Run:
@@ -509,47 +485,45 @@ class Run:
         """Open the folder; fail if another process uses it, or if it holds a different run."""
         name = noisy.run_name(args.env_id, args.exp_name, args.noise, args.noise_rate, args.seed)
         self.args, self.folder, self.start = args, Path(args.runs_dir, name), time.time()
-        self.noise, self.returns, self.last_test = noisy.noise_wrappers(env), [], ""
-        self.eval_csv = "step,episode,episodic_return,episodic_length\n"
+        self.noise, self.returns = noisy.noise_wrappers(env), env.get_wrapper_attr("return_queue")
         with fail_on(OSError, "--runs-dir"):
             self.folder.mkdir(parents=True, exist_ok=True)
             self.lock = open(self.folder / ".lock", "w")  # noqa: SIM115
         with fail_on(BlockingIOError, f"{self.folder} is in use by another process"):
             fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
-        self._remove("[!.]*" if args.overwrite else "*.tmp")
-        if any(self.folder.glob("*.json")) or (self.folder / "checkpoint.pt").exists():
-            config = self._old_config()
+        for path in filter(Path.is_file, self.folder.glob("[!.]*" if args.overwrite else "*.tmp")):
+            path.unlink()
+        self.checkpoint, result = self.folder / "checkpoint.pt", self.folder / "result.json"
+        if any(self.folder.glob("*.json")) or self.checkpoint.exists():
+            self.config = self._old_config()
         else:
             describe = 'git describe --always --dirty --abbrev=40 --exclude="*"'
             here = Path(__file__).parent
             git = subprocess.run(describe, shell=True, cwd=here, capture_output=True, text=True)
             versions = {module.__name__: module.__version__ for module in (torch, gym, mujoco, np)}
-            config = {
+            self.config = {
                 "algorithm": algorithm,
                 "args": asdict(args),
                 "matmul_precision": precision,
                 "versions": {**versions, "python": sys.version.split()[0]},
                 "git_commit": git.stdout.strip() or None,
             }
-            self._write("config.json", json.dumps(config, indent=2) + "\n")
-        result = self.folder / "result.json"
+        used = self.config["matmul_precision"]
         self.is_finished = result.exists()
         if self.is_finished:
-            with fail_on(Exception, f"cannot read {result}", "; --overwrite starts afresh"):
+            with fail_on(Exception, f"cannot read {result} (--overwrite starts afresh)"):
                 mean = json.loads(result.read_text())["final_return_mean"]
                 print(f"{self.folder} is finished: mean test return {mean:.1f}")
-            self._remove("checkpoint.pt")
-        elif precision not in config["matmul_precision"].split(", "):
-            used = config["matmul_precision"]
+            self.checkpoint.unlink(missing_ok=True)
+        elif precision not in used.split(", "):
             print(f"this processor multiplies in {precision} precision; the run used {used} so far")
-            config["matmul_precision"] = f"{used}, {precision}"
-            self._write("config.json", json.dumps(config, indent=2) + "\n")
+            self.config["matmul_precision"] = f"{used}, {precision}"
 
     def _old_config(self):
         path, new = self.folder / "config.json", asdict(self.args)
         for name in ("runs_dir", "overwrite", "torch_threads", "compile", "checkpoint_frequency"):
             del new[name]  # may differ
-        with fail_on(Exception, f"cannot read {path}", "; --overwrite starts afresh"):
+        with fail_on(Exception, f"cannot read {path} (--overwrite starts afresh)"):
             config = json.loads(path.read_text())
             old = {name: config["args"].get(name) for name in new}
         differ = [f"{name} {old[name]}, not {new[name]}" for name in new if old[name] != new[name]]
@@ -558,39 +532,46 @@ class Run:
             fail(f"{self.folder} holds a run with {'; '.join(differ)}: {advice}")
         return config
 
-    def resume(self, state, generators):
-        """Restore the last checkpoint of objects and random generators; return its step, or 0."""
-        self.state, self.generators = [*state, *self.noise.values()], generators
-        path, step = self.folder / "checkpoint.pt", 0
-        if path.exists():
-            with fail_on(Exception, f"cannot resume from {path}", "; --overwrite starts afresh"):
-                step = self._load(path)
+    def resume(self, state):
+        """Restore the last checkpoint of the objects in a list; return its step, or 0."""
+        self.state, step = state, 0
+        self.eval_csv = "step,episode,episodic_return,episodic_length\n"
+        if self.checkpoint.exists():
+            with fail_on(Exception, f"cannot read {self.checkpoint} (--overwrite starts afresh)"):
+                step = self._load()
             print(f"resumed at step {step}")
         else:
-            self._remove("events.*")
+            for path in self.folder.glob("events.*"):  # of a start that left no checkpoint
+                path.unlink()
+        self._write("config.json", json.dumps(self.config, indent=2) + "\n")
         self._write("eval.csv", self.eval_csv)
-        with self._writing("events.*"):  # what was logged after the checkpoint is purged
-            self.writer = SummaryWriter(str(self.folder), purge_step=step + 1)
+        # what an interrupted run logged after this step is purged
+        self.writer = SummaryWriter(str(self.folder), purge_step=step + 1)
         if step == 0:
-            self._log_hyperparameters()
-        Run.saved_step, self.printed = step, time.time()
+            table = "".join(f"|{name}|{value}|\n" for name, value in asdict(self.args).items())
+            self.writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + table)
+            # for the table HPARAMS: what tells the runs of a folder apart
+            columns = {name: getattr(self.args, name) for name in ("env_id", "exp_name", "seed")}
+            columns["noise"] = " + ".join(self.args.noise)
+            columns["noise_rate"] = max([0.0, *(w.noise_rate for w in self.noise.values())])
+            for summary in hparams(columns, {"eval/episodic_return_mean": 0}):
+                self.writer.file_writer.add_summary(summary)
+        Run.saved_step, self.printed, self.last_test = step, time.time(), ""
         total = self.args.total_timesteps
         self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None)  # on terminals
         return step
 
-    def _load(self, path):
-        if zipfile.ZipFile(path).testzip():  # torch.load checks no checksums
+    def _load(self):
+        if zipfile.ZipFile(self.checkpoint).testzip():  # torch.load checks no checksums
             raise ValueError("it is damaged")
-        checkpoint = torch.load(path, weights_only=True)
-        if (checkpoint["format"], checkpoint["run"]) != (2, self.folder.name):
+        checkpoint = torch.load(self.checkpoint, weights_only=True)
+        if (checkpoint["format"], checkpoint["run"]) != (3, self.folder.name):
             raise ValueError(f"it has format {checkpoint['format']} of {checkpoint['run']}")
         for part, state in zip(self.state, checkpoint["state"], strict=True):
             part.load_state_dict(state)
-        for generator, state in zip(self.generators, checkpoint["generators"], strict=True):
-            generator.bit_generator.state = state
         torch.set_rng_state(checkpoint["torch"])
-        self.returns, seconds, self.eval_csv = checkpoint["log"]
-        self.start = time.time() - seconds
+        self.eval_csv = checkpoint["eval_csv"]
+        self.start = time.time() - checkpoint["seconds"]
         return checkpoint["step"]
 
     def save(self, step):
@@ -598,32 +579,27 @@ class Run:
         with self._writing("events.*"):
             self.writer.flush()  # to be no older than the checkpoint
         checkpoint = {
-            "format": 2,
+            "format": 3,
             "run": self.folder.name,
             "step": step,
             "state": [part.state_dict() for part in self.state],
-            "generators": [generator.bit_generator.state for generator in self.generators],
             "torch": torch.get_rng_state(),
-            "log": [self.returns, time.time() - self.start, self.eval_csv],
+            "eval_csv": self.eval_csv,
+            "seconds": time.time() - self.start,
         }
         self._write("checkpoint.pt", checkpoint)
         Run.saved_step = step
 
-    def _log_hyperparameters(self):
-        table = "".join(f"|{name}|{value}|\n" for name, value in asdict(self.args).items())
-        self.writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + table)
-        # for the table HPARAMS: what tells the runs of a folder apart
-        columns = {name: getattr(self.args, name) for name in ("env_id", "exp_name", "seed")}
-        columns["noise"] = " + ".join(self.args.noise)
-        columns["noise_rate"] = max([0.0, *(w.noise_rate for w in self.noise.values())])
-        for summary in hparams(columns, {"eval/episodic_return_mean": 0}):
-            self.writer.file_writer.add_summary(summary)
-
-    def log(self, step, values):
-        """Log {tag: value} and the speed to TensorBoard; show the progress every ten seconds."""
+    def log(self, step, **groups):
+        """Log numbers as group/name to TensorBoard, and the speed; show the progress."""
         total, sps = self.args.total_timesteps, step / (time.time() - self.start)
+        tags = {"charts/SPS": sps}
+        for group, values in groups.items():
+            tags |= {f"{group}/{name}": float(value) for name, value in values.items()}
+        if not all(map(math.isfinite, tags.values())):
+            raise FloatingPointError(f"step {step}: training diverged, not all is finite: {tags}")
         with self._writing("events.*"):
-            for tag, value in {**values, "charts/SPS": sps}.items():
+            for tag, value in tags.items():
                 self.writer.add_scalar(tag, value, step)
         self.bar.update(step - self.bar.n)
         if self.bar.disable and time.time() - self.printed > 10:
@@ -631,26 +607,12 @@ class Run:
             print(f"step={step}/{total} sps={sps:.0f} {self.last_test}eta={eta}")
             self.printed = time.time()
 
-    def log_losses(self, step, curves):
-        """Log what updates return, and the noise; fail if a loss is not finite."""
-        values = {f"losses/{name}": value.item() for name, value in curves.items()}
-        if not all(map(math.isfinite, values.values())):
-            fail(f"step {step}: training diverged, not every loss is finite: {values}", code=1)
-        for name, wrapper in self.noise.items():
-            values[f"noise/{name}/rate"] = wrapper.noise_rate
-            values[f"noise/{name}/applied_fraction"] = wrapper.applied_fraction
-        self.log(step, values)
-
     def log_episode(self, step, episode):
         """Log a training episode as RecordEpisodeStatistics saw it, before reward noise."""
-        self.returns = [*self.returns[-99:], float(episode["r"])]
-        charts = {"charts/episodic_return": episode["r"], "charts/episodic_length": episode["l"]}
-        self.log(step, charts)
+        self.log(step, charts={"episodic_return": episode["r"], "episodic_length": episode["l"]})
 
     def log_test(self, step, results, now=None):
         """Log the (N, 2) returns and lengths of a test; now: the step, if it is a later one."""
-        if not np.isfinite(results).all():
-            fail(f"step {step}: a test return is not finite", code=1)
         for i, (episodic_return, length) in enumerate(results.tolist()):
             self.eval_csv += f"{step},{i},{episodic_return},{length:.0f}\n"
         self._write("eval.csv", self.eval_csv)
@@ -658,7 +620,7 @@ class Run:
         self.last_test, self.printed = f"eval_return={self.mean:.1f} ", 0  # 0: print it now
         self.bar.set_description_str(self.last_test)
         values = {"return_mean": self.mean, "return_std": self.std, "length_mean": length}
-        self.log(now or step, {f"eval/episodic_{name}": value for name, value in values.items()})
+        self.log(now or step, eval={f"episodic_{name}": value for name, value in values.items()})
 
     def finish(self, step, policy):
         """Write policy.pt and, last of all, result.json; the checkpoint has served."""
@@ -678,11 +640,7 @@ class Run:
         }
         self._write("policy.pt", policy)
         self._write("result.json", json.dumps(result, indent=2) + "\n")
-        self._remove("checkpoint.pt")
-
-    def _remove(self, pattern):
-        for path in filter(Path.is_file, self.folder.glob(pattern)):
-            path.unlink()
+        self.checkpoint.unlink(missing_ok=True)
 
     def _writing(self, name):
         return fail_on((OSError, RuntimeError), f"cannot write {self.folder / name}", code=1)
@@ -719,5 +677,6 @@ if __name__ == "__main__":
     signal.signal(signal.SIGINT, stop_run)
     sys.stdout.reconfigure(line_buffering=True)
     sys.path.append(os.getcwd())  # for the module of --env-id module:Name-v0
-    finished = train(read_args(sys.argv[1:]), stop=lambda: bool(signals))
+    with fail_on(FloatingPointError, "training stopped", code=1):
+        finished = train(read_args(), stop=lambda: bool(signals))
     raise SystemExit(0 if finished else 128 + signals[0])
