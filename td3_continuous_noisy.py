@@ -254,7 +254,7 @@ def train(args, stop=lambda: False):
     """Train one agent; return False if stop(), asked whenever an episode ends, ended it early."""
     args, env, test_env = check(args)
     if not np.isfinite([env.action_space.low, env.action_space.high]).all():
-        fail(f"TD3 needs bounded actions; {args.env_id} has {env.action_space}")
+        fail(f"TD3 needs bounded actions; some of {args.env_id} have no bounds")
     torch.set_num_threads(args.torch_threads)
     device = torch.device("cuda" if args.cuda else "cpu")
     run = Run(args, "TD3", use_matmul_precision(args.matmul_precision, device), env)
@@ -546,8 +546,7 @@ class Run:
 
     def save(self, step):
         """Write a checkpoint: all that resuming needs, between two episodes."""
-        with self._writing("events.*"):
-            self.writer.flush()  # to be no older than the checkpoint
+        self.writer.flush()  # to be no older than the checkpoint
         checkpoint = {
             "format": 3,
             "run": self.folder.name,
@@ -561,7 +560,7 @@ class Run:
         Run.saved_step = step
 
     def log(self, step, **groups):
-        """Log numbers as group/name to TensorBoard, and the speed; show the progress."""
+        """Log finite numbers as group/name to TensorBoard, and the speed; show the progress."""
         total, sps = self.args.total_timesteps, step / (time.time() - self.start)
         tags = {"charts/SPS": sps}
         for group, values in groups.items():
@@ -595,8 +594,7 @@ class Run:
     def finish(self, step, policy):
         """Write policy.pt and, last of all, result.json; the checkpoint has served."""
         seconds = time.time() - self.start
-        with self._writing("events.*"):
-            self.writer.close()
+        self.writer.close()
         result = {
             "final_return_mean": self.mean,
             "final_return_std": self.std,
@@ -647,6 +645,6 @@ if __name__ == "__main__":
     signal.signal(signal.SIGINT, stop_run)
     sys.stdout.reconfigure(line_buffering=True)
     sys.path.append(os.getcwd())  # for the module of --env-id module:Name-v0
-    with fail_on(FloatingPointError, "training stopped", code=1):
+    with fail_on((FloatingPointError, OSError), "training stopped", code=1):
         finished = train(read_args(), stop=lambda: bool(signals))
     raise SystemExit(0 if finished else 128 + signals[0])
