@@ -665,7 +665,7 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def step(self, action: Any) -> Step:
         """Step the environment and check the observation and the reward."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        number = float(np.asarray(reward).item())
+        number = float(reward.item() if isinstance(reward, np.ndarray) else reward)
         self._steps += 1
         if not math.isfinite(number):
             raise FloatingPointError(
