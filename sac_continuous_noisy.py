@@ -496,7 +496,7 @@ class Run:
                 "versions": {**versions, "python": sys.version.split()[0]},
                 "git_commit": git.stdout.strip() or None,
             }
-        used = self.config["matmul_precision"]
+        used = self.config.get("matmul_precision", precision)
         self.is_finished = result.exists()
         if self.is_finished:
             with fail_on(Exception, f"cannot read {result} (--overwrite starts afresh)"):

@@ -851,6 +851,10 @@ def test_another_precision_is_said_and_recorded(algorithm, tmp_path, monkeypatch
     assert "multiplies" not in capsys.readouterr().out
     config = json.loads((folder(tmp_path) / "config.json").read_text())
     assert config["matmul_precision"] == "medium, highest"
+    del config["matmul_precision"]
+    (folder(tmp_path) / "config.json").write_text(json.dumps(config))
+    train(algorithm, words)
+    assert "is finished" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
