@@ -637,16 +637,18 @@ class RecordEpisodeStatistics(gym.wrappers.RecordEpisodeStatistics[Any, Any]):
 
 
 class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Makes rewards floats, and raises FloatingPointError where the environment returns NaN.
+    """Stops at NaN and infinity, makes rewards floats and observations arrays of their own.
 
-    Infinity is an error, too. A learner that is given such a number is lost from there on, and says
-    so much later or never. The reward may be an array of one number.
+    A learner that is given NaN is lost from there on, and says so much later or never; so it raises
+    FloatingPointError, which says whether the action was NaN already, as after a divergence. The
+    reward may be an array of one number. An observation is copied: an environment may write the
+    next one into the same array.
 
     >>> env = FiniteNumbers(gym.make("Pendulum-v1", disable_env_checker=True))
     >>> _ = env.reset(seed=0)
     >>> env.step(np.array([np.nan]))
     Traceback (most recent call last):
-    FloatingPointError: step 1 of an episode: the environment returned the reward nan
+    FloatingPointError: step 1 of an episode: the environment was given the action [nan]
     """
 
     def __init__(self, env: Env):
@@ -659,26 +661,26 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """Reset the environment and check the first observation."""
         self._steps = 0
         observation, info = self.env.reset(seed=seed, options=options)
-        self._check_observation(observation)
-        return observation, info
+        self._check("returned the observation", observation)
+        return np.array(observation), info
 
     def step(self, action: Any) -> Step:
         """Step the environment and check the observation and the reward."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         number = float(reward.item() if isinstance(reward, np.ndarray) else reward)
         self._steps += 1
-        if not math.isfinite(number):
-            raise FloatingPointError(
-                f"step {self._steps} of an episode: the environment returned the reward {number}"
-            )
-        self._check_observation(observation)
-        return observation, number, terminated, truncated, info
+        if not (math.isfinite(number) and np.isfinite(observation).all()):
+            if isinstance(action, np.ndarray):
+                self._check("was given the action", action)
+            self._check("returned the reward", number)
+            self._check("returned the observation", observation)
+        return np.array(observation), number, terminated, truncated, info
 
-    def _check_observation(self, observation: NDArray[Any]) -> None:
-        if not np.isfinite(observation).all():
+    def _check(self, what: str, value: Any) -> None:
+        if not np.isfinite(value).all():
+            numbers = np.asarray(value).tolist()
             raise FloatingPointError(
-                f"step {self._steps} of an episode: the environment returned the observation "
-                f"{np.asarray(observation).tolist()}"
+                f"step {self._steps} of an episode: the environment {what} {numbers}"
             )
 
 
@@ -855,7 +857,7 @@ def make_flat(env: Env) -> Env:
 
     Observations that are no vector (dictionaries, tuples, arrays, categories) are flattened to one
     by ``gymnasium.wrappers.FlattenObservation``; :class:`FiniteNumbers` makes rewards floats and
-    stops at NaN. Noise belongs around the result: ``make_noisy(make_flat(env), ...)``.
+    stops at NaN and infinity. Noise belongs around the result: ``make_noisy(make_flat(env), ...)``.
 
     >>> make_flat(gym.make("Pendulum-v1").unwrapped)
     <FiniteNumbers<PendulumEnv<Pendulum-v1>>>
@@ -938,8 +940,9 @@ class EnvState:
 
     That is the random generators of the environment and of its action space, the random streams and
     the counters of its noise wrappers, and the returns that RecordEpisodeStatistics remembers.
-    ``generators`` are further ones to keep beside them. An environment of one's own that carries
-    more than its generator ``np_random`` does not go on exactly.
+    ``generators`` are further ones to keep beside them. How far training is, :func:`set_progress`
+    has to say again. An environment of one's own that carries more than its generator
+    ``np_random`` does not go on exactly.
 
     >>> env = make_noisy(gym.make("Pendulum-v1"), ["RandomNormalNoisyObservation(1)"], [0.5])
     >>> _ = env.reset(seed=1)
@@ -955,7 +958,7 @@ class EnvState:
         self.env = env
         self.generators = generators
 
-    def _generators(self) -> list[np.random.Generator]:
+    def _generators(self) -> list[Any]:
         environment, actions = self.env.unwrapped.np_random, self.env.action_space.np_random
         return [environment, actions, *self.generators]
 
@@ -964,11 +967,11 @@ class EnvState:
         return self.env.get_wrapper_attr("return_queue") if recorded else deque()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state, to be taken between two episodes."""
+        """Return the state in Python's own types, to be taken between two episodes."""
         return {
-            "generators": [generator.bit_generator.state for generator in self._generators()],
+            "generators": [_stream(generator) for generator in self._generators()],
             "noise": [wrapper.state_dict() for wrapper in noise_wrappers(self.env).values()],
-            "returns": list(self._returns()),
+            "returns": [float(value) for value in self._returns()],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -978,12 +981,29 @@ class EnvState:
             ValueError: a state of another number of generators or noise wrappers.
         """
         for generator, stream in zip(self._generators(), state["generators"], strict=True):
-            generator.bit_generator.state = stream
+            if isinstance(generator, np.random.RandomState):
+                generator.set_state(stream)
+            else:
+                generator.bit_generator.state = stream
         wrappers = noise_wrappers(self.env).values()
         for wrapper, part in zip(wrappers, state["noise"], strict=True):
             wrapper.load_state_dict(part)
         self._returns().clear()
         self._returns().extend(state["returns"])
+
+
+def _stream(generator: Any) -> Any:
+    """Return the state of a random generator; dm_control's environments have a RandomState."""
+    if isinstance(generator, np.random.RandomState):
+        return _without_arrays(generator.get_state(legacy=False))
+    return _without_arrays(generator.bit_generator.state)
+
+
+def _without_arrays(value: Any) -> Any:
+    """Turn the arrays in nested dicts into lists, which any reader of a checkpoint accepts."""
+    if isinstance(value, dict):
+        return {name: _without_arrays(part) for name, part in value.items()}
+    return value.tolist() if isinstance(value, np.ndarray) else value
 
 
 def noise_slug(noises: Sequence[str], rates: Sequence[float | str]) -> str:

@@ -265,7 +265,7 @@ def train(args, stop=lambda: False):
         return True
     args.compile = args.compile and can_compile(device)
 
-    # SETUP: the updates take gradients of explicit parameters, autograd need not follow the rest
+    # SETUP: torch.func differentiates the losses, so autograd need not follow the networks
     torch.manual_seed(args.seed)
     rng = np.random.default_rng(args.seed)
     observation, _ = env.reset(seed=args.seed)
@@ -277,7 +277,7 @@ def train(args, stop=lambda: False):
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     update = updater(ppo_loss, agent, optimizer, args)
 
-    # RESUME: between two episodes an environment carries over no more than its generator
+    # RESUME: between two episodes an environment is no more than its EnvState
     state = [agent, optimizer, rollout, observation_stats, return_stats]
     start = run.resume([*state, noisy.EnvState(env, rng)])
     if start > 0:
@@ -291,7 +291,7 @@ def train(args, stop=lambda: False):
         if step == 0:
             rollout.noise[:] = torch.randn(rollout.noise.shape)
 
-        # ACT: only that; log-probabilities and values are computed for whole rollouts
+        # ACT: log-probabilities and values are computed later, for whole rollouts
         rollout.observations[step] = observation_stats.normalize(observation)
         rollout.actions[step] = act(rollout.observations[step]) + std * rollout.noise[step]
 
@@ -479,7 +479,7 @@ def can_compile(device):
 class Run:
     """The run's folder: what is written into it, and read again to resume."""
 
-    saved_step = 0  # of the newest checkpoint
+    saved_step = 0  # of the newest checkpoint; of the class, for the signal handler
 
     def __init__(self, args, algorithm, precision, env):
         """Open the folder; fail if another process uses it, or if it holds a different run."""
@@ -491,7 +491,8 @@ class Run:
             self.lock = open(self.folder / ".lock", "w")  # noqa: SIM115
         with fail_on(BlockingIOError, f"{self.folder} is in use by another process"):
             fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
-        for path in filter(Path.is_file, self.folder.glob("[!.]*" if args.overwrite else "*.tmp")):
+        old = self.folder.glob("[!.]*" if args.overwrite else "*.tmp")
+        for path in sorted(filter(Path.is_file, old), reverse=True):  # result.json before policy.pt
             path.unlink()
         self.checkpoint, result = self.folder / "checkpoint.pt", self.folder / "result.json"
         if any(self.folder.glob("*.json")) or self.checkpoint.exists():
@@ -511,7 +512,7 @@ class Run:
         used = self.config.get("matmul_precision", precision)
         self.is_finished = result.exists()
         if self.is_finished:
-            with fail_on(Exception, f"cannot read {result} (--overwrite starts afresh)"):
+            with self._reading(result):
                 mean = json.loads(result.read_text())["final_return_mean"]
                 print(f"{self.folder} is finished: mean test return {mean:.1f}")
             self.checkpoint.unlink(missing_ok=True)
@@ -523,7 +524,7 @@ class Run:
         path, new = self.folder / "config.json", asdict(self.args)
         for name in ("runs_dir", "overwrite", "torch_threads", "compile", "checkpoint_frequency"):
             del new[name]  # may differ
-        with fail_on(Exception, f"cannot read {path} (--overwrite starts afresh)"):
+        with self._reading(path):
             config = json.loads(path.read_text())
             old = {name: config["args"].get(name) for name in new}
         differ = [f"{name} {old[name]}, not {new[name]}" for name in new if old[name] != new[name]]
@@ -537,7 +538,7 @@ class Run:
         self.state, step = state, 0
         self.eval_csv = "step,episode,episodic_return,episodic_length\n"
         if self.checkpoint.exists():
-            with fail_on(Exception, f"cannot read {self.checkpoint} (--overwrite starts afresh)"):
+            with self._reading(self.checkpoint):
                 step = self._load()
             print(f"resumed at step {step}")
         else:
@@ -545,8 +546,8 @@ class Run:
                 path.unlink()
         self._write("config.json", json.dumps(self.config, indent=2) + "\n")
         self._write("eval.csv", self.eval_csv)
-        # what an interrupted run logged after this step is purged
-        self.writer = SummaryWriter(str(self.folder), purge_step=step + 1)
+        with self._writing("events.*"):  # what was logged after this step is purged
+            self.writer = SummaryWriter(str(self.folder), purge_step=step + 1)
         if step == 0:
             table = "".join(f"|{name}|{value}|\n" for name, value in asdict(self.args).items())
             self.writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + table)
@@ -576,7 +577,8 @@ class Run:
 
     def save(self, step):
         """Write a checkpoint: all that resuming needs, between two episodes."""
-        self.writer.flush()  # to be no older than the checkpoint
+        with self._writing("events.*"):
+            self.writer.flush()  # to be no older than the checkpoint
         checkpoint = {
             "format": 3,
             "run": self.folder.name,
@@ -611,7 +613,7 @@ class Run:
         self.log(step, charts={"episodic_return": episode["r"], "episodic_length": episode["l"]})
 
     def log_test(self, step, results, now=None):
-        """Log the (N, 2) returns and lengths of a test; now: the step, if it is a later one."""
+        """Log the (N, 2) returns and lengths of a test that fell due at a step, at most `now`."""
         for i, (episodic_return, length) in enumerate(results.tolist()):
             self.eval_csv += f"{step},{i},{episodic_return},{length:.0f}\n"
         self._write("eval.csv", self.eval_csv)
@@ -624,7 +626,8 @@ class Run:
     def finish(self, step, policy):
         """Write policy.pt and, last of all, result.json; the checkpoint has served."""
         seconds = time.time() - self.start
-        self.writer.close()
+        with self._writing("events.*"):
+            self.writer.close()
         result = {
             "final_return_mean": self.mean,
             "final_return_std": self.std,
@@ -639,6 +642,9 @@ class Run:
         self._write("policy.pt", policy)
         self._write("result.json", json.dumps(result, indent=2) + "\n")
         self.checkpoint.unlink(missing_ok=True)
+
+    def _reading(self, path):
+        return fail_on(Exception, f"cannot read {path} (if damaged, --overwrite starts afresh)")
 
     def _writing(self, name):
         return fail_on((OSError, RuntimeError), f"cannot write {self.folder / name}", code=1)
@@ -675,6 +681,6 @@ if __name__ == "__main__":
     signal.signal(signal.SIGINT, stop_run)
     sys.stdout.reconfigure(line_buffering=True)
     sys.path.append(os.getcwd())  # for the module of --env-id module:Name-v0
-    with fail_on((FloatingPointError, OSError), "training stopped", code=1):
+    with fail_on(FloatingPointError, "training stopped", code=1):
         finished = train(read_args(), stop=lambda: bool(signals))
     raise SystemExit(0 if finished else 128 + signals[0])

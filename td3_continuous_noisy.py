@@ -71,7 +71,7 @@ class Args:
     learning_starts: int = 25_000  # environment steps with random actions, before learning starts
     learning_rate: float = 3e-4  # learning rate of the policy and of the Q-functions
     policy_frequency: int = 2  # environment steps between two updates of the policy and the targets
-    # the noise below is in half ranges of the action space
+    # noise of 1.0 below is half the range of the actions
     exploration_noise: float = 0.1  # standard deviation of the noise on the training actions
     policy_noise: float = 0.2  # standard deviation of the noise on the target's actions
     noise_clip: float = 0.5  # largest noise on the target's actions
@@ -262,7 +262,7 @@ def train(args, stop=lambda: False):
         return True
     args.compile = args.compile and can_compile(device)
 
-    # SETUP: the updates take gradients of explicit parameters, autograd need not follow the rest
+    # SETUP: torch.func differentiates the losses, so autograd need not follow the networks
     torch.manual_seed(args.seed)
     rng = np.random.default_rng(args.seed)
     env.action_space.seed(args.seed)
@@ -280,7 +280,7 @@ def train(args, stop=lambda: False):
     online_parameters = [*actor.parameters(), *critic.parameters()]
     target_parameters = [*target_actor.parameters(), *target_critic.parameters()]
 
-    # RESUME: between two episodes an environment carries over no more than its generator
+    # RESUME: between two episodes an environment is no more than its EnvState
     state = [actor, critic, target_actor, target_critic, q_optimizer, actor_optimizer]
     start = run.resume([*state, buffer, noisy.EnvState(env, rng)])
     if start > 0:
@@ -298,7 +298,7 @@ def train(args, stop=lambda: False):
         # STEP
         next_observation, reward, terminated, truncated, info = env.step(action)
 
-        # STORE: terminated apart from truncated, since a time limit ends no values
+        # STORE: terminated alone ends the values, a time limit does not
         buffer.add(observation, action, reward, next_observation, terminated, truncated)
         observation = next_observation
 
@@ -449,7 +449,7 @@ def can_compile(device):
 class Run:
     """The run's folder: what is written into it, and read again to resume."""
 
-    saved_step = 0  # of the newest checkpoint
+    saved_step = 0  # of the newest checkpoint; of the class, for the signal handler
 
     def __init__(self, args, algorithm, precision, env):
         """Open the folder; fail if another process uses it, or if it holds a different run."""
@@ -461,7 +461,8 @@ class Run:
             self.lock = open(self.folder / ".lock", "w")  # noqa: SIM115
         with fail_on(BlockingIOError, f"{self.folder} is in use by another process"):
             fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
-        for path in filter(Path.is_file, self.folder.glob("[!.]*" if args.overwrite else "*.tmp")):
+        old = self.folder.glob("[!.]*" if args.overwrite else "*.tmp")
+        for path in sorted(filter(Path.is_file, old), reverse=True):  # result.json before policy.pt
             path.unlink()
         self.checkpoint, result = self.folder / "checkpoint.pt", self.folder / "result.json"
         if any(self.folder.glob("*.json")) or self.checkpoint.exists():
@@ -481,7 +482,7 @@ class Run:
         used = self.config.get("matmul_precision", precision)
         self.is_finished = result.exists()
         if self.is_finished:
-            with fail_on(Exception, f"cannot read {result} (--overwrite starts afresh)"):
+            with self._reading(result):
                 mean = json.loads(result.read_text())["final_return_mean"]
                 print(f"{self.folder} is finished: mean test return {mean:.1f}")
             self.checkpoint.unlink(missing_ok=True)
@@ -493,7 +494,7 @@ class Run:
         path, new = self.folder / "config.json", asdict(self.args)
         for name in ("runs_dir", "overwrite", "torch_threads", "compile", "checkpoint_frequency"):
             del new[name]  # may differ
-        with fail_on(Exception, f"cannot read {path} (--overwrite starts afresh)"):
+        with self._reading(path):
             config = json.loads(path.read_text())
             old = {name: config["args"].get(name) for name in new}
         differ = [f"{name} {old[name]}, not {new[name]}" for name in new if old[name] != new[name]]
@@ -507,7 +508,7 @@ class Run:
         self.state, step = state, 0
         self.eval_csv = "step,episode,episodic_return,episodic_length\n"
         if self.checkpoint.exists():
-            with fail_on(Exception, f"cannot read {self.checkpoint} (--overwrite starts afresh)"):
+            with self._reading(self.checkpoint):
                 step = self._load()
             print(f"resumed at step {step}")
         else:
@@ -515,8 +516,8 @@ class Run:
                 path.unlink()
         self._write("config.json", json.dumps(self.config, indent=2) + "\n")
         self._write("eval.csv", self.eval_csv)
-        # what an interrupted run logged after this step is purged
-        self.writer = SummaryWriter(str(self.folder), purge_step=step + 1)
+        with self._writing("events.*"):  # what was logged after this step is purged
+            self.writer = SummaryWriter(str(self.folder), purge_step=step + 1)
         if step == 0:
             table = "".join(f"|{name}|{value}|\n" for name, value in asdict(self.args).items())
             self.writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + table)
@@ -546,7 +547,8 @@ class Run:
 
     def save(self, step):
         """Write a checkpoint: all that resuming needs, between two episodes."""
-        self.writer.flush()  # to be no older than the checkpoint
+        with self._writing("events.*"):
+            self.writer.flush()  # to be no older than the checkpoint
         checkpoint = {
             "format": 3,
             "run": self.folder.name,
@@ -581,7 +583,7 @@ class Run:
         self.log(step, charts={"episodic_return": episode["r"], "episodic_length": episode["l"]})
 
     def log_test(self, step, results, now=None):
-        """Log the (N, 2) returns and lengths of a test; now: the step, if it is a later one."""
+        """Log the (N, 2) returns and lengths of a test that fell due at a step, at most `now`."""
         for i, (episodic_return, length) in enumerate(results.tolist()):
             self.eval_csv += f"{step},{i},{episodic_return},{length:.0f}\n"
         self._write("eval.csv", self.eval_csv)
@@ -594,7 +596,8 @@ class Run:
     def finish(self, step, policy):
         """Write policy.pt and, last of all, result.json; the checkpoint has served."""
         seconds = time.time() - self.start
-        self.writer.close()
+        with self._writing("events.*"):
+            self.writer.close()
         result = {
             "final_return_mean": self.mean,
             "final_return_std": self.std,
@@ -609,6 +612,9 @@ class Run:
         self._write("policy.pt", policy)
         self._write("result.json", json.dumps(result, indent=2) + "\n")
         self.checkpoint.unlink(missing_ok=True)
+
+    def _reading(self, path):
+        return fail_on(Exception, f"cannot read {path} (if damaged, --overwrite starts afresh)")
 
     def _writing(self, name):
         return fail_on((OSError, RuntimeError), f"cannot write {self.folder / name}", code=1)
@@ -645,6 +651,6 @@ if __name__ == "__main__":
     signal.signal(signal.SIGINT, stop_run)
     sys.stdout.reconfigure(line_buffering=True)
     sys.path.append(os.getcwd())  # for the module of --env-id module:Name-v0
-    with fail_on((FloatingPointError, OSError), "training stopped", code=1):
+    with fail_on(FloatingPointError, "training stopped", code=1):
         finished = train(read_args(), stop=lambda: bool(signals))
     raise SystemExit(0 if finished else 128 + signals[0])

@@ -2,6 +2,7 @@
 
 import copy
 import doctest
+import json
 import math
 import pickle
 import re
@@ -1817,7 +1818,8 @@ def test_rewards_are_floats(reward):
     env.env.reward = reward
     observation, number, terminated, truncated, info = env.step(None)
     assert (number, type(number)) == (2, float)
-    assert observation is env.env.observation
+    np.testing.assert_array_equal(observation, env.env.observation)
+    assert observation.dtype == np.float32
     assert (terminated, truncated, info) == (True, False, {"some": "info"})
 
 
@@ -1836,6 +1838,22 @@ def test_finite_numbers_stop_at_what_is_not_finite(bad):
         env.step(None)
     with pytest.raises(FloatingPointError, match="step 0 of an episode"):
         env.reset()
+
+
+def test_finite_numbers_tell_a_divergence_from_a_broken_environment():
+    env = FiniteNumbers(Given(BOX))
+    env.env.reward = np.nan
+    with pytest.raises(FloatingPointError, match=r"was given the action \[0.0, nan\]"):
+        env.step(np.array([0, np.nan]))
+    with pytest.raises(FloatingPointError, match="returned the reward nan"):
+        env.step(np.zeros(2))
+
+
+def test_observations_are_arrays_of_their_own():
+    """Some environments write every observation into the same array."""
+    env = FiniteNumbers(numbered_env(reuse=True))
+    seen = [env.reset()[0], *(env.step(0)[0] for _ in range(3))]
+    assert [observation.flat[0] for observation in seen] == [1, 2, 3, 4]
 
 
 def test_finite_numbers_are_part_of_the_spec():
@@ -1878,6 +1896,24 @@ def test_an_env_state_continues_what_was_interrupted():
     play_on(other, other_rng, 2)
     EnvState(other, other_rng).load_state_dict(saved)
     assert play_on(other, other_rng, 5) == expected
+
+
+def mersenne(seed):
+    return np.random.Generator(np.random.MT19937(seed))
+
+
+@pytest.mark.parametrize("make_generator", [np.random.default_rng, np.random.RandomState, mersenne])
+def test_an_env_state_has_only_pythons_own_types(make_generator):
+    """dm_control's environments have a RandomState, whose state holds an array."""
+    env, rng = pendulum()
+    env.unwrapped.np_random = make_generator(3)
+    play_on(env, rng, 2)
+    env.unwrapped.np_random.normal(size=3)  # a RandomState keeps every second one
+    saved = json.loads(json.dumps(EnvState(env, rng).state_dict()))
+    expected = env.unwrapped.np_random.normal(size=5).tolist()
+    env.unwrapped.np_random = make_generator(4)
+    EnvState(env, rng).load_state_dict(saved)
+    assert env.unwrapped.np_random.normal(size=5).tolist() == expected
 
 
 def test_an_env_state_of_another_stack_is_refused():

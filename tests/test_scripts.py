@@ -284,7 +284,7 @@ def test_a_result_that_cannot_be_read_is_no_result(algorithm, content, tmp_path,
     with pytest.raises(SystemExit) as stopped:
         run(algorithm, tmp_path, **short)
     assert stopped.value.code == 2
-    assert_one_line(capsys.readouterr().err, f"cannot read {result} (--overwrite ")
+    assert_one_line(capsys.readouterr().err, f"cannot read {result} (if damaged, --overwrite ")
     assert result.read_text() == content
     run(algorithm, tmp_path, overwrite=True, **short)
     assert json.loads(result.read_text()).keys() == json.loads(whole).keys()
