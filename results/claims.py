@@ -692,8 +692,8 @@ def numbers():
     }
 
 
-def page():
-    """Return the text of README.md."""
+def render(template, values):
+    """Return the text of a Jinja template in this folder with these values."""
     loader = jinja2.FileSystemLoader(HERE)
     filters = {
         "p": lambda x: f"{x:.2g}",
@@ -705,7 +705,12 @@ def page():
     options = {"undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
     environment = jinja2.Environment(loader=loader, keep_trailing_newline=True, **options)
     environment.filters |= filters
-    return environment.get_template("README.md.jinja").render(numbers())
+    return environment.get_template(template).render(values)
+
+
+def page():
+    """Return the text of README.md."""
+    return render("README.md.jinja", numbers())
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from scipy import stats
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "results"))
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "results/reward_scale"))
 import claims
+import future_work
 import reward_scale
 
 from analyze_verdict import detectable_shift
@@ -21,6 +22,18 @@ RESULTS = claims.HERE
 
 def test_the_page_is_what_its_command_writes():
     assert (RESULTS / "README.md").read_text() == claims.page()
+    assert (RESULTS / "future_work.md").read_text() == future_work.page()
+
+
+def test_the_choice_on_the_page_is_that_of_the_runs():
+    """choice.csv follows from the run folders, and the winner from its last round."""
+    found = future_work.choice()
+    runs = claims.read_returns(RESULTS / "choice")
+    fresh = runs[runs["seed"] > 1000]
+    x, y = (fresh.loc[fresh["noise"] == noise, "test"] for noise in (found["winner"], ""))
+    assert len(x) == len(y) == 10
+    assert found["p"] == pytest.approx(stats.mannwhitneyu(x, y, method="exact").pvalue)
+    assert found["search"]["runs"] + found["confirmation"]["runs"] == len(runs) == 61
 
 
 # ----------------------------------------------------------------------------------- statistics
