@@ -1097,8 +1097,9 @@ def test_committed_results_are_those_of_the_committed_runs(tmp_path):
     results = Path(analyze.__file__).parent / "results"
     analyze.main(analyze.Args(results / "runs", tmp_path, results / "paper"))
     committed = {path.name for path in results.iterdir() if path.is_file()}
-    page = {"README.md", "README.md.jinja", "claims.py"}
-    assert committed - page == {path.name for path in tmp_path.iterdir()}
+    pages = {"README.md", "README.md.jinja", "claims.py"}
+    pages |= {"future_work.md", "future_work.md.jinja", "future_work.py"}
+    assert committed - pages == {path.name for path in tmp_path.iterdir()}
     for path in results.glob("*.csv"):
         tables = [pd.read_csv(folder / path.name) for folder in (results, tmp_path)]
         pd.testing.assert_frame_equal(*tables, rtol=1e-6)
