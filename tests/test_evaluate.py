@@ -244,17 +244,24 @@ def test_the_table_of_known_returns(capsys):
         cells[a_run(noise, rate)] = {
             ("", "0.0"): [(value, 1) for value in (*clean, 1000)],
             ("A(1) + B(2)", "0.1 + 0.1"): [(value, 1) for value in (*noisy, 1000)],
+            ("C(3)", "0.5"): [(-value, 1) for value in (*noisy, 1000)],
         }
-    conditions = [("", "0.0"), ("A(1) + B(2)", "0.1 + 0.1")]
+    conditions = [("", "0.0"), ("A(1) + B(2)", "0.1 + 0.1"), ("C(3)", "0.5")]
     evaluate.print_table(list(cells), conditions, cells, episodes=2)
     lines = [re.split(r" {2,}", line.strip()) for line in capsys.readouterr().out.splitlines()]
-    assert lines[0][-2:] == ["clean", "A(1) +"]
-    assert lines[1:3] == [["B(2)"], ["at 0.1 +"]]
     # sd of (20, 30, 50): sqrt((13.33^2 + 3.33^2 + 16.67^2) / 2); of (1.5, 3.5, -2.5) about 0.833
-    assert lines[5:] == [
+    assert lines[1] == ["Mean return, tested with A(1) + B(2)"]
+    assert lines[2][-2:] == ["clean", "at 0.1 + 0.1"]
+    assert lines[4:6] == [
         ["E", "x", "no noise", "0.00", "3", "33.3 ± 15.3", "0.8 ± 3.1"],
         ["E", "x", "A(1)", "0.50", "1", "5.0", "7.5"],
     ]
+    assert lines[7] == ["Mean return, tested with C(3)"]
+    assert lines[8][-2:] == ["clean", "at 0.5"]
+    assert lines[10][-2:] == ["33.3 ± 15.3", "-0.8 ± 3.1"]
+    evaluate.print_table(list(cells), conditions[:1], cells, episodes=2)
+    alone = capsys.readouterr().out
+    assert "tested with" not in alone and alone.splitlines()[0].endswith("clean")
 
 
 def test_all_of_a_folder_with_logs_and_an_analysis(runs, capsys):
@@ -266,7 +273,7 @@ def test_all_of_a_folder_with_logs_and_an_analysis(runs, capsys):
     result = run(*sorted(runs.iterdir()), *options)
     assert (result.returncode, result.stderr) == (0, "")
     table = [re.split(r" {2,}", line) for line in result.stdout.splitlines()]
-    assert [row[1:5] for row in table[3:]] == [
+    assert [row[1:5] for row in table[4:]] == [
         ["ppo_continuous_noisy", "no noise", "0.00", "2"],
         ["sac_continuous_noisy", "RandomNormalNoisyReward(0.1)", "0.50", "1"],
         ["td3_continuous_noisy", "no noise", "0.00", "1"],
@@ -278,7 +285,7 @@ def test_all_of_a_folder_with_logs_and_an_analysis(runs, capsys):
         means.append(
             np.mean([float(r["episodic_return"]) for r in rows if r["noise_rate"] == "0.5"])
         )
-    assert table[3][6] == f"{np.mean(means):.1f} ± {np.std(means, ddof=1):.1f}"
+    assert table[4][6] == f"{np.mean(means):.1f} ± {np.std(means, ddof=1):.1f}"
     before = files(runs)
     main(Args((runs,), (OBSERVATION,), (0.5, 1.0), episodes=3))  # the folder stands for its runs
     assert capsys.readouterr().out == result.stdout
