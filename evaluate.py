@@ -243,23 +243,28 @@ def write_stored(run, stored):
 
 def print_table(runs, conditions, stored, episodes):
     """Print mean and sample standard deviation over seeds: one table for each noise of the test."""
+    trained = {}
+    for run in runs:
+        trained.setdefault(run.trained_with, []).append(stored[run])
     noises = dict.fromkeys(noise for noise, _ in conditions if noise)
     for tested_with in noises or [""]:
         columns = [key for key in conditions if key[0] in ("", tested_with)]
-        rows = []
-        for trained_with in dict.fromkeys(run.trained_with for run in runs):
-            seeds = [stored[run] for run in runs if run.trained_with == trained_with]
-            row = [*trained_with, len(seeds)]
-            for key in columns:
-                means = [np.mean(seed[key][:episodes], axis=0)[0] for seed in seeds]
-                spread = f" ± {np.std(means, ddof=1):.1f}" if len(means) > 1 else ""
-                row.append(f"{np.mean(means):.1f}{spread}")
-            rows.append(row)
         headers = ["environment", "experiment", "trained with", "at rate", "seeds"]
         headers += [f"at {rate}" if noise else "clean" for noise, rate in columns]
+        rows = [
+            [*config, len(seeds), *(mean_return(seeds, key, episodes) for key in columns)]
+            for config, seeds in trained.items()
+        ]
         if tested_with:
             print(f"\nMean return, tested with {tested_with}")
         print(tabulate(rows, headers, disable_numparse=True))
+
+
+def mean_return(seeds, key, episodes):
+    """Spell the mean return under a condition, and its standard deviation if there are seeds."""
+    means = [np.mean(seed[key][:episodes], axis=0)[0] for seed in seeds]
+    spread = f" ± {np.std(means, ddof=1):.1f}" if len(means) > 1 else ""
+    return f"{np.mean(means):.1f}{spread}"
 
 
 def works(code):
