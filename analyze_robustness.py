@@ -16,17 +16,15 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from scipy import stats
 
 from analyze_runs import BASELINE, KEYS, order, rate_text
 from analyze_statistics import contrast, holm, improvement_percent, mann_whitney, mean_std
-from analyze_verdict import LEVEL, POWER, p_value
+from analyze_verdict import DETECTABLE, LEVEL, p_value
 
 FILES = ("robustness.csv", "robustness.csv.gz")
 HEADER = ["noise", "noise_rate", "episode", "episodic_return", "episodic_length"]
 CONDITION = ["test_noise", "test_rate"]
 CLEAN = BASELINE  # a condition is (noise, rate), as a configuration is
-DETECTABLE = stats.norm.ppf(1 - LEVEL / 2) + stats.norm.ppf(POWER)  # in standard errors
 RUN_COLUMNS = [*KEYS, "seed", *CONDITION, "mean", "cvar"]
 COLUMNS = [*KEYS, *CONDITION, "tested_on", "n", "mean", "std", "change_percent", "cvar"]
 SCORE_COLUMNS = [*KEYS, "n", "n_baseline", "conditions", "score", "baseline_score"]

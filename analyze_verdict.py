@@ -16,6 +16,8 @@ from analyze_runs import BASELINE
 from analyze_statistics import improvement_percent, mann_whitney_null, mean_std
 
 LEVEL, POWER = 0.05, 0.8
+# A test at this level finds an effect of so many standard errors with this power.
+DETECTABLE = stats.norm.ppf(1 - LEVEL / 2) + stats.norm.ppf(POWER)
 UNCLEAR = "no clear difference"
 VERDICTS = ["better", "worse", "perhaps better", "perhaps worse", UNCLEAR]  # in this order
 MAX_SEEDS = 1000  # a difference that would take more seeds is said to take more than these
@@ -40,8 +42,7 @@ def normal_shift(n, m):
     In standard deviations, for normal returns. Noether (1987),
     https://doi.org/10.1080/01621459.1987.10478478.
     """
-    quantiles = stats.norm.ppf(1 - LEVEL / 2) + stats.norm.ppf(POWER)
-    return quantiles * sqrt((1 / n + 1 / m) * pi / 3)
+    return DETECTABLE * sqrt((1 / n + 1 / m) * pi / 3)
 
 
 @cache

@@ -14,7 +14,7 @@ from claims import ENDING, HERE, compare_rows, markdown, read_returns, render
 import choose
 from analyze_runs import FIRST_CONFIRMATION_SEED
 from analyze_statistics import contrast, holm
-from analyze_verdict import power
+from analyze_verdict import DETECTABLE, power
 
 SMALL = "RandomNormalNoisyObservation(0.001)"
 BOTH = f"{ENDING} + {SMALL}"
@@ -22,7 +22,6 @@ NOTHING = ("", "0.00")
 ALWAYS = (ENDING, "1.00")
 FALLING = (ENDING, "1.00 to 0.00")
 FALLING_SEEDS, TOGETHER_SEEDS = range(1, 21), range(1, 11)
-POWER_Z = 1.96 + 0.84  # an effect of so many standard errors is found with 80 % power
 
 
 def core_hours(*patterns):
@@ -132,7 +131,7 @@ def together(runs):
         "interaction": interaction,
         "low": low,
         "high": high,
-        "detectable": POWER_Z * error,
+        "detectable": DETECTABLE * error,
         "cost": core_hours("schedules/*NoisyObservation_0.001*"),
     }
 
