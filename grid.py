@@ -65,7 +65,15 @@ GRID_OPTIONS = ["--algos", "--envs", "--noises", "--noise-rates", "--seeds", "--
 GRID_OPTIONS += ["--runs-dir", "--combine", "--exclude", "--budget", "--confirm"]
 EXECUTOR_OPTIONS = ["--dry-run", "--executor", "--jobs", "--sshlogin", "--remote-dir"]
 EXECUTOR_OPTIONS += ["--slurm-args", "--wait", "--help"]  # benchmark.sh reads these
-OURS = ["env-id", "seed", "noise", "noise-rate", "total-timesteps", "runs-dir", "exp-name"]
+GIVEN_BY_THE_GRID = {  # options of the scripts, and those of the sweep that set them
+    "env-id": "--envs",
+    "seed": "--seeds",
+    "noise": "--noises",
+    "noise-rate": "--noise-rates",
+    "total-timesteps": "--total-timesteps",
+    "runs-dir": "--runs-dir",
+    "exp-name": "--runs-dir",  # a sweep's folders are told apart by where they lie
+}
 
 
 class Run(NamedTuple):
@@ -115,7 +123,7 @@ def parse_args(view, caller, argv):
 
 def unknown_option(name):
     """Say what to write instead of an option that the grid does not have."""
-    known = script_options().difference(f"--{ours}" for ours in OURS)
+    known = script_options().difference(f"--{name}" for name in GIVEN_BY_THE_GRID)
     if name in known:
         return f"{name} is an option of the scripts: put it at the end, after --"
     near = difflib.get_close_matches(name, [*GRID_OPTIONS, *EXECUTOR_OPTIONS, *known], n=1)
@@ -229,8 +237,8 @@ def check(args):
         if not word.startswith("--"):
             continue
         name = word.partition("=")[0].removeprefix("--").replace("_", "-")
-        if name in OURS:
-            fail(f"--{name} is part of the grid: it has an option of its own, before the --")
+        if name in GIVEN_BY_THE_GRID:
+            fail(f"--{name} is part of the grid: use {GIVEN_BY_THE_GRID[name]}, before the --")
         if name == "overwrite":
             fail("--overwrite would start interrupted runs afresh: delete their folders instead")
 

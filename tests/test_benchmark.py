@@ -906,7 +906,8 @@ def test_a_second_sweep_waits_for_the_runs_of_the_first(tmp_path, stub):
         ("demo --jobs", "--jobs needs a value"),
         ("demo --sshlogin host", "--sshlogin and --remote-dir belong to --executor parallel"),
         ("demo -- --help", "--help after the -- would start nothing"),
-        ("demo -- --seed 2", "--seed is part of the grid"),
+        ("demo -- --seed 2", "--seed is part of the grid: use --seeds, before the --"),
+        ("demo -- --exp-name my_ppo", "--exp-name is part of the grid: use --runs-dir, before"),
         ("best --algos sac -- --nope", "sac_continuous_noisy.py: Unrecognized options: --nope"),
     ],
 )
