@@ -29,6 +29,17 @@ ENDING = "RandomEarlyTermination(50)"
 TRUNCATING = "RandomEarlyTermination(50, truncate=True)"
 MIXUP = "RandomMixupObservation(0.0, recursive=True)"
 SCALE = "RandomUniformScaleReward(0.5, 1.5)"
+NORMAL = "RandomNormalNoisyObservation(1.0)"
+FEW_SEEDS = range(1, 6)
+ENVIRONMENTS = ["HalfCheetah", "Hopper", "Humanoid", "Pusher", "Walker2d"]
+# Noises of PPO at p = 1 that the paper finds worse everywhere, and mixup without a memory of the
+# mixture beside: which of the two did the paper run?
+WORSE = {
+    NORMAL: ENVIRONMENTS,
+    MIXUP: ENVIRONMENTS,
+    "RandomMixupObservation(0.0)": ["HalfCheetah", "Pusher", "Walker2d"],
+}
+STD_PERCENT = "std_improvement_percent"
 RATES = [0.01, 0.05, 0.1, 0.2, 0.5, 1.0]
 # The paper's 15 noises by what they perturb; its text calls early termination dynamics noise.
 KINDS = {"observation": 8, "reward": 5, "dynamics": 2}
@@ -498,7 +509,7 @@ def speed(summary):
 
 
 def compare_rows(name, x, y):
-    """Return a row of the table of Pusher: samples x and y of test returns."""
+    """Compare samples x and y of test returns: a row of a table, and the exact p."""
     p, _ = mann_whitney(np.array(x)[:, None], np.array(y)[:, None])
     mean, other = np.mean(x), np.mean(y)
     interval = stats.ttest_ind(x, y, equal_var=False).confidence_interval(0.95)
@@ -511,6 +522,11 @@ def compare_rows(name, x, y):
         "of the second": f"{100 * (mean - other) / abs(other):+.1f} %",
         "p": f"{p:.2g}",
     }, p
+
+
+def uncorrected(rows):
+    """Write rows of compare_rows as a Markdown table, without a column for Holm's p."""
+    return markdown(pd.DataFrame(rows).rename(columns={"p": "p (exact)"}).to_dict("series"))
 
 
 def pusher(runs):
@@ -543,7 +559,7 @@ def pusher(runs):
     x, y = seeds(ENDING, FIXED_SEEDS), seeds("", FIXED_SEEDS)
     gain, n = x.mean() - y.mean(), len(FRESH_SEEDS)
     return {
-        "table": markdown(pd.DataFrame(rows).rename(columns={"p": "p (exact)"}).to_dict("series")),
+        "table": uncorrected(rows),
         "p": p,
         "percent": percent,
         "power": power(gain, x.std(), n, y.std(), n),
@@ -551,15 +567,25 @@ def pusher(runs):
     }
 
 
-def half_cheetah(runs):
-    """How many runs of PPO on HalfCheetah end near 4,000, and how many elsewhere."""
+def half_cheetah(runs, paper_percent):
+    """How many runs of PPO on HalfCheetah end near 4,000, and what luck that makes.
+
+    `luck`: in how many percent of the ways to take two sets of ten runs without noise the first is
+    better by the paper's improvement, or more.
+    """
     runs = runs.query("environment == 'HalfCheetah'")
     noisy = runs[runs["noise"].str.startswith("RandomUniformNoisyReward")]["test"]
     base = runs[runs["noise"] == ""]["test"]
     high, noisy_high = (base > 3000).sum(), (noisy > 3000).sum()
     low, upper = stats.binomtest(int(high), len(base)).proportion_ci(method="exact")
     table = [[high, len(base) - high], [noisy_high, len(noisy) - noisy_high]]
-    return {
+    luck = {}
+    if len(base) >= 20:
+        rng = np.random.default_rng(0)
+        draws = rng.permuted(np.tile(base, (DRAWS, 1)), axis=1)
+        first, second = draws[:, :10].mean(axis=1), draws[:, 10:20].mean(axis=1)
+        luck = {"luck": 100 * (100 * (first - second) / second >= paper_percent).mean()}
+    return luck | {
         "high": high,
         "n": len(base),
         "noisy_high": noisy_high,
@@ -572,21 +598,60 @@ def half_cheetah(runs):
     }
 
 
-def other_noises(statistics, skip):
-    """Our comparisons that are in no other table of the page."""
-    rows = statistics[statistics["p"].notna() & ~statistics["noise"].isin(skip)]
-    if rows.empty:
-        return ""
-    return markdown(
-        {
-            "": rows["algorithm"] + ", " + rows["environment"],
-            "noise": cells("`{}`, p = {}", rows["noise"], rows["noise_rate"]),
-            "n": cells("{:.0f}, {:.0f}", rows["n"], rows["n_baseline"]),
-            **improvements(rows),
-            "p (exact)": cells("{:.2g}", rows["p"]),
-            "adjusted": cells("{:.2g}", rows["p_adjusted"]),
-        }
-    )
+def worse_noises(runs, paper):
+    """PPO with noises that the paper finds worse everywhere, against all our runs without noise.
+
+    A noise is there once seeds 1 to 5 of all its environments are.
+    """
+    theirs = paper["consistently_worse"].query("algorithm == 'PPO' and noise_rate == '1.00'")
+    theirs = theirs.set_index("noise")
+    rows, found = [], {}
+    for noise, environments in WORSE.items():
+        chosen = runs.query("noise == @noise and noise_rate == '1.00' and seed in @FEW_SEEDS")
+        noisy, base = (
+            some.pivot(index="seed", columns="environment", values="test").reindex(
+                columns=environments
+            )
+            for some in (chosen, runs[runs["noise"] == ""])
+        )
+        if noisy.count().sum() < len(FEW_SEEDS) * len(environments):
+            continue
+        change = 100 * (noisy.mean() - base.mean()) / base.mean().abs()
+        p, _ = mann_whitney(noisy, base)
+        found[noise] = {"average": change.mean(), "worse": (change < 0).sum(), "p": p}
+        row = {"noise": f"`{noise}`"} | {name: "\u2013" for name in ENVIRONMENTS}
+        row |= {name: f"{value:+.0f} %" for name, value in change.items()}
+        row["average"] = f"{change.mean():+.0f} ± {change.std(ddof=1):.0f} %"
+        row["the paper"] = "\u2013"
+        if noise in theirs.index:
+            average, std = theirs.loc[noise, ["average_improvement_percent", STD_PERCENT]]
+            row["the paper"] = f"{average:+.0f} ± {std:.0f} %"
+        rows.append(row | {"p": p})
+    return {"table": markdown(pd.DataFrame(rows).to_dict("series")) if rows else "", **found}
+
+
+# ----------------------------------------------------------------------------------------- TD3, all
+
+
+def td3(runs, paper):
+    """TD3 on HalfCheetah with a noise that the paper finds worse everywhere at every rate.
+
+    A rate is there once its seeds 1 to 5 are.
+    """
+    theirs = paper["consistently_worse"].query("algorithm == 'TD3' and noise == @NORMAL")
+    theirs = theirs.set_index("noise_rate")
+    base = runs[runs["noise"] == ""]["test"]
+    rows, found = [], {}
+    for rate in ("0.01", "1.00"):
+        noisy = runs.query("noise == @NORMAL and noise_rate == @rate")["test"]
+        if len(noisy) < len(FEW_SEEDS):
+            continue
+        row, p = compare_rows(f"p = {float(rate):g}", noisy, base)
+        average, std = theirs.loc[rate, ["average_improvement_percent", STD_PERCENT]]
+        rows.append(row | {"the paper, five environments": f"{average:+.0f} ± {std:.0f} %"})
+        percent = 100 * (noisy.mean() - base.mean()) / abs(base.mean())
+        found[rate] = {"p": p, "percent": percent}
+    return {"table": uncorrected(rows) if rows else "", **found}
 
 
 # ----------------------------------------------------------------------------------------- SAC, all
@@ -658,7 +723,6 @@ def numbers():
     five = make_tables(make_studies(five)[0])
     five_statistics, five_summary = (plain(five[n][0]) for n in ("statistics", "summary_PPO"))
     five_statistics = five_statistics[five_statistics["p"].notna()]
-    skip = [*best["noise"], TRUNCATING, SCALE]
     shares = variance_share(base), variance_share(noisy)
     counts = returns.groupby("algorithm").size()
     return {
@@ -684,8 +748,9 @@ def numbers():
         "spread": spread(base, noisy, paper_base, paper_noisy),
         "speed": speed(five_summary),
         "pusher": pusher(ppo),
-        "half_cheetah": half_cheetah(ppo),
-        "others": other_noises(statistics, skip),
+        "half_cheetah": half_cheetah(ppo, best["improvement_percent"]["HalfCheetah"]),
+        "worse_noises": worse_noises(ppo, paper),
+        "td3": td3(returns.query("algorithm == 'TD3'"), paper),
         "sac": sac(early, statistics),
         "rate_error": noise_rates(HERE / "runs"),
         "scale": reward_scale(),

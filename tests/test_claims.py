@@ -119,6 +119,64 @@ def test_the_five_comparisons_stay_on_seeds_1_to_10():
     assert set(other["noise"]) == {""} and len(other) == 10
 
 
+def test_worse_noises_by_hand():
+    """Runs of 10 become 5, 8 and 12 in three environments: changes of -50, -20 and +20 %."""
+    plain_mixup = "RandomMixupObservation(0.0)"
+    rows = [
+        ("PPO", name, noise, rate, seed, value + seed / 1e6)
+        for name, noisy in (("HalfCheetah", 5.0), ("Pusher", 8.0), ("Walker2d", 12.0))
+        for noise, rate, seeds, value in (
+            ("", "0.00", range(1, 11), 10.0),
+            (plain_mixup, "1.00", range(1, 6), noisy),
+            (plain_mixup, "0.50", range(1, 6), -1e6),
+            (claims.NORMAL, "1.00", range(1, 6), 1.0),  # two environments are missing
+        )
+        for seed in seeds
+    ]
+    runs = pd.DataFrame(rows, columns=list(make_runs([]).columns))
+    paper = claims.read_paper(RESULTS / "paper")
+    found = claims.worse_noises(runs, paper)
+    assert set(found) == {"table", plain_mixup}
+    assert found[plain_mixup]["average"] == pytest.approx(-50 / 3, abs=1e-3)
+    assert found[plain_mixup]["worse"] == 2
+    # U is 0 + 0 + 50 of 150: the null is the sum of three independent Mann-Whitney statistics
+    draws = np.random.default_rng(0).permuted(np.tile(np.arange(15), (3 * 40_000, 1)), axis=1)
+    u = (draws[:, :5, None] > draws[:, None, 5:]).sum(axis=(1, 2)).reshape(3, -1).sum(axis=0)
+    assert found[plain_mixup]["p"] == pytest.approx(2 * (u <= 50).mean(), abs=0.01)
+    cells = [cell.strip() for cell in found["table"].splitlines()[-1].split("|")]
+    assert cells[2:9] == ["-50 %", "–", "–", "-20 %", "+20 %", "-17 ± 35 %", "–"]
+    assert claims.worse_noises(runs[runs["seed"] < 5], paper) == {"table": ""}
+
+
+def test_td3_with_noise_is_shown_once_five_seeds_are_there():
+    paper = claims.read_paper(RESULTS / "paper")
+    names = ["noise", "noise_rate", "seed", "test"]
+    rows = [("", "0.00", seed, 100.0 + seed) for seed in range(5)]
+    rows += [(claims.NORMAL, "1.00", seed, 50.0 + seed) for seed in range(5)]
+    rows += [(claims.NORMAL, "0.01", seed, 50.0 + seed) for seed in range(4)]
+    found = claims.td3(pd.DataFrame(rows, columns=names), paper)
+    assert set(found) == {"table", "1.00"} and "-92 ± 7 %" in found["table"]
+    assert found["1.00"]["percent"] == pytest.approx(100 * -50 / 102)
+    assert found["1.00"]["p"] == pytest.approx(2 / 252)
+
+
+def test_the_luck_of_two_kinds_of_runs():
+    """Of 20 runs one is high: it is in the first ten or in the second."""
+    returns = [*np.arange(19) / 1e6 + 1000, 5000]
+    runs = pd.DataFrame({"environment": "HalfCheetah", "noise": "", "test": returns})
+    noisy = pd.DataFrame(
+        {
+            "environment": "HalfCheetah",
+            "noise": "RandomUniformNoisyReward(-0.001, 0.001)",
+            "test": [1.0],
+        }
+    )
+    found = claims.half_cheetah(pd.concat([runs, noisy]), 30)
+    assert found["luck"] == pytest.approx(50, abs=2)
+    assert claims.half_cheetah(pd.concat([runs, noisy]), 41)["luck"] == 0
+    assert "luck" not in claims.half_cheetah(pd.concat([runs[1:], noisy]), 30)
+
+
 # ---------------------------------------------------------------------- what the paper's tables say
 
 
