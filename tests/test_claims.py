@@ -43,7 +43,7 @@ def test_cleanrls_deviations_are_those_of_a_population():
     """Three seeds: their sample standard deviation is sqrt(3/2) times what CleanRL prints."""
     returns = np.array([1.0, 2, 6])
     claims_std = claims.CLEANRL["CleanRL, v2"]["Hopper"][1]
-    hopper = claims.cleanrl("CleanRL, v2").loc["Hopper"]
+    hopper = claims.cleanrl(claims.CLEANRL["CleanRL, v2"]).loc["Hopper"]
     assert hopper["mean"] == 2311.49 and hopper["n"] == 3
     assert hopper["std"] / claims_std == pytest.approx(returns.std(ddof=1) / returns.std())
 
@@ -158,6 +158,17 @@ def test_td3_with_noise_is_shown_once_five_seeds_are_there():
     assert set(found) == {"table", "1.00"} and "-92 ± 7 %" in found["table"]
     assert found["1.00"]["percent"] == pytest.approx(100 * -50 / 102)
     assert found["1.00"]["p"] == pytest.approx(2 / 252)
+
+
+def test_td3_at_full_length_is_compared_with_its_papers(monkeypatch):
+    paper = claims.read_paper(RESULTS / "paper")
+    assert claims.long_td3(RESULTS / "nowhere", paper) == {"table": ""}
+    returns = {"environment": "Walker2d", "test": [3900.0, 4000, 4100], "training": [3, 4, 5.0]}
+    monkeypatch.setattr(claims, "read_returns", lambda _: pd.DataFrame(returns))
+    rows = claims.long_td3(RESULTS, paper)["table"].splitlines()[2:]
+    error = np.sqrt(100**2 / 3 + 415.4**2 / 5)
+    assert f"4,000 ± 100 | 4,016 ± 415 | {(4000 - 4015.6) / error:+.1f} (p" in rows[0]
+    assert f"| 4.0 ± 1.0   | 4,058 ± {658.78 * np.sqrt(1.5):.0f} |" in rows[1]
 
 
 def test_the_luck_of_two_kinds_of_runs():
