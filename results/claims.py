@@ -114,7 +114,7 @@ def fixed_beforehand(runs, chosen):
 
 
 def cleanrl(returns):
-    """Return {environment: (mean, std)} of CleanRL as a frame, with the sample standard deviation."""
+    """Return CleanRL's {environment: (mean, std)} as a frame with the sample's deviation."""
     table = pd.DataFrame(returns, index=["mean", "std"]).T
     table["std"] *= np.sqrt(CLEANRL_SEEDS / (CLEANRL_SEEDS - 1))
     return table.assign(n=CLEANRL_SEEDS)
