@@ -790,6 +790,7 @@ def render(template, values):
         "whole": lambda x: f"{x:,.0f}",
         "tenth": lambda x: f"{x:.1f}",
         "signed": lambda x: f"{x:+.1f}",
+        "signed_whole": lambda x: f"{x:+,.0f}",
     }
     options = {"undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
     environment = jinja2.Environment(loader=loader, keep_trailing_newline=True, **options)

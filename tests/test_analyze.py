@@ -1099,6 +1099,7 @@ def test_committed_results_are_those_of_the_committed_runs(tmp_path):
     committed = {path.name for path in results.iterdir() if path.is_file()}
     pages = {"README.md", "README.md.jinja", "claims.py"}
     pages |= {"future_work.md", "future_work.md.jinja", "future_work.py"}
+    pages |= {"robustness.md", "robustness.md.jinja", "robustness.py"}
     assert committed - pages == {path.name for path in tmp_path.iterdir()}
     for path in results.glob("*.csv"):
         tables = [pd.read_csv(folder / path.name) for folder in (results, tmp_path)]

@@ -14,6 +14,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "results/reward_
 import claims
 import future_work
 import reward_scale
+import robustness
 
 from analyze_verdict import detectable_shift
 
@@ -23,6 +24,7 @@ RESULTS = claims.HERE
 def test_the_page_is_what_its_command_writes():
     assert (RESULTS / "README.md").read_text() == claims.page()
     assert (RESULTS / "future_work.md").read_text() == future_work.page()
+    assert (RESULTS / "robustness.md").read_text() == robustness.page()
 
 
 def test_the_choice_on_the_page_is_that_of_the_runs():
@@ -34,6 +36,40 @@ def test_the_choice_on_the_page_is_that_of_the_runs():
     assert len(x) == len(y) == 10
     assert found["p"] == pytest.approx(stats.mannwhitneyu(x, y, method="exact").pvalue)
     assert found["search"]["runs"] + found["confirmation"]["runs"] == len(runs) == 61
+
+
+def test_the_robustness_on_the_page_is_that_of_the_episodes():
+    """Scores and their difference by hand: the noises that the policies were not trained with."""
+    tables = []
+    for path in (RESULTS / "robustness").glob("*/robustness.csv.gz"):
+        environment, _, trained_with, _ = path.parent.name.split("__")
+        table = pd.read_csv(path, keep_default_na=False)
+        assert table.groupby(["noise", "noise_rate"]).size().tolist() == 10 * [100]
+        tables.append(table.assign(environment=environment, trained_with=trained_with))
+    assert len(tables) == 90
+    episodes = pd.concat(tables)
+    baseline = episodes[episodes["trained_with"] == "baseline"]
+    clean = baseline[baseline["noise"] == ""].groupby("environment")["episodic_return"].mean()
+
+    def score(policies, noises):
+        tested = policies[policies["noise"].str.split("(").str[0].isin(noises)]
+        returns = tested.groupby("environment")["episodic_return"].mean()
+        return (100 * (returns - clean) / clean.abs()).mean()
+
+    found = robustness.numbers()["unseen"]
+    dropout, observation, action = (
+        "RandomDropoutObservation",
+        "RandomNormalNoisyObservation",
+        "RandomNormalNoisyAction",
+    )
+    for name, own, noises in (
+        ("observation noise", observation, [action, dropout]),
+        ("action noise", action, [observation, dropout]),
+    ):
+        noisy = episodes[episodes["trained_with"].str.startswith(own)]
+        assert found[name]["score"] == pytest.approx(score(noisy, noises))
+        difference = score(noisy, noises) - score(baseline, noises)
+        assert found[name]["difference"] == pytest.approx(difference)
 
 
 # ----------------------------------------------------------------------------------- statistics
