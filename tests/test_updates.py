@@ -621,6 +621,25 @@ def test_a_gradient_of_any_strides_is_applied_as_it_is(script, strides):
     torch.testing.assert_close(network.weight, before - 0.5 * gradient.sign())
 
 
+@pytest.mark.parametrize("script", [sac, td3])
+def test_the_momentum_of_a_dead_unit_ends_at_zero(script):
+    """0.9 times the smallest numbers rounds to themselves, and Intel is slow with them."""
+    network = nn.Linear(3, 1, bias=False).requires_grad_(False)
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-3, fused=True)
+    before = network.weight.clone()
+
+    def loss(params):
+        return (0 * params["weight"]).sum(), {}
+
+    update = script.updater(loss, network, optimizer, script.Args(compile=False))
+    update()
+    momentum = optimizer.state[network.weight]["exp_avg"]
+    momentum.fill_(4e-45)
+    update()
+    assert torch.equal(momentum, torch.zeros(1, 3)) and torch.equal(network.weight, before)
+    assert torch.tensor(4e-45) * torch.tensor(0.9) > 0  # elsewhere such numbers stay
+
+
 # PARTS
 
 
