@@ -1,4 +1,4 @@
-"""Write results/robustness.md and its figures from the runs in robustness/.
+"""Write results/robustness.md and its figure from the runs in robustness/.
 
     python results/robustness.py
 
@@ -9,11 +9,11 @@ file every number in it.
 
 import json
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from claims import HERE, compare_rows, markdown, plain, render
 
-from analyze_report import robustness_curves
 from analyze_robustness import (
     CONDITION,
     condition_rows,
@@ -23,7 +23,7 @@ from analyze_robustness import (
     score_rows,
 )
 from analyze_runs import read_runs
-from analyze_statistics import holm
+from analyze_statistics import contrast, holm, mann_whitney
 
 FOLDER = HERE / "robustness"
 SHORT = {
@@ -32,6 +32,7 @@ SHORT = {
     "RandomNormalNoisyAction(0.3)": "action noise",
     "RandomDropoutObservation(0.9)": "dropout",
 }
+COLORS = {"no noise": "black", "observation noise": "C0", "action noise": "C1"}
 
 
 def scores(found, counts):
@@ -80,7 +81,7 @@ def score_columns(rows):
     )
     return {
         "score": [f"{value:.0f}" for value in rows["score"]],
-        "of no noise": [f"{value:.0f}" for value in rows["baseline_score"]],
+        "without noise": [f"{value:.0f}" for value in rows["baseline_score"]],
         "difference [95 %]": [f"{d:+.0f} [{low:.0f}, {high:.0f}]" for d, low, high in differences],
     }
 
@@ -92,9 +93,9 @@ def harder(table):
         {
             "trained with": [SHORT[noise] for noise in rows["noise"]],
             "worst condition": [f"{value:.0f}" for value in rows["worst_score"]],
-            "of no noise": [f"{value:.0f}" for value in rows["baseline_worst_score"]],
-            "worst tenth of the episodes": [f"{value:.0f}" for value in rows["cvar_score"]],
-            "its of no noise": [f"{value:.0f}" for value in rows["baseline_cvar_score"]],
+            "worst condition, without noise": [f"{v:.0f}" for v in rows["baseline_worst_score"]],
+            "worst tenth": [f"{value:.0f}" for value in rows["cvar_score"]],
+            "worst tenth, without noise": [f"{v:.0f}" for v in rows["baseline_cvar_score"]],
         }
     )
 
@@ -102,14 +103,19 @@ def harder(table):
 def clean_returns(runs):
     """Compare the returns without noise in the test with those of training without noise."""
     clean = plain(runs[runs["test_noise"] == ""])
-    rows = []
+    rows, p = [], []
     for environment, group in clean.groupby("environment"):
         baseline = group.loc[group["noise"] == "", "mean"]
         for noise, same in group[group["noise"] != ""].groupby("noise"):
-            row, _ = compare_rows(f"{environment}, {SHORT[noise]}", same["mean"], baseline)
+            row, exact = compare_rows(f"{environment}, {SHORT[noise]}", same["mean"], baseline)
             rows.append(row)
-    table = pd.DataFrame(rows).rename(columns={"p": "p (exact)"})
-    return markdown(table.to_dict("series"))
+            p.append(exact)
+    names = {"first": "trained with it", "second": "without noise", "of the second": "change"}
+    table = pd.DataFrame(rows).rename(columns=names).assign(p=p)
+    return {
+        "table": markdown(table.to_dict("series")),
+        "holm": dict(zip(table[""], holm(np.array(p)), strict=True)),
+    }
 
 
 def clean_changes(table):
@@ -134,18 +140,71 @@ def returns(conditions):
     return markdown(table)
 
 
-def own_noise_at_full_rate(conditions):
-    """Return the mean returns under the noise of training at p = 1, and those without training.
+def own_noise(found):
+    """Compare policies with those trained without noise under the noise of their own training.
 
-    {"observation noise": {"Hopper": {"trained": mean, "untrained": mean}}}
+    For each rate in the test: in how many cases (noise and environment) the mean return is higher,
+    and in how many of these with an exact p, uncorrected, of at most 0.05.
     """
-    found = {}
-    for (noise, environment), rows in conditions.groupby(["test_noise", "environment"]):
-        means = rows[rows["test_rate"] == "1.00"].set_index("noise")["mean"]
-        if noise in means:
-            values = {"trained": means[noise], "untrained": means[""]}
-            found.setdefault(SHORT[noise], {})[environment] = values
-    return found
+    counts = {}
+    own = found[found["test_noise"].isin(set(found["noise"]))]
+    for (noise, rate, _), group in own.groupby(["test_noise", "test_rate", "environment"]):
+        x, y = (group.loc[group["noise"] == name, "mean"].to_numpy() for name in (noise, ""))
+        p, _ = mann_whitney(x[:, None], y[:, None])
+        count = counts.setdefault(rate, {"cases": 0, "higher": 0, "significant": 0})
+        count["cases"] += 1
+        count["higher"] += x.mean() > y.mean()
+        count["significant"] += x.mean() > y.mean() and p <= 0.05
+    return counts
+
+
+def kept(found, counts):
+    """Compare the shares of their own clean return that policies keep under noise, in percent.
+
+    The conditions that count and the averages are those of the score.
+    """
+    policy = ["noise", "environment", "seed"]
+    clean = found[found["test_noise"] == ""].set_index(policy)["mean"].rename("clean")
+    tested = found[found["test_noise"] != ""].join(clean, on=policy)
+    tested["share"] = 100 * tested["mean"] / tested["clean"]
+    conditions = list(zip(tested["test_noise"], tested["test_rate"], strict=True))
+    result = {}
+    for noise, rate in sorted(set(zip(found["noise"], found["noise_rate"], strict=True))):
+        if noise == "":
+            continue
+        mask = [counts(condition, (noise, rate)) for condition in conditions]
+        shares = tested[mask].groupby(policy)["share"].mean()
+        x, y = (shares[name].unstack("environment") for name in (noise, ""))
+        n = x.shape[1]
+        samples = [table[name].to_numpy() for table in (x, y) for name in table]
+        difference, _, low, high = contrast(samples, [1 / n] * n + [-1 / n] * n)
+        result[SHORT[noise]] = {
+            "share": x.mean().mean(),
+            "baseline_share": y.mean().mean(),
+            "difference": difference,
+            "low": low,
+            "high": high,
+            "p": mann_whitney(x, y)[0],
+        }
+    return result
+
+
+def shares_table(unseen, seen):
+    """Spell the shares of kept(), under noise that was not in training and under its own."""
+    rows = []
+    for title, found in (("noise of another kind", unseen), ("the same noise", seen)):
+        for noise, row in found.items():
+            rows.append(
+                {
+                    "trained with": noise,
+                    "tested with": title,
+                    "share": f"{row['share']:.0f} %",
+                    "without noise": f"{row['baseline_share']:.0f} %",
+                    "difference [95 %]": "{difference:+.0f} [{low:.0f}, {high:.0f}]".format(**row),
+                    "p (exact)": f"{row['p']:.1g}",
+                }
+            )
+    return markdown(pd.DataFrame(rows).to_dict("series"))
 
 
 def by_noise(table):
@@ -184,7 +243,9 @@ def numbers():
         },
         "clean": clean_returns(found),
         "change": clean_changes(unseen),
-        "strong": own_noise_at_full_rate(conditions),
+        "own": own_noise(found),
+        "kept": kept(found, is_unseen),
+        "shares": shares_table(kept(found, is_unseen), kept(found, is_seen)),
         "returns": {name: returns(rows) for name, rows in conditions.groupby("environment")},
     }
 
@@ -195,13 +256,31 @@ def page():
 
 
 def draw():
-    """Write one figure for each test noise: the return against its rate."""
+    """Draw the return against the rate of each noise in the test: a row per noise."""
     table = plain(pd.DataFrame(condition_rows(tests())))
-    for noise, rows in table[table["test_noise"] != ""].groupby("test_noise"):
-        clean = table[table["test_noise"] == ""]
-        _, fig, _ = robustness_curves("PPO", noise, pd.concat([clean, rows]))
-        name = SHORT[noise].replace(" ", "_")
-        fig.savefig(FOLDER / f"{name}.svg", metadata={"Date": None})
+    table["rate"] = table["test_rate"].astype(float)
+    clean = table[table["test_noise"] == ""]
+    noises = [noise for noise in SHORT if noise]
+    environments = sorted(set(table["environment"]))
+    fig, axes = plt.subplots(
+        len(noises), len(environments), figsize=(9, 8), sharey="col", layout="constrained"
+    )
+    for noise, row in zip(noises, axes, strict=True):
+        tested = pd.concat([clean, table[table["test_noise"] == noise]])
+        for environment, ax in zip(environments, row, strict=True):
+            for training, line in tested[tested["environment"] == environment].groupby("noise"):
+                color, error = COLORS[SHORT[training]], line["std"] / np.sqrt(line["n"])
+                label = f"trained with {SHORT[training]}"
+                ax.errorbar(line["rate"], line["mean"], error, marker=".", color=color, label=label)
+            ax.set_ylim(bottom=0)
+            ax.set_xlabel(f"rate of {SHORT[noise]} in the test")
+    for environment, ax in zip(environments, axes[0], strict=True):
+        ax.set_title(environment)
+    for ax in axes[:, 0]:
+        ax.set_ylabel("return")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    fig.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
+    fig.savefig(FOLDER / "returns.svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":

@@ -42,10 +42,10 @@ def test_the_robustness_on_the_page_is_that_of_the_episodes():
     """Scores and their difference by hand: the noises that the policies were not trained with."""
     tables = []
     for path in (RESULTS / "robustness").glob("*/robustness.csv.gz"):
-        environment, _, trained_with, _ = path.parent.name.split("__")
+        environment, _, trained_with, seed = path.parent.name.split("__")
         table = pd.read_csv(path, keep_default_na=False)
         assert table.groupby(["noise", "noise_rate"]).size().tolist() == 10 * [100]
-        tables.append(table.assign(environment=environment, trained_with=trained_with))
+        tables.append(table.assign(environment=environment, trained_with=trained_with, seed=seed))
     assert len(tables) == 90
     episodes = pd.concat(tables)
     baseline = episodes[episodes["trained_with"] == "baseline"]
@@ -56,7 +56,15 @@ def test_the_robustness_on_the_page_is_that_of_the_episodes():
         returns = tested.groupby("environment")["episodic_return"].mean()
         return (100 * (returns - clean) / clean.abs()).mean()
 
-    found = robustness.numbers()["unseen"]
+    def kept(policies, noises):
+        tested = policies[policies["noise"].str.split("(").str[0].isin(noises)]
+        policy = ["environment", "seed"]
+        own = policies[policies["noise"] == ""].groupby(policy)["episodic_return"].mean()
+        shares = tested.groupby(policy)["episodic_return"].mean() / own
+        return 100 * shares.groupby("environment").mean().mean()
+
+    numbers = robustness.numbers()
+    found, shares = numbers["unseen"], numbers["kept"]
     dropout, observation, action = (
         "RandomDropoutObservation",
         "RandomNormalNoisyObservation",
@@ -70,6 +78,8 @@ def test_the_robustness_on_the_page_is_that_of_the_episodes():
         assert found[name]["score"] == pytest.approx(score(noisy, noises))
         difference = score(noisy, noises) - score(baseline, noises)
         assert found[name]["difference"] == pytest.approx(difference)
+        assert shares[name]["share"] == pytest.approx(kept(noisy, noises))
+        assert shares[name]["baseline_share"] == pytest.approx(kept(baseline, noises))
 
 
 # ----------------------------------------------------------------------------------- statistics
