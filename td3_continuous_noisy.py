@@ -244,7 +244,7 @@ def updater(loss, network, optimizer, args):
         for name, parameter in parameters.items():
             # contiguous: the fused Adam of PyTorch 2.13 misreads any other strides, in silence
             parameter.grad = gradient[name].contiguous()
-        # the momentum of a dead unit shrinks to 1e-45, for ever; Intel is slow with such numbers
+        # Adam's momentum of dead units ends at 1e-45, and Intel's processors are slow with that
         torch.set_flush_denormal(True)
         optimizer.step()
         torch.set_flush_denormal(False)
