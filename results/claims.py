@@ -550,12 +550,13 @@ def pusher(runs):
         ("truncated at 50, none: seeds 1 to 20", TRUNCATING, "", range(1, 21), "truncated"),
         ("truncated, terminated at 50: seeds 1 to 20", TRUNCATING, ENDING, range(1, 21), "ways"),
     ]
-    rows, p, percent = [], {}, {}
+    rows, p, percent, low = [], {}, {}, {}
     for name, first, second, wanted, key in cases:
         x, y = seeds(first, wanted), seeds(second, wanted)
         if len(x) == len(y) == len(wanted):
             row, p[key] = compare_rows(name, x, y)
             percent[key] = 100 * (x.mean() - y.mean()) / abs(y.mean())
+            low[key] = stats.ttest_ind(x, y, equal_var=False).confidence_interval(0.95).low
             rows.append(row)
     x, y = seeds(ENDING, FIXED_SEEDS), seeds("", FIXED_SEEDS)
     gain, n = x.mean() - y.mean(), len(FRESH_SEEDS)
@@ -563,6 +564,7 @@ def pusher(runs):
         "table": uncorrected(rows),
         "p": p,
         "percent": percent,
+        "low": low,
         "power": power(gain, x.std(), n, y.std(), n),
         "power_half": power(gain / 2, x.std(), n, y.std(), n),
     }
