@@ -621,7 +621,8 @@ def worse_noises(runs, paper):
             continue
         change = 100 * (noisy.mean() - base.mean()) / base.mean().abs()
         p, _ = mann_whitney(noisy, base)
-        found[noise] = {"average": change.mean(), "worse": (change < 0).sum(), "p": p}
+        found[noise] = {"change": change.to_dict(), "average": change.mean(), "p": p}
+        found[noise] |= {"worse": (change < 0).sum(), "of": len(change)}
         row = {"noise": f"`{noise}`"} | {name: "\u2013" for name in ENVIRONMENTS}
         row |= {name: f"{value:+.0f} %" for name, value in change.items()}
         row["average"] = f"{change.mean():+.0f} ± {change.std(ddof=1):.0f} %"
@@ -629,6 +630,7 @@ def worse_noises(runs, paper):
         if noise in theirs.index:
             average, std = theirs.loc[noise, ["average_improvement_percent", STD_PERCENT]]
             row["the paper"] = f"{average:+.0f} ± {std:.0f} %"
+            found[noise]["paper"] = average
         rows.append(row | {"p": p})
     return {"table": markdown(pd.DataFrame(rows).to_dict("series")) if rows else "", **found}
 
@@ -754,6 +756,10 @@ def numbers():
         "runs": ", ".join(f"{name} {n}" for name, n in counts.items()),
         "draws": f"{DRAWS:,}",
         "scaled_reward": SCALE,
+        "normal": NORMAL,
+        "normal_finds": statistics.query(
+            "algorithm == 'PPO' and environment == 'Pusher' and noise == @NORMAL"
+        )["detectable_percent"].item(),
         "noisy_share": shares[1],
         "highest_share": max(share.drop("Humanoid").max() for share in shares),
         "luck": luck_of_the_best(paper),
