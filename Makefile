@@ -6,9 +6,9 @@ BIN := .venv/bin
 
 demo: $(BIN)/.run
 	PYTHON=$(BIN)/python ./benchmark.sh demo
-	$(BIN)/python analyze.py --runs-dir runs/demo >runs/demo/analysis.txt
+	$(BIN)/python analyze.py --runs-dir runs/demo >runs/demo/logs/analysis.txt
 	@echo
-	@head -n 1 runs/demo/analysis.txt
+	@head -n 1 runs/demo/logs/analysis.txt
 	@echo "The picture: runs/demo/results/curves_PPO_RandomEarlyTermination_50.svg"
 	@echo "All tables and figures: runs/demo/results/report.html"
 	@echo "The curves in TensorBoard: .venv/bin/tensorboard --logdir runs/demo"
