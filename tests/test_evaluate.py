@@ -292,6 +292,12 @@ def test_all_of_a_folder_with_logs_and_an_analysis(runs, capsys):
     assert files(runs) == before
 
 
+def test_the_demo_keeps_its_text_where_all_of_its_folder_can_be_tested():
+    """evaluate.py runs/demo/* refuses a file, but skips logs."""
+    written = re.findall(r"> ?(runs/demo/\S+)", (ROOT / "Makefile").read_text())
+    assert written and all(path.startswith("runs/demo/logs/") for path in written)
+
+
 def test_a_folder_stands_for_its_finished_runs(runs, capsys):
     (one(runs, "SAC") / "result.json").unlink()
     runs = runs.rename(runs.parent / "two__words")  # which is no run's name here
