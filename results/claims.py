@@ -21,7 +21,7 @@ from analyze import make_tables  # noqa: E402
 from analyze_compare import PAPER_CONFIGURATIONS, PAPER_SEEDS, read_paper, with_luck  # noqa: E402
 from analyze_luck import CONSISTENT_PERCENT, DRAWS, draw_improvements  # noqa: E402
 from analyze_runs import KEYS, make_studies, read_runs  # noqa: E402
-from analyze_statistics import holm, mann_whitney  # noqa: E402
+from analyze_statistics import holm, improvement_percent, mann_whitney  # noqa: E402
 
 FIXED_SEEDS = range(1, 11)
 FRESH_SEEDS = range(11, 31)
@@ -39,7 +39,6 @@ WORSE = {
     MIXUP: ENVIRONMENTS,
     "RandomMixupObservation(0.0)": ["HalfCheetah", "Pusher", "Walker2d"],
 }
-STD_PERCENT = "std_improvement_percent"
 RATES = [0.01, 0.05, 0.1, 0.2, 0.5, 1.0]
 # The paper's 15 noises by what they perturb; its text calls early termination dynamics noise.
 KINDS = {"observation": 8, "reward": 5, "dynamics": 2}
@@ -179,12 +178,18 @@ def spell(x):
     return [f"{m:,.{d}f} ± {s:,.{d}f}" for m, s, d in zip(x["mean"], x["std"], digits, strict=True)]
 
 
+def spell_average(row):
+    """Write a row of the paper's averages over environments: mean ± standard deviation."""
+    average, std = row["average_improvement_percent"], row["std_improvement_percent"]
+    return f"{average:+.0f} ± {std:.0f} %"
+
+
 def markdown(columns):
-    """Write a dict of columns as a Markdown table; a column "p" is followed by Holm's."""
-    if "p" in columns:
-        columns["Holm"] = cells("{:.2g}", holm(columns["p"]))
-        columns["p"] = cells("{:.2g}", columns["p"])
+    """Write columns, or a list of dicts, as a Markdown table; after numbers "p" comes "Holm"."""
     table = pd.DataFrame(columns)
+    if "p" in table:
+        table["Holm"] = cells("{:.2g}", holm(table["p"].to_numpy(float)))
+        table["p"] = cells("{:.2g}", table["p"])
     return tabulate(table.values, table.columns, "pipe", disable_numparse=True)
 
 
@@ -510,24 +515,29 @@ def speed(summary):
 
 
 def compare_rows(name, x, y):
-    """Compare samples x and y of test returns: a row of a table, and the exact p."""
+    """Compare samples x and y of test returns: a row of a table, and its numbers.
+
+    They are the exact p, the difference of the means in percent, and the lower end of its interval.
+    """
     p, _ = mann_whitney(np.array(x)[:, None], np.array(y)[:, None])
     mean, other = np.mean(x), np.mean(y)
+    percent = improvement_percent(mean, other)
     interval = stats.ttest_ind(x, y, equal_var=False).confidence_interval(0.95)
-    return {
+    row = {
         "": name,
         "n": f"{len(x)}, {len(y)}",
         "first": f"{mean:.1f} ± {np.std(x, ddof=1):.1f}",
         "second": f"{other:.1f} ± {np.std(y, ddof=1):.1f}",
         "difference [95 %]": f"{mean - other:+.1f} [{interval.low:.1f}, {interval.high:.1f}]",
-        "of the second": f"{100 * (mean - other) / abs(other):+.1f} %",
+        "of the second": f"{percent:+.1f} %",
         "p": f"{p:.2g}",
-    }, p
+    }
+    return row, {"p": p, "percent": percent, "low": interval.low}
 
 
 def uncorrected(rows):
     """Write rows of compare_rows as a Markdown table, without a column for Holm's p."""
-    return markdown(pd.DataFrame(rows).rename(columns={"p": "p (exact)"}).to_dict("series"))
+    return markdown(pd.DataFrame(rows).rename(columns={"p": "p (exact)"}))
 
 
 def pusher(runs):
@@ -550,21 +560,17 @@ def pusher(runs):
         ("truncated at 50, none: seeds 1 to 20", TRUNCATING, "", range(1, 21), "truncated"),
         ("truncated, terminated at 50: seeds 1 to 20", TRUNCATING, ENDING, range(1, 21), "ways"),
     ]
-    rows, p, percent, low = [], {}, {}, {}
+    rows, numbers = [], {}
     for name, first, second, wanted, key in cases:
         x, y = seeds(first, wanted), seeds(second, wanted)
         if len(x) == len(y) == len(wanted):
-            row, p[key] = compare_rows(name, x, y)
-            percent[key] = 100 * (x.mean() - y.mean()) / abs(y.mean())
-            low[key] = stats.ttest_ind(x, y, equal_var=False).confidence_interval(0.95).low
+            row, numbers[key] = compare_rows(name, x, y)
             rows.append(row)
     x, y = seeds(ENDING, FIXED_SEEDS), seeds("", FIXED_SEEDS)
     gain, n = x.mean() - y.mean(), len(FRESH_SEEDS)
     return {
         "table": uncorrected(rows),
-        "p": p,
-        "percent": percent,
-        "low": low,
+        **pd.DataFrame(numbers).T.to_dict(),  # {"p": {"fixed": ...}, "percent": ..., "low": ...}
         "power": power(gain, x.std(), n, y.std(), n),
         "power_half": power(gain / 2, x.std(), n, y.std(), n),
     }
@@ -619,7 +625,7 @@ def worse_noises(runs, paper):
         )
         if noisy.count().sum() < len(FEW_SEEDS) * len(environments):
             continue
-        change = 100 * (noisy.mean() - base.mean()) / base.mean().abs()
+        change = improvement_percent(noisy.mean(), base.mean())
         p, _ = mann_whitney(noisy, base)
         found[noise] = {"change": change.to_dict(), "average": change.mean(), "p": p}
         found[noise] |= {"worse": (change < 0).sum(), "of": len(change)}
@@ -628,11 +634,10 @@ def worse_noises(runs, paper):
         row["average"] = f"{change.mean():+.0f} ± {change.std(ddof=1):.0f} %"
         row["the paper"] = "\u2013"
         if noise in theirs.index:
-            average, std = theirs.loc[noise, ["average_improvement_percent", STD_PERCENT]]
-            row["the paper"] = f"{average:+.0f} ± {std:.0f} %"
-            found[noise]["paper"] = average
+            row["the paper"] = spell_average(theirs.loc[noise])
+            found[noise]["paper"] = theirs.loc[noise, "average_improvement_percent"]
         rows.append(row | {"p": p})
-    return {"table": markdown(pd.DataFrame(rows).to_dict("series")) if rows else "", **found}
+    return {"table": markdown(rows) if rows else "", **found}
 
 
 # ----------------------------------------------------------------------------------------- TD3, all
@@ -651,11 +656,8 @@ def td3(runs, paper):
         noisy = runs.query("noise == @NORMAL and noise_rate == @rate")["test"]
         if len(noisy) < len(FEW_SEEDS):
             continue
-        row, p = compare_rows(f"p = {float(rate):g}", noisy, base)
-        average, std = theirs.loc[rate, ["average_improvement_percent", STD_PERCENT]]
-        rows.append(row | {"the paper, five environments": f"{average:+.0f} ± {std:.0f} %"})
-        percent = 100 * (noisy.mean() - base.mean()) / abs(base.mean())
-        found[rate] = {"p": p, "percent": percent}
+        row, found[rate] = compare_rows(f"p = {float(rate):g}", noisy, base)
+        rows.append(row | {"the paper, five environments": spell_average(theirs.loc[rate])})
     return {"table": uncorrected(rows) if rows else "", **found}
 
 
@@ -678,7 +680,7 @@ def long_td3(folder, paper):
         errors, p = welch(ours, other)
         rows.append([name, *spell(ours), *spell(other), f"{errors.iloc[0]:+.1f} (p = {p[0]:.2g})"])
     columns = ["", "ours, v5", "theirs", "difference in SE"]
-    return {"table": markdown(pd.DataFrame(rows, columns=columns).to_dict("series"))}
+    return {"table": markdown(pd.DataFrame(rows, columns=columns))}
 
 
 # ----------------------------------------------------------------------------------------- SAC, all

@@ -42,13 +42,14 @@ def comparisons(cases):
     """Compare pairs of samples, {name: (x, y)}; p is corrected with Holm's method for all pairs."""
     rows, p = [], {}
     for name, (x, y) in cases.items():
-        row, p[name] = compare_rows(name, x, y)
+        row, numbers = compare_rows(name, x, y)
+        p[name] = numbers["p"]
         finds, _ = power(x, y, 0)
         rows.append({**row, "80 % power at": f"{finds:.0f} %"})
     corrected = holm(list(p.values()))
     table = pd.DataFrame(rows).rename(columns={"p": "p (exact)"})
     table["Holm"] = [f"{value:.2g}" for value in corrected]
-    return {"table": markdown(table.to_dict("series")), "holm": list(corrected)}
+    return {"table": markdown(table), "holm": list(corrected)}
 
 
 # ------------------------------------------------------------------------------- a noise is chosen

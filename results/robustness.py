@@ -8,6 +8,7 @@ file every number in it.
 """
 
 import json
+from functools import cache
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -24,6 +25,7 @@ from analyze_robustness import (
 )
 from analyze_runs import read_runs
 from analyze_statistics import contrast, holm, mann_whitney
+from analyze_verdict import LEVEL
 
 FOLDER = HERE / "robustness"
 SHORT = {
@@ -107,13 +109,13 @@ def clean_returns(runs):
     for environment, group in clean.groupby("environment"):
         baseline = group.loc[group["noise"] == "", "mean"]
         for noise, same in group[group["noise"] != ""].groupby("noise"):
-            row, exact = compare_rows(f"{environment}, {SHORT[noise]}", same["mean"], baseline)
+            row, numbers = compare_rows(f"{environment}, {SHORT[noise]}", same["mean"], baseline)
             rows.append(row)
-            p.append(exact)
+            p.append(numbers["p"])
     names = {"first": "trained with it", "second": "without noise", "of the second": "change"}
     table = pd.DataFrame(rows).rename(columns=names).assign(p=p)
     return {
-        "table": markdown(table.to_dict("series")),
+        "table": markdown(table),
         "holm": dict(zip(table[""], holm(np.array(p)), strict=True)),
     }
 
@@ -154,7 +156,7 @@ def own_noise(found):
         count = counts.setdefault(rate, {"cases": 0, "higher": 0, "significant": 0})
         count["cases"] += 1
         count["higher"] += x.mean() > y.mean()
-        count["significant"] += x.mean() > y.mean() and p <= 0.05
+        count["significant"] += x.mean() > y.mean() and p <= LEVEL
     return counts
 
 
@@ -204,7 +206,7 @@ def shares_table(unseen, seen):
                     "p (exact)": f"{row['p']:.1g}",
                 }
             )
-    return markdown(pd.DataFrame(rows).to_dict("series"))
+    return markdown(rows)
 
 
 def by_noise(table):
@@ -213,6 +215,7 @@ def by_noise(table):
     return rows.set_index(rows["noise"].map(SHORT)).to_dict("index")
 
 
+@cache
 def tests():
     """Read the robustness.csv.gz of all runs: one row per run and condition."""
     found, unreadable = read_robustness(FOLDER, read_runs(FOLDER))
@@ -225,6 +228,7 @@ def numbers():
     """Compute all that the page says."""
     found = tests()
     unseen, seen = scores(found, is_unseen), scores(found, is_seen)
+    kept_unseen, kept_seen = kept(found, is_unseen), kept(found, is_seen)
     conditions = plain(pd.DataFrame(condition_rows(found)))
     results = [json.loads(path.read_text()) for path in FOLDER.glob("*/result.json")]
     return {
@@ -244,8 +248,8 @@ def numbers():
         "clean": clean_returns(found),
         "change": clean_changes(unseen),
         "own": own_noise(found),
-        "kept": kept(found, is_unseen),
-        "shares": shares_table(kept(found, is_unseen), kept(found, is_seen)),
+        "kept": kept_unseen,
+        "shares": shares_table(kept_unseen, kept_seen),
         "returns": {name: returns(rows) for name, rows in conditions.groupby("environment")},
     }
 
