@@ -395,7 +395,7 @@ environment they held the true IQM in at least
 {", ".join(f"{c} % (n = {n})" for n, c in COVERAGE.items())} of the cases where returns were
 normal, skewed or 20 % of them in a low peak, but in
 {", ".join(f"{c} % (n = {n})" for n, c in COVERAGE_OF_MIXTURES.items())} where 40 % were in a low
-and narrow peak, as PPO's on HalfCheetah may be. P(improvement):
+and narrow peak. P(improvement):
 probability that a noisy run beats a baseline run, averaged over environments, with Newcombe's
 interval. No interval for n < {MIN_SEEDS}. p: exact two-sided Mann-Whitney test, stratified by
 environment. It is the primary test: where an interval says otherwise, p decides. In a full grid the

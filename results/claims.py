@@ -19,15 +19,23 @@ HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
 from analyze import make_tables  # noqa: E402
 from analyze_compare import PAPER_CONFIGURATIONS, PAPER_SEEDS, read_paper, with_luck  # noqa: E402
-from analyze_luck import CONSISTENT_PERCENT, DRAWS, draw_improvements  # noqa: E402
+from analyze_luck import (  # noqa: E402
+    CONSISTENT_PERCENT,
+    DRAWS,
+    draw_improvements,
+    p_value,
+)
 from analyze_runs import KEYS, make_studies, read_runs  # noqa: E402
-from analyze_statistics import holm, improvement_percent, mann_whitney  # noqa: E402
+from analyze_statistics import contrast, holm, improvement_percent, mann_whitney, wins  # noqa: E402
+from analyze_verdict import power as finds  # noqa: E402
 
 FIXED_SEEDS = range(1, 11)
 FRESH_SEEDS = range(11, 31)
 ENDING = "RandomEarlyTermination(50)"
 TRUNCATING = "RandomEarlyTermination(50, truncate=True)"
+ENDING_ANYWHERE = "RandomEarlyTermination(1, 100)"
 MIXUP = "RandomMixupObservation(0.0, recursive=True)"
+PLAIN_MIXUP = "RandomMixupObservation(0.0)"
 SCALE = "RandomUniformScaleReward(0.5, 1.5)"
 NORMAL = "RandomNormalNoisyObservation(1.0)"
 FEW_SEEDS = range(1, 6)
@@ -37,7 +45,7 @@ ENVIRONMENTS = ["HalfCheetah", "Hopper", "Humanoid", "Pusher", "Walker2d"]
 WORSE = {
     NORMAL: ENVIRONMENTS,
     MIXUP: ENVIRONMENTS,
-    "RandomMixupObservation(0.0)": ["HalfCheetah", "Pusher", "Walker2d"],
+    PLAIN_MIXUP: ["HalfCheetah", "Pusher", "Walker2d"],
 }
 RATES = [0.01, 0.05, 0.1, 0.2, 0.5, 1.0]
 # The paper's 15 noises by what they perturb; its text calls early termination dynamics noise.
@@ -71,6 +79,8 @@ CLEANRL = {
 }
 CLEANRL_TD3 = {"Walker2d": (4057.59, 658.78)}  # v4, the same documentation at commit fe8d8a0
 CLEANRL_SEEDS = 3
+CHEETAH_SEEDS = range(11, 51)
+FAR_ABOVE = 3000  # of PPO on HalfCheetah; chosen after seeds 1 to 10 were seen
 
 
 # ------------------------------------------------------------------------------------------ reading
@@ -139,6 +149,15 @@ def standard_error(*samples):
     return np.sqrt(sum(x["std"] ** 2 / x["n"] for x in samples))
 
 
+def welch_interval(x, y):
+    """Return the 95 % interval of the difference of the samples' means, row by row."""
+    parts = np.array([z["std"] ** 2 / z["n"] for z in (x, y)])
+    df = parts.sum(axis=0) ** 2 / (parts**2 / [z["n"] - 1 for z in (x, y)]).sum(axis=0)
+    half = stats.t.ppf(0.975, df) * np.sqrt(parts.sum(axis=0))
+    difference = x["mean"] - y["mean"]
+    return difference - half, difference + half
+
+
 def welch(x, y):
     """Compare samples row by row: the difference in standard errors, and Welch's p."""
     y = y.loc[x.index]
@@ -147,13 +166,13 @@ def welch(x, y):
     return (x["mean"] - y["mean"]) / standard_error(x, y), p
 
 
-def power(effect, std, n, other_std, other_n):
-    """Probability that the exact Mann-Whitney test finds a shift of normal returns at 5 %."""
+def power(effect, std, n, other_std, other_n, level=0.05):
+    """Probability that the exact Mann-Whitney test finds a shift of normal returns."""
     rng, trials = np.random.default_rng(0), 2000
     x = rng.normal(effect, std, (trials, n))
     y = rng.normal(0, other_std, (trials, other_n))
     p = [mann_whitney(a[:, None], b[:, None])[0] for a, b in zip(x, y, strict=True)]
-    return np.mean(np.array(p) <= 0.05)
+    return np.mean(np.array(p) <= level)
 
 
 def power_of_levene(ratio, n):
@@ -217,6 +236,27 @@ def luck_of_the_best(paper):
     }
 
 
+def luck_with_the_winners_spread(paper):
+    """P(luck) of the paper's best noises if useless noises had the spread of the winner.
+
+    The baseline keeps its own. Both are known from few seeds, so each draw has its own.
+    """
+    rng, found = np.random.default_rng(0), []
+    for row in paper["best"].itertuples():
+        n = PAPER_SEEDS[row.algorithm]
+
+        def drawn_std(std, df=n - 1):
+            return std * np.sqrt(df / rng.chisquare(df, DRAWS) / (df + 1))  # of a mean of n
+
+        baseline = drawn_std(row.baseline_std) * rng.standard_normal(DRAWS)
+        noisy = rng.standard_normal((PAPER_CONFIGURATIONS, DRAWS)).max(axis=0)
+        noisy *= drawn_std(row.noisy_std)
+        p = p_value(100 * (noisy - baseline) / abs(row.baseline_mean), row.improvement_percent)
+        found.append((p, f"{row.algorithm} on {row.environment.split('-')[0]}"))
+    (p, name), (second, _) = sorted(found)[:2]
+    return {"p": p, "name": name, "second": second}
+
+
 def luck_of_the_consistent(luck):
     """How many rows the paper's tables of consistent noise have, and would have by luck."""
     columns = {"": luck["algorithm"]}
@@ -230,24 +270,22 @@ def luck_of_the_consistent(luck):
             f"{title}, rows beyond luck": luck[f"{name}_beyond_luck"],
         }
     by = luck.set_index("algorithm")
-    return {
-        "table": markdown(columns),
-        "by": by.to_dict("index"),
-        "beyond": by["consistent_beyond_luck"].sum(),
-    }
+    return {"table": markdown(columns), "by": by.to_dict("index")}
 
 
 def rates(paper):
-    """How often each noise rate is the best, consistent, or worse everywhere."""
-    columns, ones = {"noise rate": [f"{rate:g}" for rate in RATES]}, {}
+    """How often p = 1 is the best rate, consistent, or worse everywhere."""
+    found = {}
     for name in ("best", "consistent", "consistently_worse"):
-        found = paper[name]["noise_rate"].astype(float)
-        columns[f"{name.replace('_', ' ')} ({len(found)})"] = [(found == r).sum() for r in RATES]
-        count = int((found == 1).sum())
-        test = stats.binomtest(count, len(found), 1 / len(RATES))
-        ones[name] = {"count": count, "p": test.pvalue}
-    expected = len(paper["best"]) / len(RATES)
-    return {"table": markdown(columns), "one": ones, "expected": expected}
+        rows = paper[name]["noise_rate"].astype(float)
+        count = int((rows == 1).sum())
+        found[name] = {
+            "count": count,
+            "of": len(rows),
+            "expected": len(rows) / len(RATES),
+            "p": stats.binomtest(count, len(rows), 1 / len(RATES)).pvalue,
+        }
+    return found
 
 
 def kind(noise):
@@ -266,12 +304,16 @@ def kinds(paper):
     columns = {"": counts.index} | {
         f"{name} ({number} of the 15 noises)": counts[name] for name, number in KINDS.items()
     }
-    exact = stats.fisher_exact(counts.loc[["PPO", "TD3"], ["reward", "observation"]])
+    fisher = {}
+    for name in ("observation", "reward"):
+        rest = counts.drop(columns=name).sum(axis=1)
+        table = pd.DataFrame({name: counts[name], "rest": rest}).loc[["PPO", "TD3"]]
+        fisher[name] = stats.fisher_exact(table).pvalue
     return {
         "table": markdown(columns),
         "ppo": stats.binom.sf(counts.loc["PPO", "reward"] - 1, 5, KINDS["reward"] / 15),
         "td3": stats.binom.sf(counts.loc["TD3", "observation"] - 1, 5, KINDS["observation"] / 15),
-        "fisher": exact.pvalue,
+        "fisher": fisher,
     }
 
 
@@ -305,12 +347,14 @@ def scaled_rewards(paper):
 
 
 def worse_everywhere(paper):
-    """The noises that the paper finds worse in all environments, by their number of rates."""
+    """At how many of six rates the paper finds a noise worse in all environments."""
     table = paper["consistently_worse"]
-    counts = pd.crosstab(table["noise"], table["algorithm"])
-    names = [f"`{noise}`" for noise in counts.index]
-    text = markdown({"noise": names} | {name: counts[name] for name in counts})
-    return {"table": text, "counts": counts.T.to_dict()}
+    counts = table.groupby(["noise", "algorithm"]).size().sort_values(ascending=False)
+    return {
+        "at_every_rate": (counts == len(RATES)).sum(),
+        "next": counts[counts < len(RATES)].max(),
+        "of": counts.groupby("noise").sum().to_dict(),
+    }
 
 
 def mixture(paper):
@@ -322,7 +366,7 @@ def mixture(paper):
     rows = paper["consistently_worse"].query("noise == @MIXUP")
     rows = rows[rows["noise_rate"].astype(float) == 1].set_index("algorithm")
     result = {}
-    for algorithm in ("SAC", "TD3"):
+    for algorithm in PAPER_SEEDS:
         average = rows.loc[algorithm, "average_improvement_percent"]
         fifth = 5 * average + 400
         result[algorithm] = {
@@ -341,15 +385,18 @@ def paper_spread(paper):
     df = best["algorithm"].map(PAPER_SEEDS) - 1
     tail = stats.f.cdf(ratio**2, df, df)
     p = holm(2 * np.minimum(tail, 1 - tail))
-    lower = best[(ratio < 1) & (p <= 0.05)]
+    lower = best.assign(p=p)[(ratio < 1) & (p <= 0.05)].sort_values("p")
     return {
         "lower": (ratio < 1).sum(),
         "rows": len(best),
         "significant": (p <= 0.05).sum(),
         "names": ", ".join(
-            f"{a} on {e.split('-')[0]}"
-            for a, e in zip(lower["algorithm"], lower["environment"], strict=True)
+            f"{a} on {e.split('-')[0]} ({value:.2g})"
+            for a, e, value in zip(
+                lower["algorithm"], lower["environment"], lower["p"], strict=True
+            )
         ),
+        "next": p[p > 0.05].min(),
     }
 
 
@@ -407,7 +454,13 @@ def cleanrl_tables(base, older, paper_base):
     """PPO's training returns on v5 and v4 against CleanRL's, and CleanRL's against the paper."""
     training, older_training = sample(base, "training"), sample(older, "training")
     older_test = sample(older, "test")
-    errors = {title: welch(training, cleanrl(CLEANRL[title])) for title in CLEANRL}
+    apart = [
+        (p, f"{se:+.1f} on {environment} ({title.removeprefix('CleanRL, ')}, p = {p:.2g})")
+        for title in CLEANRL
+        for environment, se, p in zip(
+            training.index, *welch(training, cleanrl(CLEANRL[title])), strict=True
+        )
+    ]
     to_paper, p_to_paper = welch(cleanrl(CLEANRL["CleanRL, v2"]), paper_base)
     older_errors, older_p = welch(older_test, paper_base)
     v5 = {"": training.index, "ours, v5": spell(training)} | against_cleanrl(training)
@@ -417,15 +470,15 @@ def cleanrl_tables(base, older, paper_base):
         "test": spell(older_test),
         "from the paper's in SE": cells("{:+.1f} (p = {:.2g})", older_errors, older_p),
         "training": spell(older_training),
-    } | against_cleanrl(older_training)
+    }
     return {
         "v5": markdown(v5),
         "v4": markdown(v4),
         "v2_to_paper": pd.DataFrame({"se": to_paper, "p": p_to_paper}).to_dict("index"),
-        "newer": pd.DataFrame(
-            {"se": errors["CleanRL, v4, newer"][0], "p": errors["CleanRL, v4, newer"][1]}
-        ).to_dict("index"),
-        "largest": {title: se.abs().max() for title, (se, _) in errors.items()},
+        "v4_p": dict(zip(older_test.index, older_p, strict=True)),
+        "smallest_p": min(apart)[0],
+        "number": len(apart),
+        "clearest": ", ".join(text for _, text in sorted(apart)[:3]),
     }
 
 
@@ -447,7 +500,16 @@ def five_noises(base, noisy, paper_base, paper_noisy, percent, statistics):
     error = standard_error(x, y, paper_noisy, paper_base)
     noise = noisy.groupby("environment")[["noise", "noise_rate"]].first()
     tested = statistics.set_index("environment").loc[names]
-    found = [power(paper_gain[e], x["std"][e], x["n"][e], y["std"][e], y["n"][e]) for e in names]
+    low, high = welch_interval(x, y)
+    found, strict = (
+        [power(paper_gain[e], x["std"][e], x["n"][e], y["std"][e], y["n"][e], at) for e in names]
+        for at in (0.05, 0.05 / len(names))
+    )
+    rewarding = [e for e in names if kind(noise["noise"][e]) == "reward"]
+    with_reward_noise, without = (
+        runs.pivot(index="seed", columns="environment", values="test")[rewarding]
+        for runs in (noisy, base)
+    )
     text = markdown(
         {
             "": names,
@@ -465,8 +527,9 @@ def five_noises(base, noisy, paper_base, paper_noisy, percent, statistics):
             {
                 "": names,
                 "the paper's gain": cells("{:+,.1f}", paper_gain),
-                "ours": cells("{:+,.1f}", gain),
+                "ours [95 %]": cells("{:+,.1f} [{:,.1f}, {:,.1f}]", gain, low, high),
                 "power to find the paper's": cells("{:.2f}", found),
+                "at p = 0.01": cells("{:.2f}", strict),
                 "gains differ by SE": cells("{:+.1f}", (gain - paper_gain) / error),
             }
         ),
@@ -474,6 +537,16 @@ def five_noises(base, noisy, paper_base, paper_noisy, percent, statistics):
         "paper_percent": percent.to_dict(),
         "p": tested["p"].to_dict(),
         "holm": dict(zip(names, corrected, strict=True)),
+        "strict_power": dict(zip(names, strict, strict=True)),
+        "reward": {
+            "n": len(rewarding),
+            "higher": (gain[rewarding] > 0).sum(),
+            "won": sum(
+                wins(with_reward_noise[e].to_numpy(), without[e].to_numpy()) for e in rewarding
+            ),
+            "pairs": sum(x["n"][e] * y["n"][e] for e in rewarding),
+            "p": mann_whitney(with_reward_noise, without)[0],
+        },
     }
 
 
@@ -517,7 +590,7 @@ def speed(summary):
 def compare_rows(name, x, y):
     """Compare samples x and y of test returns: a row of a table, and its numbers.
 
-    They are the exact p, the difference of the means in percent, and the lower end of its interval.
+    They are the exact p, and the difference of the means, in percent and with its interval.
     """
     p, _ = mann_whitney(np.array(x)[:, None], np.array(y)[:, None])
     mean, other = np.mean(x), np.mean(y)
@@ -532,7 +605,8 @@ def compare_rows(name, x, y):
         "of the second": f"{percent:+.1f} %",
         "p": f"{p:.2g}",
     }
-    return row, {"p": p, "percent": percent, "low": interval.low}
+    numbers = {"p": p, "percent": percent, "difference": mean - other}
+    return row, numbers | {"low": interval.low, "high": interval.high}
 
 
 def uncorrected(rows):
@@ -576,59 +650,73 @@ def pusher(runs):
     }
 
 
-def half_cheetah(runs, paper_percent):
-    """How many runs of PPO on HalfCheetah end near 4,000, and what luck that makes.
+def other_step(searched, runs):
+    """Compare PPO on Pusher when episodes end at a random step with their end at step 50.
 
-    `luck`: in how many percent of the ways to take two sets of ten runs without noise the first is
-    better by the paper's improvement, or more.
+    searched: the runs of choice/; runs: those of runs/. Both ways with the same seeds.
+    """
+    anywhere = searched.query("noise == @ENDING_ANYWHERE").set_index("seed")["test"]
+    ending = runs.query("environment == 'Pusher' and noise == @ENDING and noise_rate == '1.00'")
+    ending = ending.set_index("seed")["test"].loc[anywhere.index]
+    return compare_rows("", anywhere, ending)[1] | {"n": len(anywhere)}
+
+
+def half_cheetah(runs, paper_percent):
+    """PPO on HalfCheetah: how many runs end far above the rest, and what luck that makes.
+
+    `luck`: in how many percent of the ways to take two sets of ten of all runs without noise the
+    first is better by the paper's improvement, or more. It is there with the fresh seeds.
     """
     runs = runs.query("environment == 'HalfCheetah'")
     noisy = runs[runs["noise"].str.startswith("RandomUniformNoisyReward")]["test"]
-    base = runs[runs["noise"] == ""]["test"]
-    high, noisy_high = (base > 3000).sum(), (noisy > 3000).sum()
-    low, upper = stats.binomtest(int(high), len(base)).proportion_ci(method="exact")
-    table = [[high, len(base) - high], [noisy_high, len(noisy) - noisy_high]]
-    luck = {}
-    if len(base) >= 20:
+    base = runs[runs["noise"] == ""].set_index("seed")["test"]
+    fixed, fresh = (base[base.index.isin(list(seeds))] for seeds in (FIXED_SEEDS, CHEETAH_SEEDS))
+    low = fixed[fixed <= FAR_ABOVE]
+    rest = pd.concat([low, noisy])
+    found = {
+        "fixed": far_above(fixed),
+        "tops": sorted(fixed[fixed > FAR_ABOVE]),
+        "rest": [rest.min(), rest.max()],
+        "percent_of_rest": improvement_percent(noisy.mean(), low.mean()),
+    }
+    if len(fresh) == len(CHEETAH_SEEDS):
         rng = np.random.default_rng(0)
         draws = rng.permuted(np.tile(base, (DRAWS, 1)), axis=1)
         first, second = draws[:, :10].mean(axis=1), draws[:, 10:20].mean(axis=1)
-        luck = {"luck": 100 * (100 * (first - second) / second >= paper_percent).mean()}
-    return luck | {
-        "high": high,
-        "n": len(base),
-        "noisy_high": noisy_high,
-        "noisy_n": len(noisy),
-        "percent": [100 * low, 100 * upper],
-        "fisher": stats.fisher_exact(table).pvalue,
-        "rest": [base[base <= 3000].min(), base[base <= 3000].max()],
-        "tops": sorted(base[base > 3000], reverse=True),
-        "noisy": [noisy.min(), noisy.max()],
-    }
+        better = improvement_percent(first, second) >= paper_percent
+        between = (fresh > rest.max()) & (fresh < fixed[fixed > FAR_ABOVE].min())
+        found |= {"fresh": far_above(fresh), "between": between.sum(), "n": len(base)}
+        found |= {"luck": 100 * better.mean()}
+    return found
+
+
+def far_above(returns):
+    """How many of the returns are above FAR_ABOVE, with the exact interval of their share."""
+    count = int((returns > FAR_ABOVE).sum())
+    low, high = stats.binomtest(count, len(returns)).proportion_ci(method="exact")
+    return {"count": count, "of": len(returns), "low": 100 * low, "high": 100 * high}
 
 
 def worse_noises(runs, paper):
-    """PPO with noises that the paper finds worse everywhere, against all our runs without noise.
+    """PPO with noises that the paper finds worse everywhere, against runs without noise.
 
-    A noise is there once seeds 1 to 5 of all its environments are.
+    With noise there are FEW_SEEDS, without FIXED_SEEDS: as many in each environment, so that each
+    has the same weight in the test. A noise is there once all its runs are.
     """
     theirs = paper["consistently_worse"].query("algorithm == 'PPO' and noise_rate == '1.00'")
     theirs = theirs.set_index("noise")
+    base = by_environment(runs[runs["noise"] == ""], FIXED_SEEDS)
     rows, found = [], {}
     for noise, environments in WORSE.items():
-        chosen = runs.query("noise == @noise and noise_rate == '1.00' and seed in @FEW_SEEDS")
-        noisy, base = (
-            some.pivot(index="seed", columns="environment", values="test").reindex(
-                columns=environments
-            )
-            for some in (chosen, runs[runs["noise"] == ""])
-        )
+        noisy = by_environment(runs.query("noise == @noise and noise_rate == '1.00'"), FEW_SEEDS)
         if noisy.count().sum() < len(FEW_SEEDS) * len(environments):
             continue
-        change = improvement_percent(noisy.mean(), base.mean())
-        p, _ = mann_whitney(noisy, base)
+        noisy, without = noisy[environments], base[environments]
+        change = improvement_percent(noisy.mean(), without.mean())
+        p, _ = mann_whitney(noisy, without)
         found[noise] = {"change": change.to_dict(), "average": change.mean(), "p": p}
-        found[noise] |= {"worse": (change < 0).sum(), "of": len(change)}
+        found[noise]["lowest"] = list(change.index[noisy.max() < without.min()])
+        found[noise]["finds"] = {e: finds(noisy[e], without[e], 0)[0] for e in environments}
         row = {"noise": f"`{noise}`"} | {name: "\u2013" for name in ENVIRONMENTS}
         row |= {name: f"{value:+.0f} %" for name, value in change.items()}
         row["average"] = f"{change.mean():+.0f} ± {change.std(ddof=1):.0f} %"
@@ -636,8 +724,43 @@ def worse_noises(runs, paper):
         if noise in theirs.index:
             row["the paper"] = spell_average(theirs.loc[noise])
             found[noise]["paper"] = theirs.loc[noise, "average_improvement_percent"]
-        rows.append(row | {"p": p})
+        rows.append(row | {"p (exact)": f"{p:.2g}"})
+    if {MIXUP, PLAIN_MIXUP} <= found.keys():
+        found["mixtures"] = mixtures(runs)
     return {"table": markdown(rows) if rows else "", **found}
+
+
+def mixtures(runs):
+    """PPO with the two kinds of mixup, in the environments that both were run in.
+
+    Averages over environments of the change in percent of the mean without noise, which is taken as
+    known, and the difference of the two with its interval (Welch, Satterthwaite).
+    """
+    environments = WORSE[PLAIN_MIXUP]
+    base = by_environment(runs[runs["noise"] == ""], FIXED_SEEDS)[environments].mean()
+    noisy = (
+        by_environment(runs.query("noise == @noise and noise_rate == '1.00'"), FEW_SEEDS)
+        for noise in (MIXUP, PLAIN_MIXUP)
+    )
+    recursive, plain = (improvement_percent(returns[environments], base) for returns in noisy)
+    samples = [table[name].to_numpy() for table in (recursive, plain) for name in environments]
+    weight = 1 / len(environments)
+    difference, _, low, high = contrast(samples, 3 * [weight] + 3 * [-weight])
+    return {
+        "recursive": recursive.mean().mean(),
+        "plain": plain.mean().mean(),
+        "difference": difference,
+        "low": low,
+        "high": high,
+    }
+
+
+def by_environment(runs, seeds):
+    """Return the test returns of these seeds: a row per seed, a column per environment."""
+    chosen = runs[runs["seed"].isin(list(seeds))]
+    return chosen.pivot(index="seed", columns="environment", values="test").reindex(
+        columns=ENVIRONMENTS
+    )
 
 
 # ----------------------------------------------------------------------------------------- TD3, all
@@ -646,10 +769,11 @@ def worse_noises(runs, paper):
 def td3(runs, paper):
     """TD3 on HalfCheetah with a noise that the paper finds worse everywhere at every rate.
 
-    A rate is there once its seeds 1 to 5 are.
+    A rate is there once its FEW_SEEDS are.
     """
     theirs = paper["consistently_worse"].query("algorithm == 'TD3' and noise == @NORMAL")
     theirs = theirs.set_index("noise_rate")
+    runs = runs.query("environment == 'HalfCheetah' and seed in @FEW_SEEDS")
     base = runs[runs["noise"] == ""]["test"]
     rows, found = [], {}
     for rate in ("0.01", "1.00"):
@@ -657,8 +781,12 @@ def td3(runs, paper):
         if len(noisy) < len(FEW_SEEDS):
             continue
         row, found[rate] = compare_rows(f"p = {float(rate):g}", noisy, base)
-        rows.append(row | {"the paper, five environments": spell_average(theirs.loc[rate])})
-    return {"table": uncorrected(rows) if rows else "", **found}
+        found[rate]["finds"] = finds(noisy, base, 0)[0]
+        row["80 % power at"] = f"{found[rate]['finds']:.0f} %"
+        rows.append(row | {"the paper": spell_average(theirs.loc[rate])})
+    names = {"first": "with noise", "second": "without", "of the second": "change"}
+    names["p"] = "p (exact)"
+    return {"table": markdown(pd.DataFrame(rows).rename(columns=names)) if rows else "", **found}
 
 
 def long_td3(folder, paper):
@@ -666,7 +794,8 @@ def long_td3(folder, paper):
 
     Nothing is there before three seeds are.
     """
-    runs = read_returns(folder) if folder.exists() else []
+    runs = read_returns(folder) if folder.exists() else pd.DataFrame(columns=["environment"])
+    runs = runs.query("environment == 'Walker2d'")
     if len(runs) < CLEANRL_SEEDS:
         return {"table": ""}
     theirs = plain(paper["best"]).query("algorithm == 'TD3'").set_index("environment")
@@ -677,9 +806,12 @@ def long_td3(folder, paper):
     others["CleanRL, v4, training"] = (training, cleanrl(CLEANRL_TD3))
     rows = []
     for name, (ours, other) in others.items():
-        errors, p = welch(ours, other)
-        rows.append([name, *spell(ours), *spell(other), f"{errors.iloc[0]:+.1f} (p = {p[0]:.2g})"])
-    columns = ["", "ours, v5", "theirs", "difference in SE"]
+        _, p = welch(ours, other)
+        low, high = (limit.iloc[0] for limit in welch_interval(ours, other))
+        difference = ours["mean"].iloc[0] - other["mean"].iloc[0]
+        interval = f"{difference:+,.0f} [{low:,.0f}, {high:,.0f}]"
+        rows.append([name, *spell(ours), *spell(other), interval, f"{p[0]:.2g}"])
+    columns = ["", "ours, v5", "theirs", "difference [95 %]", "p (Welch)"]
     return {"table": markdown(pd.DataFrame(rows, columns=columns))}
 
 
@@ -706,7 +838,11 @@ def sac(early, statistics):
             "difference from the paper in SE": cells("{:+.1f} (p = {:.2g})", errors, p),
         }
     )
-    return {"table": text, "p": noisy["p"].to_dict(), "finds": noisy["detectable_percent"].min()}
+    return {
+        "table": text,
+        "p": noisy["p"].to_dict(),
+        "finds": noisy["detectable_percent"].to_dict(),
+    }
 
 
 def noise_rates(folder):
@@ -720,6 +856,12 @@ def noise_rates(folder):
             if deviation:
                 largest = max(largest, abs(applied - calls * rate) / deviation)
     return largest
+
+
+def commits(names):
+    """Count the commits that the runs of these names are from."""
+    configs = [json.loads((HERE / "runs" / name / "config.json").read_text()) for name in names]
+    return len({config["git_commit"] for config in configs})
 
 
 def reward_scale():
@@ -747,9 +889,9 @@ def numbers():
     chosen = list(zip(best.index, best["noise"], best["noise_rate"], strict=True))
     of_five = fixed_beforehand(ppo, chosen)
     base, noisy = of_five[of_five["noise"] == ""], of_five[of_five["noise"] != ""]
-    five = runs[runs["algorithm"] == "PPO"]
-    five = five.loc[fixed_beforehand(plain(five), chosen).index]
-    five = make_tables(make_studies(five)[0])
+    five_runs = runs[runs["algorithm"] == "PPO"]
+    five_runs = five_runs.loc[fixed_beforehand(plain(five_runs), chosen).index]
+    five = make_tables(make_studies(five_runs)[0])
     five_statistics, five_summary = (plain(five[n][0]) for n in ("statistics", "summary_PPO"))
     five_statistics = five_statistics[five_statistics["p"].notna()]
     shares = variance_share(base), variance_share(noisy)
@@ -759,12 +901,11 @@ def numbers():
         "draws": f"{DRAWS:,}",
         "scaled_reward": SCALE,
         "normal": NORMAL,
-        "normal_finds": statistics.query(
-            "algorithm == 'PPO' and environment == 'Pusher' and noise == @NORMAL"
-        )["detectable_percent"].item(),
+        "plain_mixup": PLAIN_MIXUP,
         "noisy_share": shares[1],
         "highest_share": max(share.drop("Humanoid").max() for share in shares),
-        "luck": luck_of_the_best(paper),
+        "luck": luck_of_the_best(paper) | {"winners": luck_with_the_winners_spread(paper)},
+        "smallest_consistent": paper["consistent"]["p_luck"].min(),
         "consistent": luck_of_the_consistent(luck),
         "rates": rates(paper),
         "kinds": kinds(paper),
@@ -780,13 +921,14 @@ def numbers():
         ),
         "spread": spread(base, noisy, paper_base, paper_noisy),
         "speed": speed(five_summary),
-        "pusher": pusher(ppo),
+        "pusher": pusher(ppo) | {"step": other_step(read_returns(HERE / "choice"), ppo)},
         "half_cheetah": half_cheetah(ppo, best["improvement_percent"]["HalfCheetah"]),
         "worse_noises": worse_noises(ppo, paper),
         "td3": td3(returns.query("algorithm == 'TD3'"), paper),
         "long_td3": long_td3(HERE / "long", paper),
         "sac": sac(early, statistics),
         "rate_error": noise_rates(HERE / "runs"),
+        "commits": commits(five_runs["run"]),
         "scale": reward_scale(),
     }
 

@@ -52,6 +52,13 @@ def comparisons(cases):
     return {"table": markdown(table), "holm": list(corrected)}
 
 
+def against_all(x, runs, config):
+    """Compare x with the runs of a (noise, noise_rate) of all seeds, not of those of x alone."""
+    noise, noise_rate = config
+    y = runs[(runs["noise"] == noise) & (runs["noise_rate"] == noise_rate)]["test"]
+    return compare_rows("", x, y)[1] | {"n": len(y)}
+
+
 # ------------------------------------------------------------------------------- a noise is chosen
 
 
@@ -113,7 +120,11 @@ def falling(runs):
         "falling, no noise": (falls, nothing),
     }
     finds, _ = power(falls, always, 0)
-    return comparisons(pairs) | {"finds": finds, "cost": core_hours("schedules/*1.0to0.0__*")}
+    return comparisons(pairs) | {
+        "finds": finds,
+        "all": against_all(falls, runs, ALWAYS),
+        "cost": core_hours("schedules/*1.0to0.0__*"),
+    }
 
 
 def together(runs):
@@ -133,6 +144,7 @@ def together(runs):
         "low": low,
         "high": high,
         "detectable": DETECTABLE * error,
+        "all": against_all(both, runs, NOTHING),
         "cost": core_hours("schedules/*NoisyObservation_0.001*"),
     }
 

@@ -13,7 +13,7 @@ from functools import cache
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
-from claims import HERE, compare_rows, markdown, plain, render
+from claims import FAR_ABOVE, HERE, compare_rows, markdown, plain, read_returns, render
 
 from analyze_robustness import (
     CONDITION,
@@ -25,7 +25,6 @@ from analyze_robustness import (
 )
 from analyze_runs import read_runs
 from analyze_statistics import contrast, holm, mann_whitney
-from analyze_verdict import LEVEL
 
 FOLDER = HERE / "robustness"
 SHORT = {
@@ -145,19 +144,36 @@ def returns(conditions):
 def own_noise(found):
     """Compare policies with those trained without noise under the noise of their own training.
 
-    For each rate in the test: in how many cases (noise and environment) the mean return is higher,
-    and in how many of these with an exact p, uncorrected, of at most 0.05.
+    One rate in the test at a time: {noise: {rate: {...}}} with the difference of the scores,
+    averaged over environments, and the exact p, stratified by environment.
     """
-    counts = {}
-    own = found[found["test_noise"].isin(set(found["noise"]))]
-    for (noise, rate, _), group in own.groupby(["test_noise", "test_rate", "environment"]):
-        x, y = (group.loc[group["noise"] == name, "mean"].to_numpy() for name in (noise, ""))
-        p, _ = mann_whitney(x[:, None], y[:, None])
-        count = counts.setdefault(rate, {"cases": 0, "higher": 0, "significant": 0})
-        count["cases"] += 1
-        count["higher"] += x.mean() > y.mean()
-        count["significant"] += x.mean() > y.mean() and p <= LEVEL
-    return counts
+    without = found[found["noise"] == ""]
+    clean = without[without["test_noise"] == ""].groupby("environment")["mean"].mean()
+    result = {}
+    tested = found[(found["test_noise"] != "") & found["test_noise"].isin(set(found["noise"]))]
+    for (noise, rate), group in tested.groupby(["test_noise", "test_rate"]):
+        x, y = (
+            group[group["noise"] == name].pivot(index="seed", columns="environment", values="mean")
+            for name in (noise, "")
+        )
+        difference = (100 * (x.mean() - y.mean()) / clean.abs()).mean()
+        numbers = {"difference": difference, "p": mann_whitney(x, y)[0]}
+        result.setdefault(SHORT[noise], {})[rate] = numbers
+    return result
+
+
+def own_noise_table(own):
+    """Spell own_noise(): a row for each noise, a column for each rate in the test."""
+    return markdown(
+        [
+            {"trained and tested with": noise}
+            | {
+                f"p = {float(rate):g}": f"{row['difference']:+.0f} ({row['p']:.2g})"
+                for rate, row in rates.items()
+            }
+            for noise, rates in own.items()
+        ]
+    )
 
 
 def kept(found, counts):
@@ -229,6 +245,9 @@ def numbers():
     found = tests()
     unseen, seen = scores(found, is_unseen), scores(found, is_seen)
     kept_unseen, kept_seen = kept(found, is_unseen), kept(found, is_seen)
+    own = own_noise(found)
+    final = plain(read_returns(FOLDER))
+    cheetah = final.query("environment == 'HalfCheetah' and noise == ''")["test"]
     conditions = plain(pd.DataFrame(condition_rows(found)))
     results = [json.loads(path.read_text()) for path in FOLDER.glob("*/result.json")]
     return {
@@ -243,11 +262,14 @@ def numbers():
         "seen": {
             "table": answers(seen),
             "environments": by_environment(seen),
+            "rates": own_noise_table(own),
             **by_noise(seen),
         },
         "clean": clean_returns(found),
         "change": clean_changes(unseen),
-        "own": own_noise(found),
+        "own": own,
+        "far_above": int((cheetah > FAR_ABOVE).sum()),
+        "cheetah_runs": len(cheetah),
         "kept": kept_unseen,
         "shares": shares_table(kept_unseen, kept_seen),
         "returns": {name: returns(rows) for name, rows in conditions.groupby("environment")},

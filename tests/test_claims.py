@@ -1,5 +1,6 @@
 """The page of results: its numbers are those of claims.py, and claims.py's are right."""
 
+import json
 import sys
 from pathlib import Path
 
@@ -184,7 +185,7 @@ def test_worse_noises_by_hand():
     found = claims.worse_noises(runs, paper)
     assert set(found) == {"table", plain_mixup}
     assert found[plain_mixup]["average"] == pytest.approx(-50 / 3, abs=1e-3)
-    assert found[plain_mixup]["worse"] == 2
+    assert found[plain_mixup]["lowest"] == ["HalfCheetah", "Pusher"]
     # U is 0 + 0 + 50 of 150: the null is the sum of three independent Mann-Whitney statistics
     draws = np.random.default_rng(0).permuted(np.tile(np.arange(15), (3 * 40_000, 1)), axis=1)
     u = (draws[:, :5, None] > draws[:, None, 5:]).sum(axis=(1, 2)).reshape(3, -1).sum(axis=0)
@@ -194,15 +195,38 @@ def test_worse_noises_by_hand():
     assert claims.worse_noises(runs[runs["seed"] < 5], paper) == {"table": ""}
 
 
+def test_the_two_mixtures_by_hand():
+    """-50, -20 and +20 % with a memory, 10 points less without; all weigh alike."""
+    rows = [
+        ("PPO", name, noise, rate, seed, 10.0 + gain + spread * (seed - 3))
+        for name, change in (("HalfCheetah", -5.0), ("Pusher", -2.0), ("Walker2d", 2.0))
+        for noise, rate, seeds, gain, spread in (
+            ("", "0.00", range(1, 31), 0.0, 0.0),
+            (claims.MIXUP, "1.00", range(1, 6), change, 0.1),
+            (claims.PLAIN_MIXUP, "1.00", range(1, 6), change - 1, 0.2),
+        )
+        for seed in seeds
+    ]
+    found = claims.mixtures(pd.DataFrame(rows, columns=list(make_runs([]).columns)))
+    assert found["recursive"] == pytest.approx(-50 / 3)
+    assert found["plain"] == pytest.approx(-80 / 3) and found["difference"] == pytest.approx(10)
+    error = np.sqrt(3 * (1 + 4) * 2.5 / 5) / 3  # in percent: the variance of 1 ... 5 is 2.5
+    df = 15**2 / (3 * (1 + 16) / 4)
+    half = stats.t.ppf(0.975, df) * error
+    assert found["low"] == pytest.approx(10 - half) and found["high"] == pytest.approx(10 + half)
+
+
 def test_td3_with_noise_is_shown_once_five_seeds_are_there():
     paper = claims.read_paper(RESULTS / "paper")
-    names = ["noise", "noise_rate", "seed", "test"]
-    rows = [("", "0.00", seed, 100.0 + seed) for seed in range(5)]
-    rows += [(claims.NORMAL, "1.00", seed, 50.0 + seed) for seed in range(5)]
-    rows += [(claims.NORMAL, "0.01", seed, 50.0 + seed) for seed in range(4)]
+    names = ["environment", "noise", "noise_rate", "seed", "test"]
+    here, other = "HalfCheetah", "Hopper"
+    rows = [(here, "", "0.00", seed, 100.0 + seed) for seed in range(1, 7)]
+    rows += [(here, claims.NORMAL, "1.00", seed, 50.0 + seed) for seed in range(1, 6)]
+    rows += [(here, claims.NORMAL, "0.01", seed, 50.0 + seed) for seed in range(1, 5)]
+    rows += [(other, claims.NORMAL, "0.01", seed, 50.0 + seed) for seed in range(1, 6)]
     found = claims.td3(pd.DataFrame(rows, columns=names), paper)
     assert set(found) == {"table", "1.00"} and "-92 ± 7 %" in found["table"]
-    assert found["1.00"]["percent"] == pytest.approx(100 * -50 / 102)
+    assert found["1.00"]["percent"] == pytest.approx(100 * -50 / 103)
     assert found["1.00"]["p"] == pytest.approx(2 / 252)
 
 
@@ -212,26 +236,63 @@ def test_td3_at_full_length_is_compared_with_its_papers(monkeypatch):
     returns = {"environment": "Walker2d", "test": [3900.0, 4000, 4100], "training": [3, 4, 5.0]}
     monkeypatch.setattr(claims, "read_returns", lambda _: pd.DataFrame(returns))
     rows = claims.long_td3(RESULTS, paper)["table"].splitlines()[2:]
-    error = np.sqrt(100**2 / 3 + 415.4**2 / 5)
-    assert f"4,000 ± 100 | 4,016 ± 415 | {(4000 - 4015.6) / error:+.1f} (p" in rows[0]
+    ours = {"mean": 4000, "std": 100, "n": 3}
+    theirs = {"mean": 4015.6, "std": 415.4, "n": 5}
+    samples = [pd.DataFrame(x, index=[0]) for x in (ours, theirs)]
+    low, high = (limit[0] for limit in claims.welch_interval(*samples))
+    assert f"4,000 ± 100 | 4,016 ± 415 | -16 [{low:,.0f}, {high:,.0f}]" in rows[0]
     assert f"| 4.0 ± 1.0   | 4,058 ± {658.78 * np.sqrt(1.5):.0f} |" in rows[1]
 
 
-def test_the_luck_of_two_kinds_of_runs():
-    """Of 20 runs one is high: it is in the first ten or in the second."""
-    returns = [*np.arange(19) / 1e6 + 1000, 5000]
-    runs = pd.DataFrame({"environment": "HalfCheetah", "noise": "", "test": returns})
-    noisy = pd.DataFrame(
-        {
-            "environment": "HalfCheetah",
-            "noise": "RandomUniformNoisyReward(-0.001, 0.001)",
-            "test": [1.0],
-        }
+def test_runs_that_end_far_above_the_rest_by_hand():
+    """Of 50 runs one ends at 5,000: it is in the first ten of 20 that are drawn, or is not."""
+    runs = make_runs([("", range(1, 51), 0), ("RandomUniformNoisyReward(1)", range(1, 11), 0)])
+    runs["environment"], runs["test"] = "HalfCheetah", 1000 - runs["seed"] / 1e6
+    runs.loc[(runs["noise"] == "") & (runs["seed"] == 3), "test"] = 5000
+    found = claims.half_cheetah(runs, 30)
+    assert found["fixed"]["count"] == 1 and found["tops"] == [5000]
+    assert found["fixed"]["high"] == pytest.approx(44.5, abs=0.1)  # 1 of 10, Clopper and Pearson
+    assert found["percent_of_rest"] == pytest.approx(0, abs=1e-3)
+    assert found["fresh"]["count"] == found["between"] == 0
+    assert found["fresh"]["high"] == pytest.approx(100 * (1 - 0.025 ** (1 / 40)))
+    assert found["luck"] == pytest.approx(100 * 10 / 50, abs=1.5)
+    assert claims.half_cheetah(runs, 41)["luck"] == 0
+    assert "luck" not in claims.half_cheetah(runs[runs["seed"] != 50], 30)
+
+
+def test_the_interval_of_a_difference_is_scipys():
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(5, 1, 7), rng.normal(3, 2, 4)
+    samples = [
+        pd.DataFrame({"mean": [a.mean()], "std": [a.std(ddof=1)], "n": [len(a)]}) for a in (x, y)
+    ]
+    low, high = claims.welch_interval(*samples)
+    expected = stats.ttest_ind(x, y, equal_var=False).confidence_interval(0.95)
+    assert (low[0], high[0]) == pytest.approx((expected.low, expected.high))
+
+
+def test_noise_and_baseline_of_a_seed_share_their_commit():
+    """So that no change of the code can be taken for an effect, in the comparisons fixed before."""
+    runs = claims.read_runs(RESULTS / "runs").query("algorithm == 'PPO' and seed <= 10")
+    late = runs["noise"].isin([claims.NORMAL, claims.TRUNCATING, claims.MIXUP, claims.PLAIN_MIXUP])
+    runs = runs[~late].assign(
+        commit=[
+            json.loads((RESULTS / "runs" / run / "config.json").read_text())["git_commit"]
+            for run in runs.loc[~late, "run"]
+        ]
     )
-    found = claims.half_cheetah(pd.concat([runs, noisy]), 30)
-    assert found["luck"] == pytest.approx(50, abs=2)
-    assert claims.half_cheetah(pd.concat([runs, noisy]), 41)["luck"] == 0
-    assert "luck" not in claims.half_cheetah(pd.concat([runs[1:], noisy]), 30)
+    commits = runs.groupby(["environment", "seed"])["commit"]
+    assert len(commits) == 50 and (commits.size() == 2).all() and (commits.nunique() == 1).all()
+
+
+def test_the_luck_of_the_winners_spread():
+    """The best of useless noises with ten times the spread is easily as good as the paper's."""
+    paper = claims.read_paper(RESULTS / "paper")
+    alike = paper["best"].assign(noisy_std=paper["best"]["baseline_std"])
+    p = claims.with_luck(paper)[0]["best"]["p_luck"].min()
+    assert claims.luck_with_the_winners_spread({"best": alike})["p"] == pytest.approx(p, abs=0.03)
+    wide = paper["best"].assign(noisy_std=10 * paper["best"]["baseline_std"])
+    assert claims.luck_with_the_winners_spread({"best": wide})["p"] > 0.9
 
 
 # ---------------------------------------------------------------------- what the paper's tables say
@@ -239,7 +300,7 @@ def test_the_luck_of_two_kinds_of_runs():
 
 def test_what_the_papers_tables_say_by_hand():
     paper = claims.read_paper(RESULTS / "paper")
-    found = claims.rates(paper)["one"]
+    found = claims.rates(paper)
     assert [found[name]["count"] for name in found] == [6, 3, 14]
     assert found["best"]["p"] == pytest.approx(stats.binomtest(6, 15, 1 / 6).pvalue)
     found = claims.mixture(paper)["TD3"]
@@ -247,12 +308,11 @@ def test_what_the_papers_tables_say_by_hand():
     assert found["std_then"] == pytest.approx((found["fifth"] + 100) / -np.sqrt(5))
     assert found["std_then"] == pytest.approx(found["std"], rel=0.01)
     kinds = claims.kinds(paper)
-    assert "| PPO | 0" in kinds["table"] and kinds["fisher"] == pytest.approx(1 / 126)
-    assert claims.worse_everywhere(paper)["counts"]["RandomNormalNoisyObservation(1.0)"] == {
-        "PPO": 3,
-        "SAC": 5,
-        "TD3": 6,
-    }
+    assert "| PPO | 0" in kinds["table"]
+    assert kinds["fisher"] == pytest.approx({"observation": 2 / 252, "reward": 12 / 252})
+    worse = claims.worse_everywhere(paper)
+    assert worse["of"]["RandomNormalNoisyObservation(1.0)"] == 3 + 5 + 6
+    assert (worse["at_every_rate"], worse["next"]) == (1, 5)
 
 
 def test_a_noise_in_all_three_algorithms_by_luck():
