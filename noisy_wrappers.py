@@ -715,7 +715,8 @@ def signatures() -> list[str]:
     found = []
     for name, wrapper in WRAPPERS.items():
         parameters = [p.replace(annotation=p.empty) for p in _parameters(wrapper)]
-        found.append(f"{name}{inspect.Signature(parameters)}")
+        text = f"{name}{inspect.Signature(parameters)}"
+        found.append(text.replace("low=None, high=None", "low, high=low"))  # early termination
     return found
 
 
@@ -772,9 +773,9 @@ def _bad_noise(text: str, reason: str) -> ValueError:
 def _pair(noises: Sequence[str], rates: Sequence[float | str]) -> list[tuple[Noise, float | str]]:
     """Parse noises with their rates: without those of rate 0, dynamics noise first."""
     if noises and not rates:
-        raise ValueError("--noise needs --noise-rate: one rate for all noises, or one for each")
+        raise ValueError("noise without a noise rate: give one for all noises, or one for each")
     if rates and not noises:
-        raise ValueError("--noise-rate needs --noise: name a noise, or leave the rate out")
+        raise ValueError("a noise rate without noise: name a noise, or leave the rate out")
     if len(rates) not in (1, len(noises)):
         raise ValueError(
             f"give one noise rate for all noises or one for each: there are {len(noises)} noises "

@@ -843,18 +843,42 @@ def test_another_precision_is_said_and_recorded(algorithm, tmp_path, monkeypatch
         use = functools.partial(lambda effective, *_: effective, precision)
         monkeypatch.setattr(script(algorithm), "use_matmul_precision", use)
         train(algorithm, words, episodes)
-        said.append("highest precision; the run used medium so far" in capsys.readouterr().out)
+        told = "matmul_precision is highest now; this run had medium so far\n"
+        said.append(told in capsys.readouterr().out)
     assert said == [False, True, False]
     assert_finished(folder(tmp_path))
     monkeypatch.setattr(script(algorithm), "use_matmul_precision", lambda *_: "high")
     train(algorithm, words)  # finished: it does not multiply any more
-    assert "multiplies" not in capsys.readouterr().out
+    assert "now" not in capsys.readouterr().out
     config = json.loads((folder(tmp_path) / "config.json").read_text())
     assert config["matmul_precision"] == "medium, highest"
     del config["matmul_precision"]
     (folder(tmp_path) / "config.json").write_text(json.dumps(config))
     train(algorithm, words)
     assert "is finished" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_other_code_and_versions_are_said_and_recorded(
+    algorithm, tmp_path, tmp_path_factory, monkeypatch, capsys
+):
+    words = options(algorithm, tmp_path)
+    train(algorithm, words, EARLY)
+    config = json.loads((folder(tmp_path) / "config.json").read_text())
+    capsys.readouterr()
+    monkeypatch.setattr(script(algorithm).gym, "__version__", "99.0")
+    git = tmp_path_factory.mktemp("bin") / "git"
+    git.write_text("#!/bin/sh\necho another-commit\n")
+    git.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{git.parent}:{os.environ['PATH']}")
+    train(algorithm, words)
+    commit, version = config["git_commit"], config["versions"]["gymnasium"]
+    told = capsys.readouterr().out
+    assert f"gymnasium is 99.0 now; this run had {version} so far\n" in told
+    assert f"git_commit is another-commit now; this run had {commit} so far\n" in told
+    config["git_commit"] = f"{commit}, another-commit"
+    config["versions"]["gymnasium"] = f"{version}, 99.0"
+    assert json.loads((folder(tmp_path) / "config.json").read_text()) == config
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)

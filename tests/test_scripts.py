@@ -20,6 +20,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import ppo_continuous_noisy as ppo
 import sac_continuous_noisy as sac
@@ -623,8 +624,8 @@ BAD = [  # arguments, what the message names, of which scripts
     ({"noise": NOISES, "noise_rate": (-0.1,)}, "-0.1", SCRIPTS),
     ({"noise": NOISES, "noise_rate": (math.nan,)}, "nan", SCRIPTS),
     ({"noise": NOISES, "noise_rate": (0.1, 0.2, 0.3)}, "3 noise rates", SCRIPTS),
-    ({"noise": NOISES}, "--noise needs --noise-rate", SCRIPTS),
-    ({"noise_rate": (0.1,)}, "--noise-rate needs --noise", SCRIPTS),
+    ({"noise": NOISES}, "noise without a noise rate", SCRIPTS),
+    ({"noise_rate": (0.1,)}, "a noise rate without noise", SCRIPTS),
     ({"noise": NOISES, "noise_rate": ("1:2",)}, "1:2", SCRIPTS),
     ({"noise": NOISES, "noise_rate": ("0.5:",)}, "0.5:", SCRIPTS),
     ({"noise": NOISES, "noise_rate": ("a:b",)}, "a:b", SCRIPTS),
@@ -739,9 +740,11 @@ def test_a_module_beside_the_caller_and_steps_as_1e2(tmp_path):
     (tmp_path / "my_envs.py").write_text("from toy_envs import *\n")
     options = ["--env-id", "my_envs:Tiny-v0", "--total-timesteps", "1.2E2", "--no-compile"]
     options += ["--learning-starts=5e1", "--eval-frequency", "0", "--eval-episodes", "1"]
+    options += ["--exp-name", "1e3", "--runs-dir=2e1"]  # these are names
     result = command("SAC", *options, cwd=tmp_path)
     assert (result.returncode, result.stderr) == (0, "")
-    [run_dir] = (tmp_path / "runs").iterdir()
+    [run_dir] = (tmp_path / "2e1").iterdir()
+    assert "__1e3__" in run_dir.name
     args = json.loads((run_dir / "config.json").read_text())["args"]
     assert (args["total_timesteps"], args["learning_starts"]) == (120, 50)
     assert args["env_id"] == "my_envs:Tiny-v0"
@@ -883,6 +886,14 @@ def scalars(tensorboard, commands):
         return run_dir, values
 
     return read
+
+
+def test_alpha_has_a_curve_when_it_is_not_tuned(tmp_path):
+    run_dir = run("SAC", tmp_path, autotune=False, alpha=0.3)
+    events = EventAccumulator(str(run_dir)).Reload()
+    values = [event.value for event in events.Scalars("losses/alpha")]
+    assert values == pytest.approx([0.3] * len(values)) and len(values) > 0
+    assert "losses/alpha_loss" not in events.Tags()["scalars"]
 
 
 @each_script
