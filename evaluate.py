@@ -11,6 +11,7 @@ the run's folder keeps them, and what it has is not played again.
 """
 
 import csv
+import fcntl
 import importlib
 import itertools
 import json
@@ -222,10 +223,22 @@ def read_stored(run):
     return stored
 
 
+def store(run, key, results):
+    """Add a condition to robustness.csv, beside what other processes have stored meanwhile."""
+    try:
+        with open(run.folder / ".robustness.lock", "a") as lock:
+            fcntl.lockf(lock, fcntl.LOCK_EX)  # until it is closed
+            stored = read_stored(run)
+            if len(stored.get(key, [])) < len(results):
+                write_stored(run, stored | {key: results})
+    except OSError as error:
+        fail(f"cannot write {run.folder / 'robustness.csv'}: {error}", code=1)
+
+
 def write_stored(run, stored):
     """Write robustness.csv, whole or not at all."""
-    path = run.folder / "robustness.csv"
-    temporary = path.with_suffix(".tmp")
+    # not *.tmp, which the training command deletes when it is called again
+    temporary = run.folder / f".robustness.{os.getpid()}"
     try:
         with open(temporary, "w") as file:
             writer = csv.writer(file, lineterminator="\n")
@@ -234,9 +247,7 @@ def write_stored(run, stored):
                 writer.writerows([*key, i, *result] for i, result in enumerate(results))
             file.flush()
             os.fsync(file.fileno())
-        temporary.replace(path)
-    except OSError as error:
-        fail(f"cannot write {path}: {error}", code=1)
+        temporary.replace(run.folder / "robustness.csv")
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -333,7 +344,7 @@ def main(args):
     tasks = [(run, *conditions[key]) for run, key in todo]
     for (run, key), results in zip(todo, play_all(tasks, args), strict=True):
         stored[run][key] = results
-        write_stored(run, stored[run])
+        store(run, key, results)
     print_table(runs, conditions, stored, args.episodes)
 
 

@@ -207,7 +207,51 @@ def test_a_kill_leaves_whole_conditions_and_the_same_command_goes_on(runs):
     (run_dir / "robustness.csv").unlink()
     main(Args((run_dir,), (OBSERVATION, ACTION), (0.3, 0.6), episodes=30))
     assert (run_dir / "robustness.csv").read_bytes() == before
-    assert not list(runs.rglob("*.tmp"))
+
+
+def test_two_processes_on_one_run_lose_nothing(runs):
+    """Both find nothing stored; then each stores the clean condition and a noise at 20 rates."""
+    run_dir = one(runs, "PPO")
+    rates = [str(i / 20) for i in range(1, 21)]
+    noises = ("RandomNormalNoisyReward(1.0)", "RandomUniformNoisyReward(0.0, 1.0)")
+    processes = []
+    for noise, episodes in zip(noises, ("1", "2"), strict=True):
+        options = ["--noise", noise, "--noise-rate", *rates, "--episodes", episodes]
+        line = command(run_dir, *options)
+        processes.append(subprocess.Popen(**line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT))
+    for process in processes:
+        output, _ = process.communicate(timeout=100)
+        assert process.returncode == 0, output
+    found = sorted((row["noise"], row["noise_rate"], row["episode"]) for row in stored(run_dir))
+    expected = [("", "0.0", "0"), ("", "0.0", "1")]  # the longer one
+    expected += [(noises[0], str(float(rate)), "0") for rate in rates]
+    expected += [(noises[1], str(float(rate)), episode) for rate in rates for episode in "01"]
+    assert found == sorted(expected)
+    assert [path.name for path in run_dir.glob(".robustness*")] == [".robustness.lock"]
+
+
+def test_the_longer_of_two_results_is_kept(runs):
+    [finished] = evaluate.find_runs([one(runs, "PPO")])
+    short, long = [(1.0, 1)], [(1.0, 1), (2.0, 2)]
+    for results in (short, long, short):
+        evaluate.store(finished, ("", "0.0"), results)
+    assert evaluate.read_stored(finished) == {("", "0.0"): long}
+
+
+def test_training_again_deletes_nothing_of_a_write(runs, monkeypatch):
+    """The command that trained a run is called again in the middle of a write."""
+    run_dir = one(runs, "PPO")
+    arguments = json.loads((run_dir / "config.json").read_text())["args"]
+    arguments = ppo.Args(**arguments | {"runs_dir": str(runs)})
+    fsync = os.fsync
+
+    def train_then_fsync(descriptor):
+        ppo.train(arguments)
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", train_then_fsync)
+    main(Args((run_dir,), episodes=1))
+    assert len(stored(run_dir)) == 1
 
 
 def test_a_full_disk_leaves_the_previous_file(runs, monkeypatch, capsys):
