@@ -7,7 +7,8 @@
 Every policy plays without noise and under every noise at every rate. Episode i begins with
 reset(seed = --seed + i), which also seeds the noise: all policies and conditions share their
 initial states. Returns are the environment's own, before noise on the reward. robustness.csv in
-the run's folder keeps them, and what it has is not played again.
+the run's folder keeps them, and what it has is not played again. It has no column for the seed:
+with another --seed than the default, everything is played and nothing is stored.
 """
 
 import csv
@@ -53,7 +54,7 @@ class Args:
     episodes: int = 100
     """test episodes per policy and condition"""
     seed: int = 2_000_000
-    """seed of the first episode; what is stored is not played again for another seed"""
+    """seed of the first episode; with another one everything is played and nothing is stored"""
     jobs: int = 1
     """processes side by side"""
     render: bool = False
@@ -327,7 +328,8 @@ def main(args):
     sys.path.append(os.getcwd())  # my_module:MyEnv-v0 may lie in the folder this is called from
     conditions = read_conditions(args)
     runs = find_runs(args.runs)
-    stored = {run: read_stored(run) for run in runs}
+    storing = args.seed == Args.seed
+    stored = {run: read_stored(run) if storing else {} for run in runs}
     for run in runs:
         check(run, conditions)
     if args.video:
@@ -337,6 +339,8 @@ def main(args):
     if args.video or args.render:
         show(runs, conditions, args)
         return
+    if not storing:
+        print(f"--seed {args.seed} is not the default: everything is played, nothing is stored")
     todo = []
     for run, key in itertools.product(runs, conditions):
         if len(stored[run].get(key, [])) < args.episodes:
@@ -344,7 +348,8 @@ def main(args):
     tasks = [(run, *conditions[key]) for run, key in todo]
     for (run, key), results in zip(todo, play_all(tasks, args), strict=True):
         stored[run][key] = results
-        store(run, key, results)
+        if storing:
+            store(run, key, results)
     print_table(runs, conditions, stored, args.episodes)
 
 
@@ -352,6 +357,6 @@ if __name__ == "__main__":
     try:
         main(tyro.cli(Args, description=__doc__))
     except KeyboardInterrupt:
-        fail("stopped; the conditions that were played are stored", code=130)
+        fail("stopped; what was played is stored, but nothing with another --seed", code=130)
     except FloatingPointError as error:  # from the environment
         fail(error, code=1)

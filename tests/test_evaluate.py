@@ -26,6 +26,7 @@ from evaluate import Args, main
 ROOT = Path(__file__).parent.parent
 SCRIPTS = {"SAC": sac, "TD3": td3, "PPO": ppo}
 OBSERVATION, ACTION = "RandomNormalNoisyObservation(0.1)", "RandomNormalNoisyAction(0.5)"
+SEED = 2_000_000  # of the first episode, unless --seed says otherwise
 COMBINED = "RandomUniformScaleReward(-3, 5)+RandomEarlyTermination(6)"
 
 
@@ -88,14 +89,13 @@ def run(*options, cwd=None, **environment):
 @pytest.mark.parametrize("algorithm", SCRIPTS)
 def test_clean_returns_are_those_of_the_last_evaluation(runs, algorithm):
     run_dir = one(runs, algorithm)
-    main(Args((run_dir,), episodes=10, seed=1_000_000))
+    [finished] = evaluate.find_runs([run_dir])
+    played = evaluate.play(finished, [], [], Args((run_dir,), episodes=10, seed=1_000_000))
     with open(run_dir / "eval.csv", newline="") as file:
         last = list(csv.DictReader(file))[-10:]
-    expected = [{"noise": "", "noise_rate": "0.0"} | row for row in last]
-    for row in expected:
-        del row["step"]
-    assert stored(run_dir) == expected
-    assert len({row["episodic_return"] for row in expected}) > 1
+    rows = [(float(row["episodic_return"]), int(row["episodic_length"])) for row in last]
+    assert played == rows
+    assert len(set(rows)) > 1
 
 
 def streams(name, seed, position):
@@ -107,7 +107,7 @@ def streams(name, seed, position):
 @pytest.mark.parametrize("algorithm", SCRIPTS)
 def test_noisy_returns_are_those_of_a_loop_with_the_documented_seeds(runs, algorithm):
     run_dir = one(runs, algorithm)
-    main(Args((run_dir,), noise=(OBSERVATION, COMBINED), noise_rate=(0.5,), episodes=4, seed=77))
+    main(Args((run_dir,), noise=(OBSERVATION, COMBINED), noise_rate=(0.5,), episodes=6))
     env = gym.make("InvertedPendulum-v5")
     policy = SCRIPTS[algorithm].load_policy(run_dir, env)
 
@@ -127,13 +127,13 @@ def test_noisy_returns_are_those_of_a_loop_with_the_documented_seeds(runs, algor
             total, length, done = total + reward, length + 1, terminated or truncated
         return total, length
 
-    ends = [streams("RandomEarlyTermination", 77 + i, 0)[0].random() < 0.5 for i in range(4)]
+    ends = [streams("RandomEarlyTermination", SEED + i, 0)[0].random() < 0.5 for i in range(6)]
     assert len(set(ends)) == 2
     both = "RandomEarlyTermination(6) + RandomUniformScaleReward(-3.0, 5.0)"
-    expected = [("", "0.0", i, *loop(77 + i, noisy=False)) for i in range(4)]
-    expected += [(OBSERVATION, "0.5", i, *loop(77 + i, noisy=True)) for i in range(4)]
+    expected = [("", "0.0", i, *loop(SEED + i, noisy=False)) for i in range(6)]
+    expected += [(OBSERVATION, "0.5", i, *loop(SEED + i, noisy=True)) for i in range(6)]
     expected += [
-        (both, "0.5 + 0.5", i, *loop(77 + i, noisy=False, last_step=6 if end else 1000))
+        (both, "0.5 + 0.5", i, *loop(SEED + i, noisy=False, last_step=6 if end else 1000))
         for i, end in enumerate(ends)
     ]
     assert [tuple(row.values()) for row in stored(run_dir)] == [
@@ -188,6 +188,25 @@ def test_more_episodes_replay_only_the_conditions_that_have_fewer(runs, monkeypa
         ((ACTION, "0.5"), 3),
     ]
     assert [row for row in again if row["episode"] != "2" and row["noise"] != ACTION] == first
+
+
+def test_another_seed_plays_everything_and_stores_nothing(runs, capsys):
+    """What is stored would do for two of the three conditions."""
+    run_dir = one(runs, "PPO")
+    main(Args((run_dir,), (OBSERVATION,), (0.5,), episodes=3))
+    before, default = files(runs), capsys.readouterr().out
+    args = Args((run_dir,), (OBSERVATION,), (0.5, 1.0), episodes=3, seed=7)
+    main(args)
+    said, *table = capsys.readouterr().out.splitlines()
+    assert said == "--seed 7 is not the default: everything is played, nothing is stored"
+    assert files(runs) == before
+    [finished] = evaluate.find_runs([run_dir])
+    means = []
+    for rate in (0, 0.5, 1.0):
+        played = evaluate.play(finished, [OBSERVATION], [rate], args)
+        means.append(f"{np.mean(played, axis=0)[0]:.1f}")
+    assert table[-1].split()[-3:] == means
+    assert means[0] != default.split()[-2]
 
 
 def test_a_kill_leaves_whole_conditions_and_the_same_command_goes_on(runs):
