@@ -148,8 +148,8 @@ def load(run, render_mode=None):
         script = importlib.import_module(name)
     except ImportError as error:
         fail(f"{run.folder}: cannot import {name}: {error}")
-    steps = run.max_episode_steps
-    env = script.make_env(run.env_id, max_episode_steps=steps, render_mode=render_mode)
+    drawn = {"render_mode": render_mode} if render_mode else {}  # not every class takes it
+    env = script.make_env(run.env_id, max_episode_steps=run.max_episode_steps, **drawn)
     try:
         return env, script.load_policy(run.folder, env)
     except Exception as error:  # a damaged file may raise anything

@@ -381,6 +381,14 @@ def test_an_environment_of_the_folder_that_it_is_called_from(runs, tmp_path):
     assert [row["episodic_length"] for row in stored(run_dir)] == ["3", "3"]
 
 
+def test_an_environment_that_takes_no_arguments(tmp_path):
+    short = {"total_timesteps": 64, "num_steps": 32, "num_minibatches": 2, "compile": False}
+    ppo.train(ppo.Args(env_id="toy_envs:Tiny-v0", runs_dir=str(tmp_path), **short))
+    [run_dir] = tmp_path.iterdir()
+    main(Args((run_dir,), episodes=3))
+    assert len(stored(run_dir)) == 3
+
+
 # Videos
 
 
@@ -431,7 +439,7 @@ def test_a_window_shows_one_episode_of_each_condition(runs, monkeypatch, capsys)
     modes = []
     make_env = ppo.make_env
 
-    def make(env_id, render_mode, **kwargs):
+    def make(env_id, render_mode=None, **kwargs):
         modes.append(render_mode)
         return make_env(env_id, **kwargs)
 
