@@ -29,12 +29,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 import tyro
 from gymnasium.wrappers import RecordVideo
 from tabulate import tabulate
 from tqdm import tqdm
 
-from analyze_runs import is_run, rate_text
+from analyze_runs import is_run, labels, read_config
 from noisy_wrappers import canonical_noises, make_noisy, noise_slug
 
 HEADER = ["noise", "noise_rate", "episode", "episodic_return", "episodic_length"]
@@ -64,13 +65,14 @@ class Args:
 
 
 class Run(NamedTuple):
-    """A finished run; `trained_with` is a row of the table, all seeds of one configuration."""
+    """A finished run, as analyze_runs.read_config reads and names it."""
 
     folder: Path
-    algorithm: str
-    env_id: str
-    max_episode_steps: int | None
-    trained_with: tuple[str, str, str, str]  # environment, experiment, noise, noise rate
+    base: str  # the algorithm
+    environment: str
+    noise: str
+    noise_rate: str
+    settings: str  # the other arguments, as JSON
 
 
 def fail(message, code=2):
@@ -111,12 +113,8 @@ def read_run(folder):
     if not (folder / "result.json").exists():
         fail(f"{folder} is not finished: the command that started it goes on with it")
     try:
-        config = json.loads((folder / "config.json").read_text())
-        args = config["args"]
-        noise = " + ".join(args["noise"]) or "no noise"
-        trained_with = (args["env_id"], args["exp_name"], noise, rate_text(args["noise_rate"]))
-        algorithm, limit = str(config["algorithm"]), args.get("max_episode_steps")
-        return Run(folder, algorithm, args["env_id"], limit, trained_with)
+        config = read_config(folder)
+        return Run(folder, *(config[name] for name in Run._fields[1:]))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         fail(f"cannot read {folder / 'config.json'}: {type(error).__name__}: {reason(error)}")
 
@@ -143,17 +141,18 @@ def read_conditions(args):
 
 def load(run, render_mode=None):
     """Return a run's clean environment and its policy, NumPy to NumPy."""
-    name = f"{run.algorithm.lower()}_continuous_noisy"
+    name = f"{run.base}_continuous_noisy".lower()
     try:
         script = importlib.import_module(name)
     except ImportError as error:
         fail(f"{run.folder}: cannot import {name}: {error}")
+    steps = json.loads(run.settings).get("max_episode_steps")
     drawn = {"render_mode": render_mode} if render_mode else {}  # not every class takes it
-    env = script.make_env(run.env_id, max_episode_steps=run.max_episode_steps, **drawn)
+    env = script.make_env(run.environment, max_episode_steps=steps, **drawn)
     try:
         return env, script.load_policy(run.folder, env)
     except Exception as error:  # a damaged file may raise anything
-        fail(f"{run.folder / 'policy.pt'} is no policy for {run.env_id}: {reason(error)}")
+        fail(f"{run.folder / 'policy.pt'} is no policy for {run.environment}: {reason(error)}")
 
 
 def check(run, conditions):
@@ -253,15 +252,24 @@ def write_stored(run, stored):
         temporary.unlink(missing_ok=True)
 
 
+def algorithms(runs):
+    """Name the runs' algorithms as analyze.py does: where settings differ, the name says which."""
+    table = pd.DataFrame(runs).assign(phase="")
+    for base, group in table.groupby("base"):
+        table.loc[group.index, "algorithm"] = labels(base, group)
+    return table["algorithm"]
+
+
 def print_table(runs, conditions, stored, episodes):
     """Print mean and sample standard deviation over seeds: one table for each noise of the test."""
     trained = {}
-    for run in runs:
-        trained.setdefault(run.trained_with, []).append(stored[run])
+    for run, algorithm in zip(runs, algorithms(runs), strict=True):
+        config = (run.environment, algorithm, run.noise or "no noise", run.noise_rate)
+        trained.setdefault(config, []).append(stored[run])
     noises = dict.fromkeys(noise for noise, _ in conditions if noise)
     for tested_with in noises or [""]:
         columns = [key for key in conditions if key[0] in ("", tested_with)]
-        headers = ["environment", "experiment", "trained with", "at rate", "seeds"]
+        headers = ["environment", "algorithm", "trained with", "at rate", "seeds"]
         headers += [f"at {rate}" if noise else "clean" for noise, rate in columns]
         rows = [
             [*config, len(seeds), *(mean_return(seeds, key, episodes) for key in columns)]

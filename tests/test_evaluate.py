@@ -294,14 +294,14 @@ def test_a_full_disk_leaves_the_previous_file(runs, monkeypatch, capsys):
 
 def test_the_table_of_known_returns(capsys):
     def a_run(noise, rate):
-        return evaluate.Run(Path(noise, str(len(cells))), "PPO", "E", None, ("E", "x", noise, rate))
+        return evaluate.Run(Path(str(len(cells))), "PPO", "E", noise, rate, "{}")
 
     cells = {}
     for noise, rate, clean, noisy in [
-        ("no noise", "0.00", [10, 30], [1, 2]),  # means 20 and 1.5
+        ("", "0.00", [10, 30], [1, 2]),  # means 20 and 1.5
         ("A(1)", "0.50", [5, 5], [7, 8]),
-        ("no noise", "0.00", [40, 20], [4, 3]),  # means 30 and 3.5
-        ("no noise", "0.00", [10, 90], [-5, 0]),  # means 50 and -2.5
+        ("", "0.00", [40, 20], [4, 3]),  # means 30 and 3.5
+        ("", "0.00", [10, 90], [-5, 0]),  # means 50 and -2.5
     ]:
         # A third episode is stored and not asked for; the second number is the length.
         cells[a_run(noise, rate)] = {
@@ -316,8 +316,8 @@ def test_the_table_of_known_returns(capsys):
     assert lines[1] == ["Mean return, tested with A(1) + B(2)"]
     assert lines[2][-2:] == ["clean", "at 0.1 + 0.1"]
     assert lines[4:6] == [
-        ["E", "x", "no noise", "0.00", "3", "33.3 ± 15.3", "0.8 ± 3.1"],
-        ["E", "x", "A(1)", "0.50", "1", "5.0", "7.5"],
+        ["E", "PPO", "no noise", "0.00", "3", "33.3 ± 15.3", "0.8 ± 3.1"],
+        ["E", "PPO", "A(1)", "0.50", "1", "5.0", "7.5"],
     ]
     assert lines[7] == ["Mean return, tested with C(3)"]
     assert lines[8][-2:] == ["clean", "at 0.5"]
@@ -325,6 +325,19 @@ def test_the_table_of_known_returns(capsys):
     evaluate.print_table(list(cells), conditions[:1], cells, episodes=2)
     alone = capsys.readouterr().out
     assert "tested with" not in alone and alone.splitlines()[0].endswith("clean")
+
+
+def test_trainings_with_other_settings_are_other_rows_of_the_table(runs, capsys):
+    first, second = sorted(runs.glob("*ppo_continuous_noisy*"))
+    args = json.loads((second / "config.json").read_text())["args"]
+    edit_config(second, args=args | {"total_timesteps": 2560, "gamma": 0.9})
+    main(Args((first, second, one(runs, "TD3")), episodes=1))
+    table = [re.split(r" {2,}", line) for line in capsys.readouterr().out.splitlines()]
+    assert [(row[1], row[4]) for row in table[2:]] == [
+        ("PPO [gamma=0.99, total_timesteps=256]", "1"),
+        ("PPO [gamma=0.9, total_timesteps=2560]", "1"),
+        ("TD3", "1"),
+    ]
 
 
 def test_all_of_a_folder_with_logs_and_an_analysis(runs, capsys):
@@ -337,9 +350,9 @@ def test_all_of_a_folder_with_logs_and_an_analysis(runs, capsys):
     assert (result.returncode, result.stderr) == (0, "")
     table = [re.split(r" {2,}", line) for line in result.stdout.splitlines()]
     assert [row[1:5] for row in table[4:]] == [
-        ["ppo_continuous_noisy", "no noise", "0.00", "2"],
-        ["sac_continuous_noisy", "RandomNormalNoisyReward(0.1)", "0.50", "1"],
-        ["td3_continuous_noisy", "no noise", "0.00", "1"],
+        ["PPO", "no noise", "0.00", "2"],
+        ["SAC", "RandomNormalNoisyReward(0.1)", "0.50", "1"],
+        ["TD3", "no noise", "0.00", "1"],
     ]
     means = []
     for seed in (1, 2):
@@ -472,7 +485,7 @@ BAD_RUNS = {
         b"x"
     ),
     "cannot read": lambda run_dir: (run_dir / "config.json").write_text("{"),
-    "KeyError: 'noise'": lambda run_dir: (run_dir / "config.json").write_text('{"args": {}}'),
+    "KeyError: 'args'": lambda run_dir: (run_dir / "config.json").write_text("{}"),
     "cannot import": lambda run_dir: edit_config(run_dir, algorithm="DQN"),
     "delete it": lambda run_dir: (run_dir / "robustness.csv").write_text("a,b\n1,2\n"),
     "no environment|exist": lambda run_dir: other_environment(run_dir, "Nothing-v0"),
