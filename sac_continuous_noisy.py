@@ -639,6 +639,8 @@ class Run:
         self._write("policy.pt", policy)
         self._write("result.json", json.dumps(result, indent=2) + "\n")
         self.checkpoint.unlink(missing_ok=True)
+        self.bar.close()
+        print(f"{self.folder} is finished: mean test return {self.mean:.1f}")
 
     def _reading(self, path):
         return fail_on(Exception, f"cannot read {path} (if damaged, --overwrite starts afresh)")
@@ -680,4 +682,6 @@ if __name__ == "__main__":
     sys.path.append(os.getcwd())  # for the module of --env-id module:Name-v0
     with fail_on(FloatingPointError, "training stopped", code=1):
         finished = train(read_args(), stop=lambda: bool(signals))
-    raise SystemExit(0 if finished else 128 + signals[0])
+    if not finished:
+        print(f"stopped; the same command goes on from step {Run.saved_step}")
+        raise SystemExit(128 + signals[0])

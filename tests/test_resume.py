@@ -428,6 +428,7 @@ def test_a_signal_ends_the_episode_and_the_run_resumes(algorithm, number, code, 
     assert 40 <= int(saved) < 65  # a checkpoint is due from step 40 on
     checkpoint = torch.load(folder(tmp_path) / "checkpoint.pt", weights_only=True)
     assert 65 <= checkpoint["step"] < 100
+    assert f"stopped; the same command goes on from step {checkpoint['step']}\n" in result.out
     assert not (folder(tmp_path) / "policy.pt").exists()
     result = run(algorithm, words, (TRAINING_STEP, 70, send(number)))
     assert (result.code, result.err) == (code, "")

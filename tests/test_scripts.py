@@ -840,12 +840,13 @@ def test_command_line(algorithm, commands):
     line, result = results[algorithm]
     assert (result.returncode, result.stderr) == (0, "")
     [run_dir] = runs_dir.glob(f"*__{algorithm.lower()}_continuous_noisy__*")
-    last = result.stdout.splitlines()[-1]  # not a terminal: plain lines
+    last, finished = result.stdout.splitlines()[-2:]  # not a terminal: plain lines
     assert re.search(r"step=240/240 sps=\d+ .*eval_return=-?\d+\.\d", last)
+    assert re.fullmatch(rf"{re.escape(str(run_dir))} is finished: mean test return .*", finished)
     assert json.loads((run_dir / "config.json").read_text())["args"]["seed"] == 1
     again = command(algorithm, *line)
     assert (again.returncode, again.stderr) == (0, "")
-    assert again.stdout.startswith(f"{run_dir} is finished: ") and again.stdout.count("\n") == 1
+    assert again.stdout == f"{finished}\n"
 
 
 @pytest.fixture(scope="module")
