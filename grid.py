@@ -74,6 +74,8 @@ GIVEN_BY_THE_GRID = {  # options of the scripts, and those of the sweep that set
     "runs-dir": "--runs-dir",
     "exp-name": "--runs-dir",  # a sweep's folders are told apart by where they lie
 }
+# A finished run counts as done whatever it had for these: the scripts' class Run ignores them, too
+MAY_DIFFER = {"overwrite", "torch-threads", "compile", "checkpoint-frequency"}
 
 
 class Run(NamedTuple):
@@ -84,6 +86,7 @@ class Run(NamedTuple):
     total_timesteps: int
     script: str
     arguments: list[str]
+    options: dict[str, object]  # the script's own, by name: what "--" gives, else the defaults
 
 
 # ------------------------------------------------------------------------------------ the arguments
@@ -123,7 +126,8 @@ def parse_args(view, caller, argv):
 
 def unknown_option(name):
     """Say what to write instead of an option that the grid does not have."""
-    known = script_options().difference(f"--{name}" for name in GIVEN_BY_THE_GRID)
+    scripts = PROJECT.glob(script_of("*"))
+    known = {f"--{option}" for script in scripts for option in defaults(script.name)}
     if name in known:
         return f"{name} is an option of the scripts: put it at the end, after --"
     near = difflib.get_close_matches(name, [*GRID_OPTIONS, *EXECUTOR_OPTIONS, *known], n=1)
@@ -133,15 +137,63 @@ def unknown_option(name):
     return f"unknown option {name}; did you mean {near[0]}{after}?"
 
 
-def script_options():
-    """Return the scripts' options, from their text: importing them takes seconds."""
-    options = set()
-    for path in PROJECT.glob("*_continuous_noisy.py"):
-        for node in ast.parse(path.read_text()).body:
-            if isinstance(node, ast.ClassDef) and node.name == "Args":
-                fields = [field for field in node.body if isinstance(field, ast.AnnAssign)]
-                options.update(f"--{field.target.id.replace('_', '-')}" for field in fields)
+def script_of(algorithm):
+    """Return the file of an algorithm's training script."""
+    return f"{algorithm}_continuous_noisy.py"
+
+
+@functools.cache
+def defaults(script):
+    """Return {option: default} of a script, from its text: importing it takes seconds.
+
+    Options that the grid gives are left out.
+    """
+    nodes = ast.parse((PROJECT / script).read_text()).body
+    [args] = [node for node in nodes if isinstance(node, ast.ClassDef) and node.name == "Args"]
+    fields = [field for field in args.body if isinstance(field, ast.AnnAssign)]
+    texts = {field.target.id.replace("_", "-"): field.value for field in fields}
+    return {name: ast.literal_eval(texts[name]) for name in texts if name not in GIVEN_BY_THE_GRID}
+
+
+@functools.cache
+def script_options(script, words):
+    """Return {option: value} of a script that is started with these words after the "--".
+
+    Exits with one line about a word that is out of place. Whether a value is a good one, the
+    script itself says: check_extra.
+    """
+    options = dict(defaults(script))
+    words = iter(words)
+    for word in words:
+        if not word.startswith("--"):
+            fail(f"{word!r} after the -- belongs to no option of {script}")
+        name, equals, text = word[2:].partition("=")
+        name = name.replace("_", "-")
+        flag = name.removeprefix("no-")
+        if isinstance(options.get(flag), bool):
+            if equals:
+                fail(f"--{name} takes no value: write --{flag} or --no-{flag}")
+            options[flag] = name == flag
+            continue
+        if name not in options:
+            near = difflib.get_close_matches(name, options, n=1)
+            hint = f"; did you mean --{near[0]}?" if near else ""
+            fail(f"{script} has no option --{name}{hint}")
+        text = text if equals else next(words, "--")
+        if not text or text.startswith("--"):
+            fail(f"--{name} needs a value")
+        options[name] = option_value(text)
     return options
+
+
+def option_value(text):
+    """Read an option's value as a script does; here a number is a number, whole or not."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            pass
+    return None if text == "None" else text
 
 
 def from_project(caller, text):
@@ -311,14 +363,16 @@ def cell(pairs, common=None):
 
 def make_run(args, algorithm, env_id, noises, rates, seed):
     """Return one run of the grid."""
-    script = f"{algorithm}_continuous_noisy"
+    script = script_of(algorithm)
     arguments = ["--env-id", env_id, "--seed", str(seed)]
     if noises:
         arguments += ["--noise", *noises, "--noise-rate", *map(str, rates)]
     arguments += ["--total-timesteps", str(args.total_timesteps)]
     arguments += ["--runs-dir", args.runs_dir, *args.extra]
-    folder = Path(args.runs_dir, run_name(env_id, script, noises, rates, seed))
-    return Run(folder, (algorithm, env_id), args.total_timesteps, f"{script}.py", arguments)
+    name = run_name(env_id, script.removesuffix(".py"), noises, rates, seed)
+    folder, kind = Path(args.runs_dir, name), (algorithm, env_id)
+    options = script_options(script, tuple(args.extra))
+    return Run(folder, kind, args.total_timesteps, script, arguments, options)
 
 
 def grid(args):
@@ -354,26 +408,49 @@ def runs_in(folder):
             except (OSError, ValueError, KeyError, TypeError) as error:
                 fail(f"cannot read {path} ({type(error).__name__}: {error}); delete its folder")
         env_id, script = name.split("__")[:2]
-        runs.append(Run(folder / name, (script, env_id), steps, "", []))
+        runs.append(Run(folder / name, (script, env_id), steps, "", [], {}))
     return runs
 
 
 def result(run):
-    """Return whether a run is finished, and what is wrong with its result.json, or "".
+    """Return whether a run is finished, and what is wrong with its files, or "".
 
-    Exits if the folder holds a finished run of another length.
+    Exits if the folder holds a finished run of another length or with other options.
     """
     path = run.folder / "result.json"
     if not path.exists():
         return False, ""
     try:
         steps = json.loads(path.read_text())["total_timesteps"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        path = run.folder / "config.json"
+        made_with = json.loads(path.read_text())["args"]
+        differences = other_options(run, made_with)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         reason = f"{path} cannot be read ({type(error).__name__}: {error})"
         return False, f"{reason}; delete the run's folder to run it again"
     if steps != run.total_timesteps:
         fail(f"{run.folder} holds a finished run of {steps} steps; choose another --runs-dir")
+    if differences:
+        fail(
+            f"{run.folder} holds a finished run with {' and '.join(differences)}; choose another "
+            "--runs-dir, or the same options after the --"
+        )
     return True, ""
+
+
+def other_options(run, made_with):
+    """Say in which options that change its result a run differs from the one that made its folder.
+
+    made_with: the arguments in the folder's config.json. One that an older version did not have
+    counts as today's default.
+    """
+    differences = []
+    for name, wanted in run.options.items():
+        default = defaults(run.script)[name]
+        made = made_with.get(name.replace("-", "_"), default)
+        if name not in MAY_DIFFER and made != wanted:
+            differences.append(f"--{name} {made}, not {wanted}")
+    return differences
 
 
 def command_line(run):

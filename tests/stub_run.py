@@ -19,7 +19,7 @@ from statistics import fmean
 sys.path.insert(0, str(Path(__file__).parent.parent))
 from noisy_wrappers import run_name  # noqa: E402
 
-EPISODES = 2
+EPISODES = 10  # the scripts' default
 
 
 def episodes_of(algorithm, env_id, noise, rates, seed):
@@ -46,6 +46,7 @@ def train(argv):
     parser.add_argument("--noise-rate", nargs="*", default=[])
     parser.add_argument("--total-timesteps", type=int, required=True)
     parser.add_argument("--runs-dir", required=True)
+    parser.add_argument("--gamma", type=float, default=0.99)
     args = parser.parse_args(argv)
     args.noise_rate = [rate if ":" in rate else float(rate) for rate in args.noise_rate]
     exp_name = args.script.removesuffix(".py")

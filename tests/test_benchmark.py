@@ -6,6 +6,7 @@ skip; with the environment variable CI they fail.
 """
 
 import argparse
+import ast
 import csv
 import json
 import os
@@ -30,7 +31,7 @@ import stub_run
 import tyro
 
 import choose_runs
-from grid import check, parse_args
+from grid import GIVEN_BY_THE_GRID, MAY_DIFFER, check, parse_args, script_options
 
 ROOT = Path(__file__).parent.parent
 PATH = f"{os.environ['PATH']}:/usr/sbin:/sbin"
@@ -592,9 +593,10 @@ def test_an_environment_and_runs_in_the_callers_folder(tmp_path):
 def test_a_line_runs_when_pasted_into_a_shell(tmp_path):
     grid = ["best", "--algos", "ppo", "--envs", "Hopper-v5", "--seeds", "1"]
     small = ["--total-timesteps", "2048", "--runs-dir", tmp_path / "my runs"]
+    _, folder = folders(*grid, *small)
     result = run(*grid, *small, "--dry-run", "--", "--no-compile", "--eval-episodes", "1")
     subprocess.run(result.out.splitlines()[1], shell=True, check=True, cwd=ROOT)
-    assert (folders(*grid, *small)[1] / "result.json").exists()
+    assert (folder / "result.json").exists()
 
 
 # CHOOSE
@@ -684,6 +686,19 @@ def test_a_dry_run_of_choose_prints_the_batch_that_is_due(tmp_path, stub):
     assert "3 are done, about 0.1 core-hours are left" in second.err
 
 
+def test_a_choice_never_mixes_runs_with_other_options(tmp_path, stub):
+    command = [*CHOOSE, "--runs-dir", tmp_path]
+    first = run(*command, env=stub)
+    assert first.code == 0, first.out + first.err
+    for words in (command, [*command, "--confirm", "5"]):
+        other = run(*words, "--", "--gamma", "0.5", env=stub)
+        assert other.code == 2 and not other.out and other.err.count("\n") == 1
+        assert "holds a finished run with --gamma 0.99, not 0.5; choose another" in other.err
+    assert run(*command, "--", "--no-compile", "--gamma", "0.990", env=stub).out == first.out
+    whole = run(*CHOOSE, "--runs-dir", tmp_path / "other", "--", "--gamma", "0.5", env=stub)
+    assert whole.code == 0 and "p = " in whole.out, whole.out + whole.err
+
+
 # REPORTS AND ERRORS
 
 
@@ -694,6 +709,7 @@ def test_status_arithmetic(tmp_path):
     (tmp_path / "logs").mkdir()
     done.mkdir()
     (done / "result.json").write_text('{"total_timesteps": 1000}')
+    (done / "config.json").write_text('{"args": {}}')
     for folder, text in {
         done: "step=1000/1000 sps=200 eval_return=1.0\n# now host: exit=0\n",
         running: "step=100/1000 sps=100 eta=0:00:09\nstep=200/1000 sps=100 eta=0:00:08\n",
@@ -741,26 +757,95 @@ def test_a_finished_run_of_another_length_is_not_taken_for_done(tmp_path):
     [folder] = folders(*grid)
     folder.mkdir()
     (folder / "result.json").write_text('{"total_timesteps": 20}')
+    (folder / "config.json").write_text('{"args": {}}')
     result = run(*grid)
     assert result.code == 2 and "holds a finished run of 20 steps" in result.err
     assert not (tmp_path / "logs").exists()
 
 
+def test_a_finished_run_with_other_options_is_not_taken_for_done(tmp_path):
+    grid = ["baseline", "--algos", "sac", "--envs", "Hopper-v5", "--seeds", "1"]
+    grid += ["--total-timesteps", "1000", "--runs-dir", tmp_path]
+    [folder] = folders(*grid)
+    folder.mkdir()
+    (folder / "result.json").write_text('{"total_timesteps": 1000}')
+
+    def made_with(**args):
+        (folder / "config.json").write_text(json.dumps({"args": args}))
+
+    made_with(gamma=0.99, autotune=True, learning_starts=10, torch_threads=8, compile=False)
+    refused = run(*grid, "--", "--gamma", "0.5", "--learning_starts=10", "--no-autotune")
+    assert (
+        refused.code == 2
+        and not refused.out
+        and refused.err
+        == (
+            f"error: {folder} holds a finished run with --gamma 0.99, not 0.5 and --autotune True, "
+            "not False; choose another --runs-dir, or the same options after the --\n"
+        )
+    )
+    assert "with --learning-starts 10, not 5000; choose" in run("status", *grid).err
+    for same in ("--learning-starts 10", "--learning_starts=10 --no-compile --torch-threads 2"):
+        result = run(*grid, "--", *same.split())
+        assert result.code == 0 and "1 runs: 1 done" in result.out, result.err
+    # An older version had an option that is gone, and did not have one of today's
+    made_with(gamma=0.99, capture_video=True)
+    assert "1 runs: 1 done" in run("status", *grid).out
+    assert "--max-episode-steps None, not 50" in run(*grid, "--", "--max-episode-steps", "50").err
+
+
+def test_misspelt_options_are_refused_where_nothing_is_to_do(tmp_path, stub):
+    grid = ["baseline", *GRID[1:7], "--total-timesteps", "1000", "--runs-dir", tmp_path]
+    assert run(*grid, env=stub).code == 0
+    for words, message in {
+        "--gama 0.99": "sac_continuous_noisy.py has no option --gama; did you mean --gamma?",
+        "--gamma=0.99 1": "'1' after the -- belongs to no option of sac_continuous_noisy.py",
+        "--gamma --no-compile": "--gamma needs a value",
+        "--gamma": "--gamma needs a value",
+        "--compile=False": "--compile takes no value: write --compile or --no-compile",
+    }.items():
+        result = run(*grid, "--", *words.split())
+        assert (result.code, result.out, result.err) == (2, "", f"error: {message}\n")
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_the_grid_reads_options_as_the_scripts_do(algorithm):
+    script = import_module(f"{algorithm}_continuous_noisy")
+    for words in (
+        "",
+        "--gamma 0.5 --eval_episodes=3 --no-compile --matmul_precision high",
+        "--gamma=.5 --gamma 1 --cuda --no_overwrite --max-episode-steps 1_000",
+        "--max-episode-steps None --gamma -inf --torch-threads=2",
+    ):
+        read = vars(tyro.cli(script.Args, args=words.split()))
+        wanted = {name.replace("_", "-"): value for name, value in read.items()}
+        wanted = {name: wanted[name] for name in wanted.keys() - GIVEN_BY_THE_GRID.keys()}
+        assert script_options(f"{algorithm}_continuous_noisy.py", tuple(words.split())) == wanted
+    # What the script lets differ where it goes on with a run
+    [names] = re.findall(
+        r"for name in (\(.+\)):\n +del new\[name\]", Path(script.__file__).read_text()
+    )
+    ignored = {name.replace("_", "-") for name in ast.literal_eval(names)}
+    assert ignored == MAY_DIFFER | {"runs-dir"}
+
+
 @pytest.mark.parametrize("damaged", ["", "{}", "[]"])
-def test_a_damaged_result_fails_its_run_and_stops_no_other(damaged, tmp_path, stub):
+@pytest.mark.parametrize("file", ["result.json", "config.json"])
+def test_a_damaged_result_fails_its_run_and_stops_no_other(file, damaged, tmp_path, stub):
     grid = ["baseline", "--algos", "ppo", "--envs", "Hopper-v5", "--seeds", "1-2"]
     grid += ["--total-timesteps", "1000", "--runs-dir", tmp_path]
     bad, good = folders(*grid)
     bad.mkdir()
-    (bad / "result.json").write_text(damaged)
-    advice = f"{bad}/result.json cannot be read ("
+    (bad / "result.json").write_text('{"total_timesteps": 1000}')
+    (bad / file).write_text(damaged)
+    advice = f"{bad}/{file} cannot be read ("
     status = run("status", *grid)
     assert status.code == 0 and re.search(
         rf"damaged +{log_of(bad)} +{re.escape(advice)}", status.out
     )
     sweep = run(*grid, env=stub)
     assert sweep.code == 1 and f"warning: {advice}" in sweep.err and "2 runs, 1 to do" in sweep.err
-    assert (bad / "result.json").read_text() == damaged and (good / "result.json").exists()
+    assert (bad / file).read_text() == damaged and (good / "result.json").exists()
     assert "2 runs: 1 done, 0 running, 1 failed, 0 to do" in sweep.out
     assert "delete the run's folder to run it again" in sweep.out
 
@@ -908,7 +993,12 @@ def test_a_second_sweep_waits_for_the_runs_of_the_first(tmp_path, stub):
         ("demo -- --help", "--help after the -- would start nothing"),
         ("demo -- --seed 2", "--seed is part of the grid: use --seeds, before the --"),
         ("demo -- --exp-name my_ppo", "--exp-name is part of the grid: use --runs-dir, before"),
-        ("best --algos sac -- --nope", "sac_continuous_noisy.py: Unrecognized options: --nope"),
+        ("best --algos sac -- --nope", "sac_continuous_noisy.py has no option --nope"),
+        ("best --algos sac ppo -- --tau 0.1", "ppo_continuous_noisy.py has no option --tau"),
+        (
+            "best --algos sac -- --tau abc",
+            "sac_continuous_noisy.py: Error parsing --tau: could not",
+        ),
     ],
 )
 def test_bad_input(args, message, tmp_path):
