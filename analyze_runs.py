@@ -123,16 +123,20 @@ def is_run(folder):
 def read_runs(runs_dir):
     """Read all run folders; `status` is finished, unfinished, corrupt or duplicate.
 
-    In a folder of `./benchmark.sh choose` (it has a choice.csv) `phase` is search or confirmation,
-    by the seed; elsewhere it is empty.
+    For the algorithms and environments in the choice.csv of `./benchmark.sh choose`, `phase` is
+    search or confirmation, by the seed; for others it is empty.
     """
     runs_dir = Path(runs_dir)
     rows = [read_run(folder) for folder in sorted(runs_dir.iterdir()) if is_run(folder)]
     runs = pd.DataFrame(rows, columns=RUN_COLUMNS, dtype=object)
     runs["phase"] = ""
-    if (runs_dir / "choice.csv").exists():
+    choice = read_choice(runs_dir)
+    if choice is not None:
+        chosen = set(zip(choice["algorithm"], choice["environment"], strict=True))
+        pairs = zip(runs["base"], runs["environment"], strict=True)
         fresh = runs["seed"].fillna(0) >= FIRST_CONFIRMATION_SEED
-        runs["phase"] = np.where(fresh, "confirmation", "search")
+        phases = np.where(fresh, "confirmation", "search")
+        runs["phase"] = np.where([pair in chosen for pair in pairs], phases, "")
     for base, group in runs.groupby("base"):
         runs.loc[group.index, "algorithm"] = labels(base, group)
     twice = (runs["status"] == "finished") & runs.duplicated(["status", *KEYS, "seed"])

@@ -11,7 +11,8 @@ Usage: ./benchmark.sh PRESET [grid options] [executor options] [-- script option
 Presets
   choose     finds out whether a noise helps, and which: for each algorithm and environment that you
              name, runs the noises with more and more seeds, drops the worse half again and again,
-             compares the winner with no noise on fresh seeds, and says what came out
+             compares the winner with no noise on fresh seeds, and says what came out; the runs
+             go into runs/choose
   demo       PPO on Pusher-v5, without and with one noise, 5 seeds, 100,000 steps, into runs/demo
   baseline   no noise: 3 algorithms, 5 environments, the paper's seeds
   best       the paper's best noise for each algorithm and environment
@@ -34,7 +35,8 @@ Grid options replace a preset's values
   --combine  custom: adds every pair of the noises, both in one environment
   --total-timesteps 1e6
   --runs-dir runs
-             where the run folders go; counts from the folder that you call this from
+             where the run folders go (choose: runs/choose, demo: runs/demo); counts from the folder
+             that you call this from
 
 Options of choose
   --exclude "NOISE@RATE"   noises to leave out, because they always fail for instance

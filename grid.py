@@ -59,7 +59,7 @@ PRESETS = {  # the grid options that a preset sets; its noises are in preset_pai
     "paper": {},
     "ablation": {"algos": ["ppo"]},
     "custom": {},
-    "choose": {},
+    "choose": {"runs_dir": "runs/choose"},  # apart: analyze.py judges its runs otherwise
 }
 GRID_OPTIONS = ["--algos", "--envs", "--noises", "--noise-rates", "--seeds", "--total-timesteps"]
 GRID_OPTIONS += ["--runs-dir", "--combine", "--exclude", "--budget", "--confirm"]

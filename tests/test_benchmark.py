@@ -523,6 +523,9 @@ def test_other_presets():
     assert {(x.script[:3], x.env_id, x.runs_dir) for x in dry_run("demo")} == {
         ("ppo", "Pusher-v5", "runs/demo")
     }
+    chosen = run(*C.split(), "--dry-run")
+    assert all(line.endswith("--runs-dir runs/choose") for line in chosen.out.splitlines())
+    assert run("status", *C.split()).out.startswith("runs/choose: ")
     assert [(x.seed, x.noise, x.total_timesteps) for x in dry_run("demo")] == [
         (seed, noise, 100_000)
         for seed in range(1, 6)

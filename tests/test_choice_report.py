@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import stats
 from test_analyze import ENDING, SCALE, row, run, write_run
@@ -12,6 +13,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 import analyze
 import analyze_report
 import analyze_runs
+import evaluate
 
 PUSH = "RandomNormalNoisyAction(0.3)"
 HEADER = "algorithm,environment,phase,round,noise,noise_rate,seeds,score,survives\n"
@@ -78,6 +80,35 @@ def test_without_choice_csv_high_seeds_are_seeds(tmp_path):
     tables = run(tmp_path)
     assert set(tables["summary_PPO"]["algorithm"]) == {"PPO"} and "choice" not in tables
     assert row(tables["summary_PPO"], noise=SCALE)["n"] == 8
+
+
+def test_other_sweeps_in_the_folder_of_a_choice_stay_as_they_are(tmp_path):
+    write_choice(tmp_path / "runs")
+    for algorithm, env in (("PPO", "Pusher-v5"), ("SAC", "Hopper-v5")):
+        for seed in (1, 2, 3):
+            write_run(tmp_path / "runs", [100.0 + seed], algorithm, env, seed=seed)
+            write_run(tmp_path / "runs", [110.0 + seed], algorithm, env, SCALE, 1.0, seed)
+    tables = run(tmp_path)
+    found = tables["statistics"].query("environment != 'all'")
+    assert set(zip(found["algorithm"], found["environment"], strict=True)) == {
+        ("PPO [confirmation]", "Hopper-v5"),
+        ("PPO", "Pusher-v5"),
+        ("SAC", "Hopper-v5"),
+    }
+
+
+def test_a_choice_in_a_folder_of_its_own_disturbs_no_other_sweep(tmp_path):
+    for seed in (1, 2, 3):
+        write_run(tmp_path / "runs", [100.0 + seed], "PPO", seed=seed)
+        write_run(tmp_path / "runs", [110.0 + seed], "PPO", noise=SCALE, rate=1.0, seed=seed)
+    before = [run.folder.name for run in evaluate.find_runs([tmp_path / "runs"])]
+    tables = run(tmp_path)
+    write_choice(tmp_path / "runs/choose")
+    assert [run.folder.name for run in evaluate.find_runs([tmp_path / "runs"])] == before
+    again = run(tmp_path, out="again")
+    assert tables.keys() == again.keys() and "choice" not in again
+    for name, table in tables.items():
+        pd.testing.assert_frame_equal(table, again[name])
 
 
 def test_a_damaged_choice_is_one_line(tmp_path, capsys):
