@@ -277,6 +277,23 @@ def test_two_algorithms_and_environments_at_once(tmp_path):
         assert float(line["score"]) == pytest.approx(fmean(wanted))
 
 
+@pytest.mark.parametrize(
+    ("algorithm", "env", "seconds"),
+    [  # eight runs of 1,000 steps, each with ten seconds to start
+        ("sac", "Hopper-v5", 8 * (10 + 1000 / 150)),
+        ("sac", "Humanoid-v5", 8 * (10 + 1000 / 90)),
+        ("td3", "HumanoidStandup-v5", 8 * (10 + 1000 / 130)),
+        ("ppo", "Humanoid-v5", 8 * (10 + 1000 / 2900)),
+    ],
+)
+def test_the_core_hours_announced(algorithm, env, seconds, tmp_path):
+    args = arguments(
+        f"--algos | {algorithm} | --envs | {env} | --noises | {A}@1 | --confirm | 4", tmp_path
+    )
+    [choice] = choose_runs.choices(args)
+    assert choice.core_hours == pytest.approx(seconds / 3600)
+
+
 def test_another_choice_keeps_the_lines_of_the_first(tmp_path):
     first = arguments(
         "--algos | ppo | --envs | Pendulum-v1 | --noise-rates | 1 | --noises | "
