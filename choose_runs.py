@@ -5,6 +5,7 @@ command computes from the finished runs where each choice stands.
 """
 
 import csv
+import fcntl
 import itertools
 import json
 import os
@@ -219,17 +220,24 @@ def obstacle(choice):
 
 def write_choice(path, rows):
     """Write choice.csv whole or not at all; it keeps what other commands have chosen."""
-    ours = {(row["algorithm"], row["environment"]) for row in rows}
     try:
-        if path.exists():
-            with open(path, newline="") as file:
-                old = list(csv.DictReader(file))
-            rows = [r for r in old if (r["algorithm"], r["environment"]) not in ours] + rows
-        temporary = path.with_suffix(".tmp")
-        with open(temporary, "w", newline="") as file:
-            writer = csv.DictWriter(file, CHOICE_COLUMNS, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
-        os.replace(temporary, path)
+        with open(path.with_name(".choice.lock"), "w") as lock:
+            fcntl.lockf(lock, fcntl.LOCK_EX)  # until it is closed: commands may end side by side
+            replace_choice(path, rows)
     except (OSError, KeyError, ValueError) as error:
         fail(f"cannot write {path} ({type(error).__name__}: {error})")
+
+
+def replace_choice(path, rows):
+    """Replace the lines of what was chosen now, and keep the others."""
+    ours = {(row["algorithm"], row["environment"]) for row in rows}
+    if path.exists():
+        with open(path, newline="") as file:
+            old = list(csv.DictReader(file))
+        rows = [r for r in old if (r["algorithm"], r["environment"]) not in ours] + rows
+    temporary = path.with_suffix(".tmp")
+    with open(temporary, "w", newline="") as file:
+        writer = csv.DictWriter(file, CHOICE_COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    os.replace(temporary, path)

@@ -2,6 +2,8 @@
 
 import csv
 import math
+import multiprocessing
+import os
 import re
 from statistics import fmean
 
@@ -313,6 +315,26 @@ def test_another_choice_keeps_the_lines_of_the_first(tmp_path):
         lines = read(tmp_path / "choice.csv")
         assert lines[:-2] == before
         assert [line["phase"] for line in lines[-2:]] == ["confirmation"] * 2
+
+
+def test_two_commands_that_end_side_by_side_keep_each_others_lines(tmp_path, monkeypatch):
+    path = tmp_path / "choice.csv"
+    line = dict.fromkeys(CHOICE_COLUMNS, "x")
+    replace = os.replace
+    fork = multiprocessing.get_context("fork")
+    second = fork.Process(target=choose_runs.write_choice, args=(path, [line]))
+
+    def replace_late(temporary, path):
+        monkeypatch.undo()
+        second.start()
+        second.join(timeout=1)  # the second has written by now, or waits for the first
+        replace(temporary, path)
+
+    monkeypatch.setattr(os, "replace", replace_late)
+    choose_runs.write_choice(path, [line | {"algorithm": "first"}])
+    second.join()
+    assert second.exitcode == 0
+    assert [found["algorithm"] for found in read(path)] == ["first", "x"]
 
 
 def test_status_says_who_survives(tmp_path):
