@@ -5,6 +5,7 @@ import math
 import multiprocessing
 import os
 import re
+from pathlib import Path
 from statistics import fmean
 
 import numpy as np
@@ -294,6 +295,24 @@ def test_the_core_hours_announced(algorithm, env, seconds, tmp_path):
     )
     [choice] = choose_runs.choices(args)
     assert choice.core_hours == pytest.approx(seconds / 3600)
+
+
+def test_the_readme_says_what_it_takes_by_default():
+    text = " ".join((Path(__file__).parent.parent / "README.md").read_text().split())
+    pattern = r"takes (\d+) runs .* about (\d+) hours for PPO and (\d+) for SAC in a small env"
+    runs, *hours = map(int, re.search(pattern, text).groups())
+    for algorithm, announced in zip(("ppo", "sac"), hours, strict=True):
+        args = parse_args("list", "/", ["choose", "--algos", algorithm, "--envs", "Hopper-v5"])
+        choices = choose_runs.choices(args)
+        assert choose_runs.total(choices).startswith(f"{runs} runs in all")
+        assert choices[0].core_hours == pytest.approx(announced, rel=0.03)
+
+
+def test_a_second_choice_takes_the_same_fresh_seeds(tmp_path):
+    words = f"--algos | ppo | --envs | Pendulum-v1 | --noises | {A}@1 | --confirm | "
+    assert [len(batch) for batch in batches(arguments(words + "4", tmp_path))] == [8]
+    [more] = batches(arguments(words + "6", tmp_path))
+    assert {name.rpartition("__")[2] for name in more} == {"1005", "1006"}
 
 
 def test_another_choice_keeps_the_lines_of_the_first(tmp_path):
