@@ -716,6 +716,7 @@ def worse_noises(runs, paper):
         p, _ = mann_whitney(noisy, without)
         found[noise] = {"change": change.to_dict(), "average": change.mean(), "p": p}
         found[noise]["lowest"] = list(change.index[noisy.max() < without.min()])
+        found[noise]["alone"] = {e: mann_whitney(noisy[[e]], without[[e]])[0] for e in environments}
         found[noise]["finds"] = {e: finds(noisy[e], without[e], 0)[0] for e in environments}
         row = {"noise": f"`{noise}`"} | {name: "\u2013" for name in ENVIRONMENTS}
         row |= {name: f"{value:+.0f} %" for name, value in change.items()}
@@ -726,16 +727,20 @@ def worse_noises(runs, paper):
             found[noise]["paper"] = theirs.loc[noise, "average_improvement_percent"]
         rows.append(row | {"p (exact)": f"{p:.2g}"})
     if {MIXUP, PLAIN_MIXUP} <= found.keys():
-        found["mixtures"] = mixtures(runs)
+        found["mixtures"] = mixtures(runs, paper)
     return {"table": markdown(rows) if rows else "", **found}
 
 
-def mixtures(runs):
+def mixtures(runs, paper):
     """PPO with the two kinds of mixup, in the environments that both were run in.
 
     Averages over environments of the change in percent of the mean without noise, which is taken as
-    known, and the difference of the two with its interval (Welch, Satterthwaite).
+    known, and the difference of the two with its interval (Welch, Satterthwaite). `needed` is what
+    the plain kind's change in each other environment would have to be for the paper's average.
     """
+    average = paper["consistently_worse"].query(
+        "algorithm == 'PPO' and noise == @MIXUP and noise_rate == '1.00'"
+    )["average_improvement_percent"]
     environments = WORSE[PLAIN_MIXUP]
     base = by_environment(runs[runs["noise"] == ""], FIXED_SEEDS)[environments].mean()
     noisy = (
@@ -743,12 +748,15 @@ def mixtures(runs):
         for noise in (MIXUP, PLAIN_MIXUP)
     )
     recursive, plain = (improvement_percent(returns[environments], base) for returns in noisy)
+    others = len(ENVIRONMENTS) - len(environments)
+    needed = (len(ENVIRONMENTS) * average.item() - plain.mean().sum()) / others
     samples = [table[name].to_numpy() for table in (recursive, plain) for name in environments]
     weight = 1 / len(environments)
     difference, _, low, high = contrast(samples, 3 * [weight] + 3 * [-weight])
     return {
         "recursive": recursive.mean().mean(),
         "plain": plain.mean().mean(),
+        "needed": needed,
         "difference": difference,
         "low": low,
         "high": high,
@@ -901,6 +909,7 @@ def numbers():
         "draws": f"{DRAWS:,}",
         "scaled_reward": SCALE,
         "normal": NORMAL,
+        "mixup": MIXUP,
         "plain_mixup": PLAIN_MIXUP,
         "noisy_share": shares[1],
         "highest_share": max(share.drop("Humanoid").max() for share in shares),

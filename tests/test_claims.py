@@ -207,9 +207,11 @@ def test_the_two_mixtures_by_hand():
         )
         for seed in seeds
     ]
-    found = claims.mixtures(pd.DataFrame(rows, columns=list(make_runs([]).columns)))
+    paper = claims.read_paper(RESULTS / "paper")
+    found = claims.mixtures(pd.DataFrame(rows, columns=list(make_runs([]).columns)), paper)
     assert found["recursive"] == pytest.approx(-50 / 3)
     assert found["plain"] == pytest.approx(-80 / 3) and found["difference"] == pytest.approx(10)
+    assert found["needed"] == pytest.approx((5 * -76.4 + 80) / 2)  # the paper has -76.4 on average
     error = np.sqrt(3 * (1 + 4) * 2.5 / 5) / 3  # in percent: the variance of 1 ... 5 is 2.5
     df = 15**2 / (3 * (1 + 16) / 4)
     half = stats.t.ppf(0.975, df) * error
