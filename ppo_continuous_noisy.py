@@ -496,13 +496,7 @@ class Run:
         for path in sorted(filter(Path.is_file, old), reverse=True):  # result.json before policy.pt
             path.unlink()
         self.checkpoint, result = self.folder / "checkpoint.pt", self.folder / "result.json"
-        describe = 'git describe --always --dirty --abbrev=40 --exclude="*"'
-        here = Path(__file__).parent
-        git = subprocess.run(describe, shell=True, cwd=here, capture_output=True, text=True)
-        versions = {module.__name__: module.__version__ for module in (torch, gym, mujoco, np)}
-        versions["python"] = sys.version.split()[0]
-        now = {"matmul_precision": precision, "git_commit": git.stdout.strip() or None}
-        self.config = {"algorithm": algorithm, "args": asdict(args), "versions": versions, **now}
+        self.config = {"algorithm": algorithm, "args": asdict(args), "versions": {}}
         self.is_finished = result.exists()
         if any(self.folder.glob("*.json")) or self.checkpoint.exists():
             self.config = self._old_config()
@@ -512,16 +506,21 @@ class Run:
                 print(f"{self.folder} is finished: mean test return {mean:.1f}")
             self.checkpoint.unlink(missing_ok=True)
         else:
-            self._note_changes(self.config, now)
-            self._note_changes(self.config.setdefault("versions", versions), versions)
+            self._note_versions(precision)
 
-    def _note_changes(self, old, now):
-        # what has changed since the run began is kept like this: "2.12.0, 2.13.0"
-        for name, value in now.items():
-            used = str(old.get(name, value))
-            if str(value) not in used.split(", "):
-                print(f"{name} is {value} now; this run had {used} so far")
-                old[name] = f"{used}, {value}"
+    def _note_versions(self, precision):
+        describe = 'git describe --always --dirty --abbrev=40 --exclude="*"'
+        here = Path(__file__).parent
+        git = subprocess.run(describe, shell=True, cwd=here, capture_output=True, text=True)
+        now = {"matmul_precision": precision, "git_commit": git.stdout.strip() or None}
+        versions = {module.__name__: module.__version__ for module in (torch, gym, mujoco, np)}
+        versions["python"] = sys.version.split()[0]
+        for old, new in ((self.config, now), (self.config.setdefault("versions", {}), versions)):
+            for name, value in new.items():
+                used = str(old.setdefault(name, value))
+                if str(value) not in used.split(", "):  # changed since the run began: keep both
+                    print(f"{name} is {value} now; this run had {used} so far")
+                    old[name] = f"{used}, {value}"
 
     def _old_config(self):
         path, new = self.folder / "config.json", asdict(self.args)

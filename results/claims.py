@@ -153,7 +153,7 @@ def welch_interval(x, y):
     """Return the 95 % interval of the difference of the samples' means, row by row."""
     parts = np.array([z["std"] ** 2 / z["n"] for z in (x, y)])
     df = parts.sum(axis=0) ** 2 / (parts**2 / [z["n"] - 1 for z in (x, y)]).sum(axis=0)
-    half = stats.t.ppf(0.975, df) * np.sqrt(parts.sum(axis=0))
+    half = stats.t.ppf(0.975, df) * standard_error(x, y)
     difference = x["mean"] - y["mean"]
     return difference - half, difference + half
 
@@ -537,7 +537,6 @@ def five_noises(base, noisy, paper_base, paper_noisy, percent, statistics):
         "paper_percent": percent.to_dict(),
         "p": tested["p"].to_dict(),
         "holm": dict(zip(names, corrected, strict=True)),
-        "strict_power": dict(zip(names, strict, strict=True)),
         "reward": {
             "n": len(rewarding),
             "higher": (gain[rewarding] > 0).sum(),
