@@ -218,16 +218,17 @@ def test_the_two_mixtures_by_hand():
     assert found["low"] == pytest.approx(10 - half) and found["high"] == pytest.approx(10 + half)
 
 
-def test_td3_with_noise_is_shown_once_five_seeds_are_there():
+def test_td3_with_noise_is_compared_on_halfcheetah_and_five_seeds():
     paper = claims.read_paper(RESULTS / "paper")
     names = ["environment", "noise", "noise_rate", "seed", "test"]
     here, other = "HalfCheetah", "Hopper"
     rows = [(here, "", "0.00", seed, 100.0 + seed) for seed in range(1, 7)]
     rows += [(here, claims.NORMAL, "1.00", seed, 50.0 + seed) for seed in range(1, 6)]
-    rows += [(here, claims.NORMAL, "0.01", seed, 50.0 + seed) for seed in range(1, 5)]
+    rows += [(here, claims.NORMAL, "0.01", seed, 101.5 + seed) for seed in range(1, 6)]
     rows += [(other, claims.NORMAL, "0.01", seed, 50.0 + seed) for seed in range(1, 6)]
     found = claims.td3(pd.DataFrame(rows, columns=names), paper)
-    assert set(found) == {"table", "1.00"} and "-92 ± 7 %" in found["table"]
+    assert "-33 ± 15 %" in found["table"] and "-92 ± 7 %" in found["table"]
+    assert found["0.01"]["percent"] == pytest.approx(100 * 1.5 / 103)
     assert found["1.00"]["percent"] == pytest.approx(100 * -50 / 103)
     assert found["1.00"]["p"] == pytest.approx(2 / 252)
 
