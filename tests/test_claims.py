@@ -235,15 +235,16 @@ def test_td3_with_noise_is_compared_on_halfcheetah_and_five_seeds():
 
 def test_td3_at_full_length_is_compared_with_its_papers(monkeypatch):
     paper = claims.read_paper(RESULTS / "paper")
-    assert claims.long_td3(RESULTS / "nowhere", paper) == {"table": ""}
     returns = {"environment": "Walker2d", "test": [3900.0, 4000, 4100], "training": [3, 4, 5.0]}
     monkeypatch.setattr(claims, "read_returns", lambda _: pd.DataFrame(returns))
-    rows = claims.long_td3(RESULTS, paper)["table"].splitlines()[2:]
+    found = claims.long_td3(RESULTS, paper)
+    rows = found["table"].splitlines()[2:]
     ours = {"mean": 4000, "std": 100, "n": 3}
     theirs = {"mean": 4015.6, "std": 415.4, "n": 5}
     samples = [pd.DataFrame(x, index=[0]) for x in (ours, theirs)]
     low, high = (limit[0] for limit in claims.welch_interval(*samples))
     assert f"4,000 ± 100 | 4,016 ± 415 | -16 [{low:,.0f}, {high:,.0f}]" in rows[0]
+    assert found["the paper, v2, test"]["low"] == pytest.approx(100 * low / 4015.6)
     assert f"| 4.0 ± 1.0   | 4,058 ± {658.78 * np.sqrt(1.5):.0f} |" in rows[1]
 
 
