@@ -724,7 +724,7 @@ def worse_noises(runs, paper):
             row["the paper"] = spell_average(theirs.loc[noise])
             found[noise]["paper"] = theirs.loc[noise, "average_improvement_percent"]
         rows.append(row | {"p (exact)": f"{p:.2g}"})
-    return {"table": markdown(rows), "mixtures": mixtures(runs, paper), **found}
+    return {"table": markdown(rows), **found}
 
 
 def mixtures(runs, paper):
@@ -923,6 +923,7 @@ def numbers():
         "pusher": pusher(ppo) | {"step": other_step(read_returns(HERE / "choice"), ppo)},
         "half_cheetah": half_cheetah(ppo, best["improvement_percent"]["HalfCheetah"]),
         "worse_noises": worse_noises(ppo, paper),
+        "mixtures": mixtures(ppo, paper),
         "td3": td3(returns.query("algorithm == 'TD3'"), paper),
         "long_td3": long_td3(HERE / "long", paper),
         "sac": sac(early, statistics),
