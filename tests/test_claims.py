@@ -166,6 +166,24 @@ def test_the_five_comparisons_stay_on_seeds_1_to_10():
     assert set(other["noise"]) == {""} and len(other) == 10
 
 
+def test_the_sets_of_runs_are_whole():
+    """The page names the seeds of each comparison; a run that is lost must not go unnoticed."""
+    runs = claims.read_returns(RESULTS / "runs")
+    few, cheetah = claims.FEW_SEEDS, [*claims.FIXED_SEEDS, *claims.CHEETAH_SEEDS]
+    expected = [
+        ("PPO", "HalfCheetah", "", "0.00", cheetah),
+        ("TD3", "HalfCheetah", "", "0.00", few),
+    ]
+    expected += [("TD3", "HalfCheetah", claims.NORMAL, rate, few) for rate in ("0.01", "1.00")]
+    for noise, environments in claims.WORSE.items():
+        expected += [("PPO", environment, noise, "1.00", few) for environment in environments]
+    keys = ["algorithm", "environment", "noise", "noise_rate"]
+    found = runs.groupby(keys)["seed"].apply(sorted)
+    for *key, seeds in expected:
+        assert found[tuple(key)] == list(seeds), key
+    assert sorted(claims.read_returns(RESULTS / "long")["seed"]) == [1, 2, 3]
+
+
 def test_worse_noises_by_hand(monkeypatch):
     """Runs of 10 become 5, 8 and 12 in three environments: changes of -50, -20 and +20 %."""
     plain_mixup = "RandomMixupObservation(0.0)"
