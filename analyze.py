@@ -26,8 +26,8 @@ import pandas as pd
 import tyro
 from scipy import stats
 
-from analyze_compare import PAPER_CONFIGURATIONS, compare_tables, read_paper
-from analyze_luck import (
+from analysis.figures import figures, text_table, write_figure, write_report, write_table
+from analysis.luck import (
     CONSISTENT_PERCENT,
     DRAWS,
     LUCKY,
@@ -37,10 +37,10 @@ from analyze_luck import (
     luck_of_study,
     luck_rows,
 )
-from analyze_report import figures, text_table, write_figure, write_report, write_table
-from analyze_robustness import read_robustness, robustness_sentences, robustness_tables
-from analyze_runs import BASELINE, KEYS, left_out, make_studies, read_choice, read_runs
-from analyze_statistics import (
+from analysis.paper import PAPER_CONFIGURATIONS, compare_tables, read_paper
+from analysis.robustness import read_robustness, robustness_sentences, robustness_tables
+from analysis.runs import BASELINE, KEYS, left_out, make_studies, read_choice, read_runs
+from analysis.statistics import (
     COVERAGE,
     COVERAGE_OF_MIXTURES,
     MIN_SEEDS,
@@ -54,7 +54,7 @@ from analyze_statistics import (
     probability_of_improvement,
     steps_to_reach,
 )
-from analyze_verdict import power, sentences, tally, verdict
+from analysis.verdicts import power, sentences, tally, verdict
 
 
 @dataclass

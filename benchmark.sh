@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# A sweep: a grid of runs (grid.py) -> one complete command per line -> an executor.
+# A sweep: a grid of runs (sweep/grid.py) -> one complete command per line -> an executor.
 set -euo pipefail
 
 usage() {
@@ -161,7 +161,7 @@ export PYTHON
   gymnasium mujoco torch tyro tensorboard 2>/dev/null ||
   fail "'$PYTHON' lacks a package: set PYTHON, or install requirements.txt into .venv"
 
-show() { "$PYTHON" sweep.py "$1" "$caller" ${grid[@]+"${grid[@]}"}; }
+show() { "$PYTHON" -m sweep "$1" "$caller" ${grid[@]+"${grid[@]}"}; }
 if [ $view = status ]; then
   show status
   exit
@@ -307,7 +307,7 @@ run_todo() {
   set +m
   [ "$stopped" -eq 0 ] || "stop_$executor" &
   trap '' PIPE # whoever reads what this prints may leave first
-  [ ! -t 2 ] || { "$PYTHON" sweep.py watch "$caller" "${grid[@]}" & watch=$!; }
+  [ ! -t 2 ] || { "$PYTHON" -m sweep watch "$caller" "${grid[@]}" & watch=$!; }
   while kill -0 -- "-$group" 2>/dev/null; do
     sleep 1 & wait $! || true # a trap interrupts wait, not sleep
   done

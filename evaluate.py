@@ -35,7 +35,7 @@ from gymnasium.wrappers import RecordVideo
 from tabulate import tabulate
 from tqdm import tqdm
 
-from analyze_runs import is_run, labels, read_config
+from analysis.runs import is_run, labels, read_config
 from noisy_wrappers import canonical_noises, make_noisy, noise_slug
 
 HEADER = ["noise", "noise_rate", "episode", "episodic_return", "episodic_length"]
@@ -65,7 +65,7 @@ class Args:
 
 
 class Run(NamedTuple):
-    """A finished run, as analyze_runs.read_config reads and names it."""
+    """A finished run, as analysis.runs.read_config reads and names it."""
 
     folder: Path
     base: str  # the algorithm

@@ -1,0 +1,1 @@
+"""What analyze.py and evaluate.py read and compute with."""

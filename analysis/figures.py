@@ -1,0 +1,492 @@
+"""How analyze.py's results look: numbers as text, tables as files, figures, and report.html."""
+
+import base64
+import re
+import zlib
+from itertools import product
+from pathlib import Path
+
+import jinja2
+import matplotlib
+import numpy as np
+import pandas as pd
+from markupsafe import Markup, escape
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from tabulate import tabulate
+
+from analysis.runs import BASELINE, rate_order
+from analysis.verdicts import tally
+
+matplotlib.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
+matplotlib.rcParams["svg.hashsalt"] = "noisy"  # equal figures are equal files
+WIDTH, HEIGHT = 10, 5.5  # inches of every figure; one with many rows is higher
+viridis = matplotlib.colormaps["viridis"]  # ordered by lightness, so it reads in grey
+TOP = 10  # configurations in the interval plot
+
+
+def slug(text):
+    """Turn a label or a noise into a part of a file name; a long one is cut and keeps a hash."""
+    name = re.sub(r"[^A-Za-z0-9._=+-]+", "_", text).strip("_")
+    return name if len(name) <= 150 else f"{name[:140]}_{zlib.crc32(name.encode()):08x}"
+
+
+# ------------------------------------------------------------------------------------------- tables
+
+# Columns that are shown as one: "mean ± std", "estimate [low, high]" or "ours (the baseline's)".
+MERGED = {
+    "baseline": ("baseline_mean", "baseline_std"),
+    "noisy": ("noisy_mean", "noisy_std"),
+    "mean": ("mean", "std"),
+    "average improvement %": ("average_improvement_percent", "std_improvement_percent"),
+    "IQM": ("iqm", "iqm_low", "iqm_high"),
+    "improvement (IQM) %": ("improvement_iqm_percent", "improvement_low", "improvement_high"),
+    "interaction": ("interaction", "interaction_low", "interaction_high"),
+    "interaction %": ("interaction_percent", "percent_low", "percent_high"),
+    "difference": ("difference", "difference_low", "difference_high"),
+    "P(improvement)": ("probability_of_improvement", "probability_low", "probability_high"),
+}
+for _name in ("score", "worst_score", "cvar_score"):
+    MERGED[f"{_name} (baseline)"] = (_name, f"baseline_{_name}")
+WHOLE = ["n", "n_baseline", "conditions", "environments", "chosen_from", "steps_to_baseline"]
+WHOLE += ["seeds_needed", "percent_of_environments", "configurations"]
+WHOLE += ["consistent", "consistently_worse"]
+# Columns that would make a table wider than a page; {name}.csv has them.
+ONLY_CSV = {
+    "best": ["leave_one_seed_out_mean"],
+    "luck": ["consistent_by_luck_95", "consistently_worse_by_luck_95"],
+    "compare_luck": ["consistent_by_luck_95", "consistently_worse_by_luck_95"],
+    "statistics": ["environments", "comparisons", "smallest_p", "smallest_p_adjusted"],
+    "robustness_score": ["smallest_p"],
+}
+for _name in ("mean", "average improvement %"):
+    MERGED[f"paper: {_name}"] = tuple(f"paper_{column}" for column in MERGED[_name])
+
+
+def cell(name, value):
+    """Spell one value of the column `name`; a value that does not exist is a dash."""
+    if pd.isna(value):
+        return "\u2013"
+    if isinstance(value, str):
+        return value or ("baseline" if name == "noise" else "\u2013")
+    if name.startswith(("p_", "paper_p_")) or name in ("p", "smallest_p", "smallest_p_adjusted"):
+        return f"{value:.2g}"
+    if name.startswith("probability"):
+        return f"{value:.2f}"
+    if name == "steps_millions":
+        return f"{value:g}"
+    whole = name in WHOLE or name.endswith("_beyond_luck")
+    return f"{value:z,.0f}" if whole else f"{value:z,.1f}"  # z: no "-0"
+
+
+def merged(title, parts, table, text):
+    """Return one column of text for the columns `parts`; a value that does not exist is a dash."""
+    columns = [text[name] for name in parts]
+    if len(parts) == 3:
+        interval = columns[0] + " [" + columns[1] + ", " + columns[2] + "]"
+        result = interval.where(table[parts[1]].notna(), columns[0])
+    elif title.endswith("(baseline)"):
+        result = columns[0] + " (" + columns[1] + ")"
+    else:
+        result = columns[0] + " \u00b1 " + columns[1]
+    return result.where(table[parts[0]].notna(), "\u2013")
+
+
+def shown(name, table):
+    """Return `table` as a person reads it: all text, related columns in one, rates side by side."""
+    table = table.reset_index(drop=True).drop(columns=ONLY_CSV.get(name, []))
+    text = pd.DataFrame({c: [cell(c, v) for v in table[c]] for c in table}, dtype=object)
+    for title, parts in MERGED.items():
+        if parts[-1] in text:
+            text[parts[0]] = merged(title, parts, table, text)
+            text = text.drop(columns=list(parts[1:])).rename(columns={parts[0]: title})
+    if name == "early_performance" and len(text):
+        text["mean"] += " (" + text.pop("n") + ")"
+        keys = ["algorithm", "environment", "noise", "steps_millions"]
+        text = text.pivot(index=keys, columns="noise_rate", values="mean").fillna("\u2013")
+        text = text[sorted(text.columns, key=rate_order)].reset_index()
+    return text.rename(columns=lambda column: column.replace("_", " ").replace("percent", "%"))
+
+
+def text_table(name, table):
+    """Format a table for the terminal."""
+    text = shown(name, table)
+    return tabulate(text.values, text.columns, disable_numparse=True) if len(text) else "(empty)"
+
+
+def write_table(out, name, table, caption):
+    """Write {name}.csv (all digits), .md and .tex (longtable, as people read them)."""
+    table.to_csv(out / f"{name}.csv", index=False, float_format="%.10g", lineterminator="\n")
+    text = shown(name, table)
+    markdown = tabulate(text.values, text.columns, tablefmt="pipe", disable_numparse=True)
+    (out / f"{name}.md").write_text(f"{caption}\n\n{markdown}\n")
+    latex = tabulate(text.values, text.columns, tablefmt="latex_longtable", disable_numparse=True)
+    escaped = re.sub(r"([%&_#])", r"\\\1", caption).replace("|", r"\textbar{}").replace("\n", " ")
+    latex = latex.replace("\n", f"\n\\caption{{{escaped}}}\\\\\n", 1)
+    for sign, command in (("\u00b1", r"$\pm$"), ("\u2013", "--"), (" < ", " $<$ ")):
+        latex = latex.replace(sign, command)
+    (out / f"{name}.tex").write_text(latex + "\n")
+
+
+# ------------------------------------------------------------------------------------------ figures
+
+
+def figures(studies, tables):
+    """Yield (name, figure, caption) for every figure, in the order of the report."""
+    statistics = tables["statistics"][0]
+    for study in studies:
+        tested = statistics[(statistics["algorithm"] == study.algorithm) & statistics["p"].notna()]
+        summary = tables[f"summary_{study.base}"][0]
+        summary = summary[summary["algorithm"] == study.algorithm]
+        if tested["improvement_iqm_percent"].notna().any():
+            yield interval_figure(study, tested)
+        noises = sorted({noise for noise, _ in study.returns if noise})
+        if tested["improvement_iqm_percent"].notna().any() and len(noises) > 1:
+            yield heatmap_figure(study, summary)
+        for noise in noises or [""]:
+            yield curves_figure(study, noise)
+        for wrapper in sorted({noise.split("(")[0] for noise in noises}):
+            variants = [n for n in noises if n.split("(")[0] == wrapper and " + " not in n]
+            if len(variants) > 1:
+                yield ablation_figure(study, summary, variants)
+    if "robustness" in tables:
+        yield from robustness_figures(tables["robustness"][0])
+
+
+def span(numbers):
+    """Spell the numbers of seeds or environments behind a line or a panel: "5", or "3 to 5"."""
+    low, high = min(numbers, default=0), max(numbers, default=0)
+    return f"{low}" if low == high else f"{low} to {high}"
+
+
+def panels(environments, labels):
+    """Make one panel per environment, three in a row, above a legend with as many labels."""
+    across = min(3, len(environments))
+    down = -(-len(environments) // across)
+    columns = max(1, min(4, int(130 / max(map(len, labels)))))
+    legend = 0.2 + 0.2 * -(-len(labels) // columns)
+    height = max(HEIGHT, 2.4 * down + legend)
+    fig = Figure(figsize=(WIDTH, height))
+    # Placed by hand: matplotlib's automatic layouts take as long as the drawing itself.
+    bottom, top = (legend + 0.45) / height, 1 - 0.3 / height
+    fig.subplots_adjust(0.9 / WIDTH, bottom, 1 - 0.3 / WIDTH, top, wspace=0.25, hspace=0.45)
+    axes = fig.subplots(down, across, squeeze=False).ravel()
+    for ax in axes[len(environments) :]:
+        ax.remove()
+    for ax, env in zip(axes, environments, strict=False):
+        ax.set_title(env)
+        ax.yaxis.get_major_locator().set_params(nbins=5)
+        if ax.get_subplotspec().is_first_col():
+            ax.set_ylabel("test return\n(sum of rewards per episode)")
+    axes = axes[: len(environments)]
+
+    def add_legend():
+        handles = axes[0].get_legend_handles_labels()[0]
+        fig.legend(handles, labels, loc="lower center", ncols=columns, frameon=False)
+
+    return fig, axes, add_legend
+
+
+def curves_figure(study, noise):
+    """Draw learning curves: mean over seeds, one line per noise rate, shaded standard deviation.
+
+    There is a panel for each environment in which this noise was tried.
+    """
+    configs = [config for config in study.returns if config[0] in ("", noise)]
+    noisy = [config[0] == noise for config in configs]
+    counts = np.stack([np.isfinite(study.final(config)).sum(axis=0) for config in configs])
+    tried = np.flatnonzero(counts[noisy].any(axis=0))
+    labels = []
+    for (name, rate), n in zip(configs, counts[:, tried], strict=True):
+        seeds = span(n[n > 0])  # in the panels that have the line
+        labels.append(f"rate {rate} (n = {seeds})" if name else f"no noise (n = {seeds})")
+    fig, axes, add_legend = panels([study.environments[e] for e in tried], labels)
+    unit, word = (1e6, "millions") if study.steps[-1] >= 1e6 else (1e3, "thousands")
+    x, every = study.steps / unit, max(1, len(study.steps) // 8)
+    for (e, ax), (i, config) in product(zip(tried, axes, strict=True), enumerate(configs)):
+        curves = study.returns[config][:, :, e]
+        curves = curves[:, np.isfinite(curves[-1])]
+        mean = curves.mean(axis=1) if curves.size else np.full(len(x), np.nan)
+        std = curves.std(axis=1, ddof=1) if curves.shape[1] > 1 else 0
+        color, line, marker = line_style(i, len(configs))
+        width = 1.8 if config == BASELINE else 1.1
+        marks = {"marker": marker, "markevery": (min(i, every - 1), every), "markersize": 4.5}
+        ax.plot(x, mean, line, color=color, linewidth=width, label=config[1], **marks)
+        ax.fill_between(x, mean - std, mean + std, color=color, alpha=0.07, linewidth=0)
+        ax.set_xlabel(f"training steps ({word})")
+    add_legend()
+    title = f"{study.algorithm}, {noise or 'no noise'}"
+    caption = f"{title}: learning curves, mean over n seeds, shaded \u00b1 one standard deviation."
+    return f"curves_{slug(title)}", fig, caption
+
+
+def ablation_figure(study, summary, noises):
+    """Draw bars of the final return: a wrapper's parameters side by side, grouped by noise rate."""
+    baseline = summary[summary["noise"] == ""]
+    groups = [summary[summary["noise"] == noise] for noise in noises]
+    rates = sorted({rate for group in groups for rate in group["noise_rate"]}, key=rate_order)
+    labels = [f"no noise (n = {span(baseline['n'])})"]
+    for noise, group in zip(noises, groups, strict=True):
+        labels.append(f"{noise} (n = {span(group['n'])})")
+    fig, axes, add_legend = panels(study.environments, labels)
+    width = 0.8 / len(noises)
+    for ax, env in zip(axes, study.environments, strict=True):
+        rows = baseline[baseline["environment"] == env].set_index("noise_rate").reindex(["0.00"])
+        bars(ax, [-1], rows, 0.6, color="white", hatch="", label=labels[0])
+        ax.axhline(rows["mean"].iloc[0], color="black", linewidth=0.6, linestyle=":")
+        ax.axhline(0, color="black", linewidth=0.6)
+        for i, group in enumerate(groups):
+            rows = group[group["environment"] == env].set_index("noise_rate").reindex(rates)
+            place = np.arange(len(rates)) + width * (i - (len(noises) - 1) / 2)
+            grey = str(0.85 - 0.4 * i / (len(noises) - 1))
+            hatch = ["", "//", "..", "xx", ""][i % 5]
+            bars(ax, place, rows, width, color=grey, hatch=hatch, label=labels[i + 1])
+        ax.set_xticks([-1, *range(len(rates))], ["none", *rates])
+        ax.set_xlabel("noise rate")
+    add_legend()
+    wrapper = noises[0].split("(")[0]
+    caption = f"{study.algorithm}, {wrapper}: final test return by parameters and noise rate. "
+    caption += "Bars: mean over n seeds, whiskers \u00b1 one standard deviation; dotted: no noise."
+    return f"ablation_{slug(study.algorithm)}_{wrapper}", fig, caption
+
+
+def bars(ax, place, rows, width, **look):
+    """Draw bars of the means with whiskers of one standard deviation."""
+    whiskers = {"yerr": rows["std"].fillna(0), "capsize": 2, "error_kw": {"elinewidth": 0.8}}
+    ax.bar(place, rows["mean"], width, edgecolor="black", linewidth=0.6, **whiskers, **look)
+
+
+def heatmap(grid, framed=None, below=0.9):
+    """Draw percentages (rows x columns), with the number in each cell: return figure, axes, limit.
+
+    The colours fit the data and end at \u00b1 `limit` %, which is at most 100. `framed` marks
+    cells (as `grid`, of bool); `below` is the space in inches for the names of the columns.
+    """
+    limit = int(np.clip(np.ceil(np.nanmax(np.abs(grid.to_numpy()))), 1, 100))
+    rows, columns = ([broken(name) for name in names] for names in (grid.index, grid.columns))
+    lines = max(name.count("\n") for name in rows) + 1
+    longest = max(len(line) for name in rows for line in name.split("\n"))
+    left = 0.4 + 0.075 * longest
+    height = max(HEIGHT, 0.5 + below + max(0.3, 0.17 * lines) * len(rows))
+    wide = min(1.2 * len(columns), WIDTH - left - 1.5)
+    high = min(0.8 * len(rows), height - 0.5 - below)
+    bottom = height - 0.5 - high
+    fig = Figure(figsize=(WIDTH, height))
+    ax = fig.add_axes([left / WIDTH, bottom / height, wide / WIDTH, high / height])
+    image = ax.imshow(grid, cmap="cividis", vmin=-limit, vmax=limit, aspect="auto")
+    for (i, j), value in np.ndenumerate(grid.to_numpy()):
+        if np.isfinite(value):
+            ink = "black" if value > 0 else "white"
+            ax.text(j, i, f"{round(value):+d}", ha="center", va="center", color=ink, fontsize=8)
+        if framed is not None and framed.iat[i, j]:
+            box = Rectangle((j - 0.46, i - 0.46), 0.92, 0.92, fill=False, edgecolor="red", lw=1.5)
+            ax.add_patch(box)
+    ax.set_xticks(range(len(columns)), columns)
+    ax.set_yticks(range(len(rows)), rows)
+    bar = fig.add_axes([(left + wide + 0.2) / WIDTH, bottom / height, 0.15 / WIDTH, high / height])
+    clipped = np.nanmax(np.abs(grid.to_numpy())) > limit
+    fig.colorbar(image, cax=bar, extend="both" if clipped else "neither", label="percent")
+    return fig, ax, limit
+
+
+def broken(label):
+    """Put each noise or rate of a combination on a line of its own."""
+    return str(label).replace(" + ", " +\n")
+
+
+def heatmap_figure(study, summary):
+    """Draw the mean improvement over environments, noise x rate, with the numbers in the cells."""
+    rows = summary[summary["improvement_percent"].notna()]
+    grid = rows.pivot_table(index="noise", columns="noise_rate", values="improvement_percent")
+    fig, ax, limit = heatmap(grid[sorted(grid.columns, key=rate_order)])
+    ax.set_xlabel("noise rate")
+    ax.set_title(f"{study.algorithm} ({span(rows['n'])} seeds)")
+    caption = f"{study.algorithm}: improvement of the final mean return over the baseline, mean "
+    caption += f"over environments ({span(rows.groupby(['noise', 'noise_rate']).size())} in a "
+    caption += f"cell); the colours end at \u00b1 {limit} %."
+    return f"heatmap_{slug(study.algorithm)}", fig, caption
+
+
+def interval_figure(study, statistics):
+    """Draw the configurations with the highest IQM of the improvement, with their intervals.
+
+    Those of several environments together, or, where there are none, those of each.
+    """
+    all_rows = statistics[statistics["environment"] == "all"]
+    together = len(all_rows) > 0
+    rows = all_rows if together else statistics
+    rows = rows[rows["environments"] == rows["environments"].max()]  # the same ones for all
+    of, rows = len(rows), rows.sort_values("improvement_iqm_percent", kind="stable").tail(TOP)
+    labels = [f"{r.noise}, rate {r.noise_rate} (n = {r.n})" for r in rows.itertuples()]
+    if not together:
+        pairs = zip(rows["environment"], labels, strict=True)
+        labels = [f"{environment}, {label}" for environment, label in pairs]
+    fig = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
+    left, right = axes = fig.subplots(1, 2, sharey=True, width_ratios=[3, 2])
+    place = np.arange(len(rows))
+    titles = ("improvement (IQM) %", "P(improvement)")
+    for ax, title, neutral in zip(axes, titles, (0, 0.5), strict=True):
+        middle, low, high = rows[list(MERGED[title])].astype(float).to_numpy().T
+        ax.hlines(place, low, high, color="0.6", linewidth=5)
+        ax.plot(middle, place, "|", color="black", markersize=11, markeredgewidth=2)
+        ax.axvline(neutral, color="black", linewidth=0.8, linestyle="--")
+        margin = 0.6 + max(0, 4 - len(rows)) / 2  # a few rows stay close together
+        ax.set_ylim(-margin, len(rows) - 1 + margin)
+    left.set_yticks(place, [broken(label) for label in labels])
+    left.set_xlabel("improvement over the baseline, IQM (%)")
+    right.set_xlabel("probability of improvement")
+    right.set_xlim(-0.02, 1.02)
+    where = f"{rows['environments'].iloc[0]:.0f} environments" if together else "each alone"
+    caption = f"{study.algorithm}, {where}: improvement with 95 % intervals (none for n < 3); "
+    caption += "dashed: no improvement."
+    if len(rows) < of:
+        caption += f" The {len(rows)} best of {of} are chosen on the seeds that are shown, so "
+        caption += "they look better than they are."
+    return f"intervals_{slug(study.algorithm)}", fig, caption
+
+
+def robustness_figures(table):
+    """Yield (name, figure, caption) for every figure of robustness: heatmaps, then curves."""
+    for (algorithm, environment), rows in table.groupby(["algorithm", "environment"]):
+        clean = rows[(rows["noise"] == "") & (rows["test_noise"] == "")]["mean"]
+        if len(clean) and clean.iloc[0] != 0 and len(rows) > 1:
+            yield robustness_heatmap(algorithm, environment, rows, clean.iloc[0])
+    for (algorithm, noise), rows in table.groupby(["algorithm", "test_noise"]):
+        if noise and " + " not in noise and rows["test_rate"].nunique() >= 3:
+            clean = (table["algorithm"] == algorithm) & (table["test_noise"] == "")
+            yield robustness_curves(algorithm, noise, pd.concat([table[clean], rows]))
+
+
+def robustness_heatmap(algorithm, environment, rows, clean):
+    """Draw training configuration x test condition: the score 100 (R - C) / |C| of every cell."""
+    trained = rows["noise"].where(rows["noise"] != "", "no noise") + ", " + rows["noise_rate"]
+    tested = rows["test_noise"].where(rows["test_noise"] != "", "clean") + ", " + rows["test_rate"]
+    score = 100 * (rows["mean"] - clean) / abs(clean)
+    cells = rows.assign(
+        trained=trained.str.replace("no noise, 0.00", "no noise"),
+        tested=tested.str.replace("clean, 0.00", "clean"),
+        score=score,
+        same=rows["tested_on"] == "the same noise",
+    )
+    # Rows and columns stand in the order of the table, which is that of noises and rates.
+    order = {"index": cells["trained"].unique(), "columns": cells["tested"].unique()}
+    axes = {"index": "trained", "columns": "tested"}
+    grid = cells.pivot(**axes, values="score").reindex(**order)
+    same = cells.pivot(**axes, values="same").reindex(**order).eq(True)
+    longest = max(map(len, grid.columns))
+    fig, ax, limit = heatmap(grid, same, below=0.7 + 0.05 * longest)
+    ax.tick_params(axis="x", rotation=35)
+    for label in ax.get_xticklabels():
+        label.set(ha="right", rotation_mode="anchor")
+    ax.set_title(f"{algorithm} on {environment}: trained with (rows), tested with (columns)")
+    caption = (
+        f"{algorithm} on {environment} ({span(rows['n'])} seeds): mean return under the noise "
+    )
+    caption += "of the column, of policies trained with the noise of the row, as its difference "
+    caption += "from the clean return of policies trained without noise, in percent of that. "
+    caption += f"Framed: tested on the noise of training. The colours end at \u00b1 {limit} %."
+    return f"robustness_heatmap_{slug(algorithm)}_{slug(environment)}", fig, caption
+
+
+def robustness_curves(algorithm, noise, rows):
+    """Draw the return against the rate of a test noise: one line per training configuration."""
+    configs = list(dict.fromkeys(zip(rows["noise"], rows["noise_rate"], strict=True)))
+    configs.sort(key=lambda config: (config[0], rate_order(config[1])))
+    labels = [f"{noise}, {rate}" if noise else "no noise" for noise, rate in configs]
+    environments = sorted(set(rows[rows["test_noise"] == noise]["environment"]))
+    fig, axes, add_legend = panels(environments, labels)
+    for (ax, environment), (i, config) in product(
+        zip(axes, environments, strict=True), enumerate(configs)
+    ):
+        mine = (rows["noise"] == config[0]) & (rows["noise_rate"] == config[1])
+        line = rows[mine & (rows["environment"] == environment)]
+        line = line.assign(rate=line["test_rate"].astype(float)).sort_values("rate")
+        color, dashes, marker = line_style(i, len(configs))
+        std = line["std"].astype(float).fillna(0)
+        look = {"color": color, "marker": marker or ".", "label": labels[i]}
+        ax.plot(line["rate"], line["mean"], dashes, **look)
+        ax.fill_between(
+            line["rate"], line["mean"] - std, line["mean"] + std, color=color, alpha=0.07, lw=0
+        )
+        ax.set_xlabel("rate of the noise in the test (0: clean)")
+    add_legend()
+    caption = f"{algorithm}, tested with {noise}: mean return over seeds against the rate, shaded "
+    caption += "\u00b1 one standard deviation; one line for each noise in training."
+    return f"robustness_curves_{slug(algorithm)}_{slug(noise)}", fig, caption
+
+
+def line_style(i, number):
+    """Return colour, line and marker of line i of so many; the first is the baseline, in black."""
+    color = viridis(0.7 * (i - 1) / max(1, number - 2)) if i else "black"
+    return color, ["-", "--", "-.", ":"][i % 4], ["", "o", "s", "^", "D", "v", "P", "X"][i % 8]
+
+
+def write_figure(out, name, fig):
+    """Write {name}.svg, and .pdf for LaTeX, without dates: equal figures are equal files."""
+    fig.savefig(out / f"{name}.svg", metadata={"Date": None})
+    fig.set_layout_engine("none")  # the layout is done
+    fig.savefig(out / f"{name}.pdf", metadata={"CreationDate": None})
+
+
+# ------------------------------------------------------------------------------------------- report
+
+SECTIONS = {
+    "choice": "Choice of a noise",
+    "best": "Best noise tried (may be worse than none)",
+    "consistent": "Consistent noise",
+    "consistently_worse": "Consistently worse",
+    "luck": "Luck",
+    "statistics": "Statistics",
+    "early_performance": "Learning curves",
+    "ablation": "Parameters",
+    "interactions": "Two noises together",
+    "robustness": "Robustness",
+    "summary": "All results",
+    "missing": "Runs left out",
+}
+FIGURES_OF = {"intervals": "best", "heatmap": "consistent", "curves": "early_performance"}
+
+
+def breakable(text):
+    """Mark where a browser may break a cell: a noise between its words, but never a number."""
+    if re.match("-?[0-9]", text):
+        text = text.replace(" \u00b1 ", "\u00a0\u00b1\u00a0").replace(", ", ",\u00a0")
+        parts = [Markup('<span class="number">{}</span>').format(part) for part in text.split(" ")]
+        return Markup(" ").join(parts)
+    return Markup(re.sub("(?<=[a-z0-9])(?=[A-Z(])", "<wbr>", str(escape(text))))
+
+
+def write_report(out, verdicts, tables, drawn, overview, problems, notes):
+    """Write report.html: one self-contained page with all verdicts, tables and figures."""
+    sections = {key: {"id": key, "title": title} for key, title in SECTIONS.items()}
+    for section in sections.values():
+        section |= {"tables": [], "figures": []}
+    for name, (table, caption) in tables.items():
+        text = shown(name, table)
+        key = name.removeprefix("compare_").removesuffix("_score")
+        entry = {
+            "name": name,
+            "caption": caption,
+            "columns": text.columns,
+            "rows": text.values.tolist(),
+        }
+        sections["summary" if key.startswith("summary") else key]["tables"].append(entry)
+    for name, caption in drawn:
+        kind = name.split("_")[0]
+        svg = base64.b64encode((out / f"{name}.svg").read_bytes()).decode()
+        entry = {"svg": svg, "caption": caption}
+        sections[FIGURES_OF.get(kind, kind)]["figures"].append(entry)
+    here = jinja2.FileSystemLoader(Path(__file__).parent)
+    pages = jinja2.Environment(loader=here, autoescape=True, trim_blocks=True)
+    full = [s for s in sections.values() if s["tables"] or s["figures"]]
+    pages.filters["breakable"] = breakable
+    page = pages.get_template("report.html.jinja")
+    groups = verdicts.groupby(["algorithm", "environment"], sort=False)
+    verdicts = []
+    for _, group in groups:
+        lines = group[["verdict", "sentence"]].to_dict("records")
+        verdicts.append({"lines": lines, "tally": tally(group["verdict"])})
+    html = page.render(
+        verdicts=verdicts, sections=full, overview=overview, problems=problems, notes=notes
+    )
+    (out / "report.html").write_text(html)

@@ -1,0 +1,186 @@
+"""What luck alone would show: a sweep in which no noise does anything, drawn many times.
+
+The best of many configurations looks good although none is. Each draw makes the baseline and all
+configurations anew, each with its own number of seeds, from one and the same distribution of final
+returns. Keeping the baseline fixed would not do: a baseline that was unlucky is part of the luck.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from analysis.runs import BASELINE
+
+DRAWS = 10_000
+SEEDS_TO_RESAMPLE = 20  # with fewer seeds of the baseline, returns are taken as normal
+CONSISTENT_PERCENT = 80  # of the environments, as in the paper
+LUCKY = 0.05
+
+
+@dataclass
+class Luck:
+    """What DRAWS sweeps of an algorithm show in which no noise does anything."""
+
+    best: dict  # environment -> (draws,) the highest improvement in percent
+    configurations: int  # how many there are in two or more environments
+    highest: np.ndarray  # (draws,) the highest average improvement of any of them
+    lowest: np.ndarray  # (draws,) the lowest one
+    consistent: np.ndarray  # (draws,) how many of them count as consistent
+    consistently_worse: np.ndarray  # (draws,) how many are worse in every environment
+
+
+def draw_improvements(mean, std, df, n_baseline, n_noisy, rng, seeds=()):
+    """Draw the improvements of configurations that do nothing, in percent of |mean|.
+
+    The standard deviation `std` was estimated with `df` degrees of freedom, so each draw has its
+    own, std sqrt(df / chi2_df). For a single configuration this is Student's t-test. Returns are
+    normal, or have the shape of the baseline's `seeds` if there are SEEDS_TO_RESAMPLE or more.
+
+    mean, std, df, n_baseline: numbers; n_noisy (configs,), 0 where there is no run
+    -> (configs x draws), NaN where there is no run.
+    """
+    spread = std * np.sqrt(df / rng.chisquare(df, DRAWS))
+    resample = len(seeds) >= SEEDS_TO_RESAMPLE and np.ptp(seeds) > 0
+    if resample:
+        shape = (seeds - np.mean(seeds)) / np.std(seeds)
+
+    def mean_of(n):
+        if resample:
+            return rng.choice(shape, (DRAWS, n)).mean(axis=1)
+        return rng.standard_normal(DRAWS) / np.sqrt(n)
+
+    baseline = mean_of(n_baseline)
+    improvements = np.full((len(n_noisy), DRAWS), np.nan)
+    for i, n in enumerate(n_noisy):
+        if n > 0:
+            improvements[i] = 100 * spread * (mean_of(n) - baseline) / abs(mean)
+    return improvements
+
+
+def pooled_std(samples):
+    """Return the standard deviation within samples, and its degrees of freedom."""
+    df = sum(len(sample) - 1 for sample in samples if len(sample))
+    squares = sum(((sample - sample.mean()) ** 2).sum() for sample in samples if len(sample))
+    return np.sqrt(squares / max(1, df)), df
+
+
+def summarize(environments, draws):
+    """Make a Luck of improvements (envs x configs x draws) that are NaN where there is no run."""
+    tried = np.isfinite(draws[..., 0])
+    best = {
+        name: values[here].max(axis=0)
+        for name, values, here in zip(environments, draws, tried, strict=True)
+        if here.any()
+    }
+    several = tried.sum(axis=0) > 1
+    draws, number = draws[:, several], tried[:, several].sum(axis=0)[:, None]
+    average = np.nansum(draws, axis=0) / number
+    percent = 100 * (draws >= 0).sum(axis=0) / number  # NaN >= 0 is false
+    return Luck(
+        best=best,
+        configurations=int(several.sum()),
+        highest=average.max(axis=0, initial=-np.inf),
+        lowest=average.min(axis=0, initial=np.inf),
+        consistent=(percent >= CONSISTENT_PERCENT).sum(axis=0),
+        consistently_worse=(percent == 0).sum(axis=0),
+    )
+
+
+def luck_of_study(study):
+    """Draw the sweep of a Study again, with its numbers of seeds, as if no noise did anything."""
+    rng = np.random.default_rng(0)
+    configs = [config for config in study.returns if config != BASELINE]
+    draws = np.full((len(study.environments), len(configs), DRAWS), np.nan)
+    for e in range(len(study.environments)):
+        samples = [study.final(config)[:, e] for config in (BASELINE, *configs)]
+        samples = [sample[np.isfinite(sample)] for sample in samples]
+        baseline, noisy = samples[0], samples[1:]
+        std, df = pooled_std(samples)
+        if len(baseline) and baseline.mean() != 0 and df > 0:
+            n_noisy = [len(sample) for sample in noisy]
+            draws[e] = draw_improvements(
+                baseline.mean(), std, df, len(baseline), n_noisy, rng, baseline
+            )
+    return summarize(study.environments, draws)
+
+
+def luck_of_paper(best, seeds, configurations):
+    """Draw the paper's sweep from its table of best noises: a dict of algorithm -> Luck.
+
+    The standard deviation is the baseline's. That of the best noise is known, too, but belongs to a
+    winner, which had luck with its seeds.
+
+    best: the table; seeds: algorithm -> seeds of each configuration, of which there are
+    `configurations` in every environment.
+    """
+    lucks = {}
+    for algorithm, rows in best.groupby("algorithm"):
+        rng, n = np.random.default_rng(0), seeds[algorithm]
+        draws = [
+            draw_improvements(
+                row.baseline_mean, row.baseline_std, n - 1, n, configurations * [n], rng
+            )
+            for row in rows.itertuples()
+        ]
+        lucks[algorithm] = summarize(list(rows["environment"]), np.stack(draws))
+    return lucks
+
+
+def p_value(draws, observed):
+    """P(a draw is as high as `observed`), the observation counted as a draw: never zero."""
+    return (1 + (draws >= observed).sum()) / (1 + len(draws))
+
+
+def add_luck_of_best(best, lucks):
+    """Add to a table of best noises what the best of as many useless configurations shows."""
+    best = best.assign(luck_median_percent=np.nan, luck_95_percent=np.nan, p_luck=np.nan)
+    for row in best.itertuples():
+        draws = lucks[row.algorithm].best.get(row.environment)
+        if draws is not None:
+            best.loc[row.Index, "luck_median_percent"] = np.median(draws)
+            best.loc[row.Index, "luck_95_percent"] = np.quantile(draws, 0.95)
+            best.loc[row.Index, "p_luck"] = p_value(draws, row.improvement_percent)
+    return best
+
+
+def add_luck_of_consistent(good, bad, lucks):
+    """Add p_luck to the tables of consistent and of consistently worse noise.
+
+    It is the probability that the highest average improvement of as many useless configurations is
+    at least as high, and that the lowest is at least as low.
+    """
+    rows = zip(good["algorithm"], good["average_improvement_percent"], strict=True)
+    good = good.assign(p_luck=[p_value(lucks[name].highest, value) for name, value in rows])
+    rows = zip(bad["algorithm"], bad["average_improvement_percent"], strict=True)
+    bad = bad.assign(p_luck=[p_value(-lucks[name].lowest, -value) for name, value in rows])
+    return good, bad
+
+
+def luck_rows(lucks, best, good, bad):
+    """Yield one row per algorithm: what its tables have, and what they would have by luck.
+
+    The tables are those of best, consistent and consistently worse noise, with p_luck.
+    """
+    for algorithm, luck in lucks.items():
+        p_best, p_good, p_bad = (
+            table.loc[table["algorithm"] == algorithm, "p_luck"] for table in (best, good, bad)
+        )
+        if len(p_best) == 0:
+            continue
+        row = {"algorithm": algorithm, "environments": len(p_best)}
+        row |= {"best_beyond_luck": (p_best <= LUCKY).sum(), "configurations": luck.configurations}
+        if luck.configurations:
+            row |= count_row("consistent", p_good, luck.consistent)
+            row |= count_row("consistently_worse", p_bad, luck.consistently_worse)
+        yield row
+
+
+def count_row(name, p, draws):
+    """Return luck_rows' columns for one table: its rows' p_luck, and how many rows luck makes."""
+    return {
+        name: len(p),
+        f"{name}_by_luck": draws.mean(),
+        f"{name}_by_luck_95": np.quantile(draws, 0.95),
+        f"p_{name}": p_value(draws, len(p)),
+        f"{name}_beyond_luck": (p <= LUCKY).sum(),
+    }

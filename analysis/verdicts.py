@@ -1,0 +1,226 @@
+"""One plain sentence for each environment and noise: is it better than no noise?
+
+A noise is called better or worse only where the p of the exact two-sided Mann-Whitney test,
+corrected with Benjamini and Hochberg's method over all configurations of one algorithm in one
+environment, is at most 0.05; where only the uncorrected p is, it is "perhaps" so.
+"""
+
+from functools import cache
+from math import ceil, inf, nan, pi, sqrt
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from analysis.runs import BASELINE
+from analysis.statistics import improvement_percent, mann_whitney_null, mean_std
+
+LEVEL, POWER = 0.05, 0.8
+# A test at this level finds an effect of so many standard errors with this power.
+DETECTABLE = stats.norm.ppf(1 - LEVEL / 2) + stats.norm.ppf(POWER)
+UNCLEAR = "no clear difference"
+VERDICTS = ["better", "worse", "perhaps better", "perhaps worse", UNCLEAR]  # in this order
+MAX_SEEDS = 1000  # a difference that would take more seeds is said to take more than these
+
+
+def verdict(row):
+    """Name the verdict of a row of statistics with its p, p_adjusted and win rate; or NaN."""
+    if pd.isna(row["p"]):
+        return nan
+    if round(row["p"], 12) > LEVEL:
+        return UNCLEAR
+    direction = "better" if row["probability_of_improvement"] > 0.5 else "worse"
+    return direction if round(row["p_adjusted"], 12) <= LEVEL else f"perhaps {direction}"
+
+
+# -------------------------------------------------------------------------------------------- power
+
+
+def normal_shift(n, m):
+    """Return the shift that n against m seeds find with 80 % power, for many seeds.
+
+    In standard deviations, for normal returns. Noether (1987),
+    https://doi.org/10.1080/01621459.1987.10478478.
+    """
+    return DETECTABLE * sqrt((1 / n + 1 / m) * pi / 3)
+
+
+@cache
+def detectable_shift(n, m):
+    """Return the shift that n against m seeds find with 80 % power, or NaN if there is none.
+
+    In standard deviations, for normal returns and the exact two-sided Mann-Whitney test at the 5 %
+    level. For few seeds it is simulated: when x is shifted by s, it wins the pairs with y - x < s.
+    """
+    tail = 2 * np.cumsum(mann_whitney_null(n, m))
+    losses = np.flatnonzero(tail <= LEVEL + 1e-12)  # so many lost pairs are still significant
+    if len(losses) == 0:
+        return nan
+    if n * m > 900:
+        return normal_shift(n, m)
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(size=(4000, n, 1)), rng.normal(size=(4000, 1, m))
+    gaps = np.sort((y - x).reshape(4000, n * m))
+    last_needed = n * m - losses[-1] - 1  # the largest gap that must be closed
+    return float(np.quantile(gaps[:, last_needed], POWER))
+
+
+@cache
+def seeds_needed(shift):
+    """Return how many seeds each side needs to find a shift (in sd) with 80 % power; maybe inf."""
+    if shift == 0:
+        return inf
+    n = max(4, ceil((normal_shift(1, 1) / shift) ** 2))
+    while n < 30 and not detectable_shift(n, n) <= shift:
+        n += 1
+    return n
+
+
+def power(x, y, observed_percent):
+    """Return what these returns could have shown, and what the observed improvement would take.
+
+    x (n) and y (m) are final returns with and without noise -> the improvement in percent that is
+    found with 80 % power, and the seeds that `observed_percent` needs. Both take the returns
+    for normal with the pooled standard deviation of x and y; NaN where that does not exist.
+    """
+    (_, x_std, n), (y_mean, y_std, m) = mean_std(x), mean_std(y)
+    if n < 2 or m < 2 or y_mean == 0:
+        return nan, nan
+    pooled = sqrt(((n - 1) * x_std**2 + (m - 1) * y_std**2) / (n + m - 2))
+    std_percent = 100 * pooled / abs(y_mean)
+    if std_percent == 0:
+        return nan, nan
+    shift = round(abs(observed_percent) / std_percent, 3)
+    return detectable_shift(n, m) * std_percent, seeds_needed(shift)
+
+
+# ---------------------------------------------------------------------------------------- sentences
+
+
+def percent(value, sign="+"):
+    """Spell a percentage: whole from 10 on, with a decimal below."""
+    return f"{value:{sign}.{0 if abs(value) >= 10 else 1}f} %"
+
+
+def interval(low, high):
+    """Spell an interval in percent: whole numbers, or with a decimal where it is narrow."""
+    if high - low >= 10:
+        return f"[{round(low)}, {round(high)}]"
+    return f"[{low:.1f}, {high:.1f}]"
+
+
+def p_value(p):
+    """Spell a p-value for a sentence: "= 0.04", or "< 0.001"."""
+    return f"= {p:.2g}" if p >= 0.001 else "< 0.001"
+
+
+def far_away(values):
+    """Count the values (n) that lie far above and far below the others (Tukey's outer fences)."""
+    low, high = np.quantile(values, [0.25, 0.75])
+    reach = 3 * (high - low)
+    return (values > high + reach).sum(), (values < low - reach).sum()
+
+
+def disagreement(mean_percent, iqm_percent, x, y):
+    """Say where the improvement of the mean differs from that of the interquartile mean, or "".
+
+    They differ by at least 10 points and by half of the larger one. x (n) with noise, y (m)
+    without.
+    """
+    apart = abs(mean_percent - iqm_percent)
+    if not apart >= max(10, abs(mean_percent) / 2, abs(iqm_percent) / 2):
+        return ""
+    reasons = []
+    for values, name in ((x, "with noise"), (y, "without noise")):
+        for count, where in zip(far_away(values), ("above", "below"), strict=True):
+            if count:
+                lie = "lies" if count == 1 else "lie"
+                reasons.append(f"{count} of {len(values)} runs {name} {lie} far {where} the others")
+    because = f": {' and '.join(reasons)}" if reasons else ""
+    return f" The mean says {percent(mean_percent)}{because}."
+
+
+def evidence(row):
+    """Spell the improvement with its interval and the p-values of a row of statistics."""
+    text = ""
+    if pd.notna(row["improvement_iqm_percent"]):
+        text = percent(row["improvement_iqm_percent"])
+        if pd.notna(row["improvement_low"]):
+            text += f" {interval(row['improvement_low'], row['improvement_high'])}"
+        text += ", "
+    text += f"p {p_value(row['p'])}"
+    if row["comparisons"] > 1 and row["verdict"] != UNCLEAR:
+        corrected = p_value(row["p_adjusted"]).removeprefix("= ")
+        text += f", corrected for {row['comparisons']:.0f} comparisons {corrected}"
+    elif row["comparisons"] == 1 and row["verdict"] != UNCLEAR:
+        text += ", the only comparison"
+    return text
+
+
+def reach(row):
+    """Say what the seeds of a row without a clear difference could have shown, or ""."""
+    n, m = int(row["n"]), int(row["n_baseline"])
+    seeds = f"{n} seeds" if n == m else f"{n} seeds against {m}"
+    if n == m == 1:
+        seeds = "one seed"
+    parts = []
+    if row["smallest_p"] > LEVEL:
+        parts.append(f"{seeds} cannot show any (smallest possible p: {row['smallest_p']:.2g})")
+    elif pd.notna(row["detectable_percent"]):
+        difference = percent(row["detectable_percent"], sign="")
+        parts.append(f"{seeds} could have shown {difference} (80 % power)")
+    needed = row["seeds_needed"]
+    if needed > max(n, m):
+        needed = f"about {needed:.0f}" if needed <= MAX_SEEDS else f"more than {MAX_SEEDS:,}"
+        difference = percent(abs(row["improvement_iqm_percent"]), sign="")
+        parts.append(f"{difference} would take {needed} seeds each")
+    return "; " + ", and ".join(parts) if parts else ""
+
+
+def sentence(row):
+    """Say in one sentence what a row of statistics shows."""
+    environment = row["environment"]
+    if environment == "all":
+        environment = f"all {row['environments']:.0f} environments together"
+    start = f"{row['algorithm']} on {environment} with {row['noise']} at rate {row['noise_rate']}"
+    if row["verdict"] == UNCLEAR:
+        return f"{start} shows {UNCLEAR}: {evidence(row)}{reach(row)}."
+    return f"{start} is {row['verdict']} than no noise: {evidence(row)}."
+
+
+def tally(verdicts):
+    """Count verdicts in words: "3 comparisons: 1 perhaps better, 2 no clear difference"."""
+    counts = verdicts.value_counts()
+    parts = [f"{counts[name]} {name}" for name in VERDICTS if name in counts]
+    return f"{len(verdicts)} comparisons: {', '.join(parts)}"
+
+
+def sentences(studies, statistics):
+    """Return a frame of algorithm, environment, verdict and sentence for all that was tested.
+
+    All environments together come before each alone, and clear differences before others.
+    """
+    tested = statistics[statistics["p"].notna() & (statistics["environment"] != "all but Pusher")]
+    tested = tested.assign(
+        apart=tested["environment"] != "all",
+        rank=[VERDICTS.index(verdict) for verdict in tested["verdict"]],
+    )
+    rows = []
+    for study in studies:
+        mine = tested[tested["algorithm"] == study.algorithm]
+        for _, row in mine.sort_values(["apart", "environment", "rank", "p"]).iterrows():
+            text = sentence(row) + remark(study, row)
+            rows.append((study.algorithm, row["environment"], row["verdict"], text))
+    return pd.DataFrame(rows, columns=["algorithm", "environment", "verdict", "sentence"])
+
+
+def remark(study, row):
+    """Return what the returns behind a row of one environment say besides, or ""."""
+    if row["environment"] not in study.environments:
+        return ""
+    e = study.environments.index(row["environment"])
+    x = study.final((row["noise"], row["noise_rate"]))[:, e]
+    y = study.final(BASELINE)[:, e]
+    x, y = x[np.isfinite(x)], y[np.isfinite(y)]
+    mean_percent = improvement_percent(x.mean(), y.mean())
+    return disagreement(mean_percent, row["improvement_iqm_percent"], x, y)

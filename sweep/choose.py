@@ -1,0 +1,243 @@
+"""The runs of `./benchmark.sh choose`: their folders say what they returned, choose.py what is due.
+
+The run folders are the only state. Whatever was killed, and whichever executor goes on, the same
+command computes from the finished runs where each choice stands.
+"""
+
+import csv
+import fcntl
+import itertools
+import json
+import os
+from pathlib import Path
+from statistics import fmean
+from typing import NamedTuple
+
+from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED, read_run
+from analysis.statistics import holm
+from sweep import halving
+from sweep.grid import Run, cell, cells, fail, make_run, result
+
+# What a run takes on one core until the finished ones tell: docs/sweeps.md
+STEPS_PER_SECOND = {"sac": 150, "td3": 265, "ppo": 5700}  # in small MuJoCo environments
+IN_HUMANOID = {"sac": 90, "td3": 130, "ppo": 2900}
+START_UP = 10  # seconds, with compilation
+
+
+class Choice(NamedTuple):
+    """The choice of a noise for one algorithm and environment, as far as it has come."""
+
+    name: str  # "PPO on Hopper-v5"
+    algorithm: str
+    env_id: str
+    schedule: list[tuple[int, int]]  # of its search
+    confirm: int  # fresh seeds of the confirmation
+    state: halving.State
+    runs: dict[tuple[str, str, int], Run]  # those that have been due so far
+    returns: dict[tuple[str, str, int], float]  # of those that are finished
+    core_hours: float  # about what is left
+
+
+def choices(args):
+    """Return the choices of one command, or exit if its numbers make no choice."""
+    pairs = list(itertools.product(dict.fromkeys(args.algos), args.envs))
+    fewest = halving.fewest_seeds(len(pairs))
+    if args.confirm < fewest:
+        fail(
+            f"--confirm must be at least {fewest}, not {args.confirm}: with fewer seeds no "
+            f"difference could be significant (number of verdicts: {len(pairs)})"
+        )
+    return [follow(args, algorithm, env_id) for algorithm, env_id in pairs]
+
+
+def follow(args, algorithm, env_id):
+    """Return one choice: where the finished runs have brought it."""
+    noises = candidates(args, algorithm, env_id)
+    budget = 3 * len(noises) if args.budget is None else args.budget
+    if budget < len(noises):
+        fail(f"--budget must be at least {len(noises)}, a run for each noise, not {budget}")
+    schedule = halving.schedule(len(noises), budget)
+    last_seed = sum(seeds for _, seeds in schedule)
+    if last_seed >= FIRST_CONFIRMATION_SEED:
+        fail(f"--budget {budget} is too large: the best noises would run with {last_seed} seeds")
+    cell_of = {halving.BASELINE: ([], [])} | noises
+    runs, returns = {}, {}
+    while True:
+        state = halving.advance(list(noises), budget, args.confirm, returns)
+        finished = {}
+        for noise, rate, seed in state.due:
+            run = make_run(args, algorithm, env_id, *cell_of[noise, rate], seed)
+            runs[noise, rate, seed] = run
+            if result(run)[0]:
+                finished[noise, rate, seed] = read_return(run, seed)
+        if not finished:
+            break
+        returns |= finished
+    left = halving.number_of_runs(len(noises), budget, args.confirm) - len(returns)
+    speeds = IN_HUMANOID if "Humanoid" in env_id else STEPS_PER_SECOND
+    seconds = START_UP + args.total_timesteps / speeds[algorithm]
+    if returns:
+        seconds = fmean(wall_time(runs[key]) for key in returns)
+    core_hours = left * seconds / 3600
+    name = f"{algorithm.upper()} on {env_id}"
+    return Choice(name, algorithm, env_id, schedule, args.confirm, state, runs, returns, core_hours)
+
+
+def runs_of(found):
+    """Return the runs of all choices together, the first seed of everything first."""
+    runs = []
+    for choice in found:
+        runs += [(seed, run) for (_, _, seed), run in choice.runs.items()]
+    return [run for _, run in sorted(runs, key=lambda pair: pair[0])]
+
+
+def candidates(args, algorithm, env_id):
+    """Return the noises to choose from, each once: {(noise, rate) as text: (noises, rates)}."""
+    noises = {}
+    for found in cells(args, algorithm, env_id):
+        if found != ([], []):  # at rate 0 a noise is none
+            noises[as_text(found)] = found
+    for pairs in args.exclude:
+        if any(rate is None for _, rate in pairs):
+            fail('--exclude needs a rate with each noise, as in "NOISE@0.1"')
+        excluded = as_text(cell(pairs))
+        if excluded not in noises:
+            fail(f"--exclude: {' at '.join(excluded)} is not among the noises")
+        del noises[excluded]
+    if not noises:
+        fail("there is no noise to choose from")
+    return noises
+
+
+def as_text(found):
+    """Spell a cell's noises and rates, as in config.json and tables: "A + B", "0.1 + 0.2"."""
+    noises, rates = found
+    return " + ".join(noises), " + ".join(map(str, rates))
+
+
+def read_return(run, seed):
+    """Return what a finished run counts for.
+
+    That is the mean over its last tests in the search, and its last test in the confirmation.
+    """
+    row = read_run(run.folder)
+    if row["status"] != "finished":
+        fail(f"{run.folder} cannot be used ({row['reason']}); delete it to run it again")
+    count = 1 if seed >= FIRST_CONFIRMATION_SEED else halving.LAST_TESTS
+    return fmean(row["returns"][-count:])
+
+
+def wall_time(run):
+    """Return how many seconds a finished run has taken."""
+    return json.loads((run.folder / "result.json").read_text())["wall_time_seconds"]
+
+
+# ---------------------------------------------------------------------------------------- in words
+
+
+def plan(found):
+    """Return lines that say, before a batch starts, what is due and what all of it will take."""
+    if any(choice.state.due for choice in found):
+        return [*map(describe, found), total(found)]
+    return []
+
+
+def total(found):
+    """Say how many runs all choices take, and what is left of them."""
+    search = sum(noises * seeds for choice in found for noises, seeds in choice.schedule)
+    confirm = sum(2 * choice.confirm for choice in found)
+    finished = sum(len(choice.returns) for choice in found)
+    hours = sum(choice.core_hours for choice in found)
+    hours = f"{hours:.1f}" if hours >= 0.1 else f"{hours:.2g}"
+    return (
+        f"{search + confirm} runs in all, {search} to search and {confirm} to confirm; "
+        f"{finished} are done, about {hours} core-hours are left"
+    )
+
+
+def describe(choice):
+    """Say where a choice stands."""
+    state = choice.state
+    number, rounds = len(state.rounds) + 1, len(choice.schedule)
+    if not state.due:
+        return f"{choice.name}: all runs are done"
+    seeds = f"seeds {state.seeds[0]} to {state.seeds[-1]}" if len(state.seeds) > 1 else "seed 1"
+    due = f"{seeds}; runs to do: {len(state.due)}"
+    if number <= rounds:
+        noises = f"{len(state.noises)} of {choice.schedule[0][0]} noises"
+        return f"{choice.name}, round {number} of {rounds}: {noises}, {due}"
+    winner = halving.spelled(*state.noises)
+    return f"{choice.name}, confirmation: {winner} against no noise, {due}"
+
+
+def standing(found):
+    """Yield lines that say where each choice stands, which noises survive, and what is left."""
+    for choice in found:
+        yield describe(choice)
+        if choice.state.rounds:
+            scores = choice.state.rounds[-1].scores
+            for noise in sorted(choice.state.noises, key=scores.get, reverse=True):
+                yield f"  {scores[noise]:10.2f}  {halving.spelled(noise)}"
+    yield total(found)
+
+
+def conclusion(found, runs_dir):
+    """Yield the verdicts, one line for each choice, and write choice.csv.
+
+    While runs of a choice are left, there is none: then say what to do about them.
+    """
+    if any(choice.state.due for choice in found):
+        for choice in found:
+            yield obstacle(choice) if choice.state.due else describe(choice)
+        return
+    comparisons = []
+    for choice in found:
+        [winner] = choice.state.noises
+        comparisons.append(halving.compare(winner, choice.state.seeds, choice.returns))
+    corrected = holm([comparison.p for comparison in comparisons])
+    rows = []
+    for choice, comparison, p in zip(found, comparisons, corrected, strict=True):
+        names = choice.algorithm.upper(), choice.env_id
+        helped = halving.helps(comparison, p)
+        rows += halving.rows(*names, choice.state, choice.returns, helped)
+    write_choice(Path(runs_dir, "choice.csv"), rows)
+    for choice, comparison, p in zip(found, comparisons, corrected, strict=True):
+        noises = choice.schedule[0][0] if choice.schedule else 1
+        yield halving.verdict(choice.name, noises, comparison, p, len(found))
+
+
+def obstacle(choice):
+    """Say that a choice cannot go on, and what to do."""
+    text = f"{describe(choice)}. These did not finish; the same command starts them again."
+    for noise, rate, _ in choice.state.due:
+        pairs = zip(noise.split(" + "), rate.split(" + "), strict=True)
+        excluded = "+".join(f"{noise}@{rate}" for noise, rate in pairs)
+        advice = f'\n  If it fails every time, leave it out: --exclude "{excluded}"'
+        if noise and advice not in text:
+            text += advice
+    return text
+
+
+def write_choice(path, rows):
+    """Write choice.csv whole or not at all; it keeps what other commands have chosen."""
+    try:
+        with open(path.with_name(".choice.lock"), "w") as lock:
+            fcntl.lockf(lock, fcntl.LOCK_EX)  # until it is closed: commands may end side by side
+            replace_choice(path, rows)
+    except (OSError, KeyError, ValueError) as error:
+        fail(f"cannot write {path} ({type(error).__name__}: {error})")
+
+
+def replace_choice(path, rows):
+    """Replace the lines of what was chosen now, and keep the others."""
+    ours = {(row["algorithm"], row["environment"]) for row in rows}
+    if path.exists():
+        with open(path, newline="") as file:
+            old = list(csv.DictReader(file))
+        rows = [r for r in old if (r["algorithm"], r["environment"]) not in ours] + rows
+    temporary = path.with_suffix(".tmp")
+    with open(temporary, "w", newline="") as file:
+        writer = csv.DictWriter(file, CHOICE_COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    os.replace(temporary, path)

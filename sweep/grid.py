@@ -1,0 +1,490 @@
+"""The runs of a sweep: the arguments of benchmark.sh, the runs that they name, their commands.
+
+`./benchmark.sh --help` explains the arguments. __main__.py shows how far the runs have come.
+"""
+
+import argparse
+import ast
+import csv
+import difflib
+import functools
+import itertools
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+from noisy_wrappers import canonical_env_id, canonical_noises, run_name
+
+PROJECT = Path(__file__).resolve().parent.parent
+SEEDS = {"sac": range(1, 6), "td3": range(1, 6), "ppo": range(1, 11)}  # the paper's
+ENVS = ["HalfCheetah-v5", "Hopper-v5", "Humanoid-v5", "Pusher-v5", "Walker2d-v5"]
+RATES = [0.01, 0.05, 0.1, 0.2, 0.5, 1.0]
+NOISES = [  # as the paper's authors ran them: dropout keeps 90 %, mixup remembers the mixture
+    "RandomDropoutObservation(0.9)",
+    "RandomEarlyTermination(1, 100)",
+    "RandomEarlyTermination(50)",
+    "RandomMixupObservation(0.0, recursive=True)",
+    "RandomMixupObservation(0.5, recursive=True)",
+    "RandomNormalNoisyObservation(0.001)",
+    "RandomNormalNoisyObservation(1.0)",
+    "RandomNormalNoisyReward(0.001)",
+    "RandomNormalNoisyReward(1.0)",
+    "RandomUniformNoisyObservation(-0.001, 0.001)",
+    "RandomUniformNoisyReward(-0.001, 0.001)",
+    "RandomUniformScaleObservation(0.5, 1.5)",
+    "RandomUniformScaleObservation(0.8, 1.2)",
+    "RandomUniformScaleReward(0.5, 1.5)",
+    "RandomUniformScaleReward(0.8, 1.2)",
+]
+# The paper shows bars for several beta and names none of them: these are ours.
+ABLATION = [(f"RandomUniformScaleReward({2 - b:.1f}, {b})", 0.05) for b in (1.1, 1.2, 1.5, 1.8, 2)]
+ABLATION += [
+    (f"RandomUniformNoisyObservation(-{b}, {b})", 1.0) for b in (0.0001, 0.001, 0.01, 0.1, 1.0)
+]
+PRESETS = {  # the grid options that a preset sets; its noises are in preset_pairs
+    "demo": {
+        "algos": ["ppo"],
+        "envs": ["Pusher-v5"],
+        "seeds": [range(1, 6)],
+        "total_timesteps": 100_000,
+        "runs_dir": "runs/demo",  # never into a sweep's folders: these runs are shorter
+    },
+    "baseline": {},
+    "best": {},
+    "paper": {},
+    "ablation": {"algos": ["ppo"]},
+    "custom": {},
+    "choose": {"runs_dir": "runs/choose"},  # apart: analyze.py judges its runs otherwise
+}
+GRID_OPTIONS = ["--algos", "--envs", "--noises", "--noise-rates", "--seeds", "--total-timesteps"]
+GRID_OPTIONS += ["--runs-dir", "--combine", "--exclude", "--budget", "--confirm"]
+EXECUTOR_OPTIONS = ["--dry-run", "--executor", "--jobs", "--sshlogin", "--remote-dir"]
+EXECUTOR_OPTIONS += ["--slurm-args", "--wait", "--help"]  # benchmark.sh reads these
+GIVEN_BY_THE_GRID = {  # options of the scripts, and those of the sweep that set them
+    "env-id": "--envs",
+    "seed": "--seeds",
+    "noise": "--noises",
+    "noise-rate": "--noise-rates",
+    "total-timesteps": "--total-timesteps",
+    "runs-dir": "--runs-dir",
+    "exp-name": "--runs-dir",  # a sweep's folders are told apart by where they lie
+}
+# A finished run counts as done whatever it had for these: the scripts' class Run ignores them, too
+MAY_DIFFER = {"overwrite", "torch-threads", "compile", "checkpoint-frequency"}
+
+
+class Run(NamedTuple):
+    """One line of the grid."""
+
+    folder: Path
+    kind: tuple[str, str]  # algorithm, environment: runs of one kind are equally fast
+    total_timesteps: int
+    script: str
+    arguments: list[str]
+    options: dict[str, object]  # the script's own, by name: what "--" gives, else the defaults
+
+
+# ------------------------------------------------------------------------------------ the arguments
+
+
+def parse_args(view, caller, argv):
+    """Return the grid's arguments; `extra` are the scripts' own, after "--"."""
+    parser = argparse.ArgumentParser(prog="benchmark.sh", add_help=False, allow_abbrev=False)
+    parser.error = lambda message: fail(message.removeprefix("argument "))
+    parser.add_argument("preset", nargs="?")
+    parser.add_argument("--algos", nargs="+", type=str.lower, default=list(SEEDS))
+    parser.add_argument("--envs", nargs="+", default=ENVS)
+    parser.add_argument("--noises", nargs="+", type=entry, default=[])
+    parser.add_argument("--noise-rates", nargs="+", type=rate, default=[])
+    parser.add_argument("--seeds", nargs="+", type=seeds)
+    parser.add_argument("--total-timesteps", type=whole_number, default=1_000_000)
+    parser.add_argument("--runs-dir", default="runs")
+    parser.add_argument("--combine", action="store_true")
+    parser.add_argument("--exclude", nargs="+", type=entry, default=[])
+    parser.add_argument("--budget", type=whole_number)
+    parser.add_argument("--confirm", type=whole_number, default=10)
+    split = argv.index("--") if "--" in argv else len(argv)
+    words, extra = argv[:split], argv[split + 1 :]
+    given = {word.partition("=")[0] for word in words if word.startswith("--")}
+    preset = words[0] if words and not words[0].startswith("--") else None
+    if preset not in PRESETS and not (preset is None and view == "status"):
+        named = words[0] if words else ""
+        fail(f"unknown preset {named!r}; choose one of {', '.join(PRESETS)}")
+    for name in sorted(given.difference(GRID_OPTIONS)):
+        fail(unknown_option(name))
+    parser.set_defaults(**PRESETS.get(preset, {}))
+    args = parser.parse_args(words)
+    args.given, args.extra = given, extra
+    args.runs_dir = from_project(caller, args.runs_dir)
+    return args
+
+
+def unknown_option(name):
+    """Say what to write instead of an option that the grid does not have."""
+    scripts = PROJECT.glob(script_of("*"))
+    known = {f"--{option}" for script in scripts for option in defaults(script.name)}
+    if name in known:
+        return f"{name} is an option of the scripts: put it at the end, after --"
+    near = difflib.get_close_matches(name, [*GRID_OPTIONS, *EXECUTOR_OPTIONS, *known], n=1)
+    if not near:
+        return f"unknown option {name}; ./benchmark.sh --help lists them"
+    after = ", an option of the scripts, at the end after --" if near[0] in known else ""
+    return f"unknown option {name}; did you mean {near[0]}{after}?"
+
+
+def script_of(algorithm):
+    """Return the file of an algorithm's training script."""
+    return f"{algorithm}_continuous_noisy.py"
+
+
+@functools.cache
+def defaults(script):
+    """Return {option: default} of a script, from its text: importing it takes seconds.
+
+    Options that the grid gives are left out.
+    """
+    nodes = ast.parse((PROJECT / script).read_text()).body
+    [args] = [node for node in nodes if isinstance(node, ast.ClassDef) and node.name == "Args"]
+    fields = [field for field in args.body if isinstance(field, ast.AnnAssign)]
+    texts = {field.target.id.replace("_", "-"): field.value for field in fields}
+    return {name: ast.literal_eval(texts[name]) for name in texts if name not in GIVEN_BY_THE_GRID}
+
+
+@functools.cache
+def script_options(script, words):
+    """Return {option: value} of a script that is started with these words after the "--".
+
+    Exits with one line about a word that is out of place. Whether a value is a good one, the
+    script itself says: check_extra.
+    """
+    options = dict(defaults(script))
+    words = iter(words)
+    for word in words:
+        if not word.startswith("--"):
+            fail(f"{word!r} after the -- belongs to no option of {script}")
+        name, equals, text = word[2:].partition("=")
+        name = name.replace("_", "-")
+        flag = name.removeprefix("no-")
+        if isinstance(options.get(flag), bool):
+            if equals:
+                fail(f"--{name} takes no value: write --{flag} or --no-{flag}")
+            options[flag] = name == flag
+            continue
+        if name not in options:
+            near = difflib.get_close_matches(name, options, n=1)
+            hint = f"; did you mean --{near[0]}?" if near else ""
+            fail(f"{script} has no option --{name}{hint}")
+        text = text if equals else next(words, "--")
+        if not text or text.startswith("--"):
+            fail(f"--{name} needs a value")
+        options[name] = option_value(text)
+    return options
+
+
+def option_value(text):
+    """Read an option's value as a script does; here a number is a number, whole or not."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            pass
+    return None if text == "None" else text
+
+
+def from_project(caller, text):
+    """Return a path that counts from the caller's folder as one that counts from the project's.
+
+    It is relative where it lies in the project, so that it means the same on other machines.
+    """
+    path = os.path.normpath(os.path.join(caller, text))
+    if Path(path).is_relative_to(os.getcwd()):
+        path = os.path.relpath(path)
+    if not re.fullmatch(r"[^-\t\n][^\t\n]*", path):
+        fail("--runs-dir must be a path without tabs and newlines that begins with no dash")
+    return path
+
+
+def whole_number(text):
+    """Read "1000000" or "1e6"."""
+    try:
+        value = float(text)
+        if value != int(value):
+            raise ValueError
+    except (ValueError, OverflowError):
+        reason = f"{text!r} is not a whole number, such as 1000000 or 1e6"
+        raise argparse.ArgumentTypeError(reason) from None
+    return int(value)
+
+
+def seeds(text):
+    """Read a seed, "3", or a range of seeds, "1-5"."""
+    match = re.fullmatch(r"(\d+)(?:-(\d+))?", text)
+    values = range(0)
+    if match:
+        first, last = match.groups(default=match[1])
+        values = range(int(first), int(last) + 1)
+    if not values:
+        fail(f"--seeds takes numbers and ranges, separated by spaces: 1 2 3 or 1-3, not {text!r}")
+    return values
+
+
+def rate(text):
+    """Read a noise rate: a number, or "start:end" for one that changes during training."""
+    if ":" in text:
+        return text  # canonical_noises reads it
+    try:
+        return float(text)
+    except ValueError:
+        reason = f"{text!r} is no rate: give a number from 0 to 1, or two as in 1.0:0.0"
+        raise argparse.ArgumentTypeError(reason) from None
+
+
+def entry(text):
+    """Read an entry of --noises, "A(..)", "A(..)+B(..)" or "A(..)@0.1+B(..)@0.2".
+
+    Returns a list of (noise, rate); the rate is None where --noise-rates will give it.
+    """
+    pairs = []
+    for part in re.split(r"\s*\+\s*(?=[A-Za-z_])", text.strip()):
+        noise, at, own = part.partition("@")
+        pairs.append((noise, rate(own) if at else None))
+    if len({own is None for _, own in pairs}) > 1:
+        reason = f"{text!r}: give each of these noises a rate with @, or none of them"
+        raise argparse.ArgumentTypeError(reason)
+    return pairs
+
+
+def check(args):
+    """Exit with one line about the first argument that no run could be started with.
+
+    Environments get their full names on the way.
+    """
+    for algorithm in args.algos:
+        if algorithm not in SEEDS:
+            fail(f"unknown algorithm {algorithm!r}; choose from {', '.join(SEEDS)}")
+    if args.total_timesteps <= 0:
+        fail(f"--total-timesteps must be greater than 0, not {args.total_timesteps}")
+    try:
+        args.envs = list(dict.fromkeys(map(canonical_env_id, args.envs)))
+    except ValueError as error:
+        fail(f"--envs: {error}")
+    for name in ("--exclude", "--budget", "--confirm"):
+        if name in args.given and args.preset != "choose":
+            fail(f"{name} belongs to choose")
+    if args.combine and args.preset != "custom":
+        fail("--combine belongs to custom")
+    if args.preset == "choose":
+        if not {"--algos", "--envs"} <= args.given:
+            fail("choose needs --algos and --envs: the noise is chosen for each of them")
+        if "--seeds" in args.given:
+            fail("choose takes the seeds that it needs: leave out --seeds; see --budget, --confirm")
+    if {"-h", "--help"} & set(args.extra):
+        fail("--help after the -- would start nothing: ask the script itself")
+    for word in args.extra:
+        if not word.startswith("--"):
+            continue
+        name = word.partition("=")[0].removeprefix("--").replace("_", "-")
+        if name in GIVEN_BY_THE_GRID:
+            fail(f"--{name} is part of the grid: use {GIVEN_BY_THE_GRID[name]}, before the --")
+        if name == "overwrite":
+            fail("--overwrite would start interrupted runs afresh: delete their folders instead")
+
+
+# ----------------------------------------------------------------------------------------- the runs
+
+
+def preset_pairs(preset, algorithm, env_id):
+    """Return a preset's (noise, rate) pairs for one algorithm and environment."""
+    if preset == "demo":
+        return [("RandomEarlyTermination(50)", 1.0)]  # the paper's best for PPO on Pusher
+    if preset in ("paper", "choose"):
+        return list(itertools.product(NOISES, RATES))
+    if preset == "ablation":
+        return ABLATION
+    if preset == "best":
+        pair = best_pairs().get((algorithm, env_id.rpartition("-v")[0]))
+        return [pair] if pair else fail(f"the paper has no best noise for {algorithm} on {env_id}")
+    return []
+
+
+@functools.cache
+def best_pairs():
+    """Return the paper's best noise and rate for each algorithm and environment."""
+    pairs = {}
+    with open(PROJECT / "results" / "paper" / "best.csv", newline="") as file:
+        for row in csv.DictReader(file):
+            cell = row["algorithm"].lower(), row["environment"].rpartition("-v")[0]
+            pairs[cell] = row["noise_as_run"], float(row["noise_rate"])
+    return pairs
+
+
+@functools.cache
+def canonical(noises, rates):
+    """Return noises and rates in canonical notation, with a rate for each noise."""
+    try:
+        return canonical_noises(noises, rates)
+    except ValueError as error:
+        fail(error)
+
+
+def cells(args, algorithm, env_id):
+    """Return the noises and the rates of every noisy cell of the grid, in the order given."""
+    pairs = preset_pairs(args.preset, algorithm, env_id)
+    entries, rates = [[pair] for pair in pairs], []
+    if args.noises or args.noise_rates:
+        names = dict.fromkeys(noise for noise, _ in pairs)
+        entries = args.noises or [[(noise, None)] for noise in names]
+        rates = args.noise_rates or list(dict.fromkeys(own for _, own in pairs))
+    if args.combine:
+        entries = entries + [a + b for a, b in itertools.combinations(entries, 2)]
+    crossed = [pairs for pairs in entries if any(rate is None for _, rate in pairs)]
+    if crossed and not rates:
+        fail('--noises needs --noise-rates, or a rate with each noise, as in "NOISE@0.1"')
+    if args.noise_rates and not crossed:
+        fail("--noise-rates needs --noises that have no rate of their own")
+    found = []
+    for pairs in entries:
+        for common in rates if pairs in crossed else [None]:
+            found.append(cell(pairs, common))
+    return found
+
+
+def cell(pairs, common=None):
+    """Return canonical noises and rates; `common` is the rate of those without one of their own."""
+    noises = tuple(noise for noise, _ in pairs)
+    rates = tuple(common if rate is None else rate for _, rate in pairs)
+    return canonical(noises, rates)
+
+
+def make_run(args, algorithm, env_id, noises, rates, seed):
+    """Return one run of the grid."""
+    script = script_of(algorithm)
+    arguments = ["--env-id", env_id, "--seed", str(seed)]
+    if noises:
+        arguments += ["--noise", *noises, "--noise-rate", *map(str, rates)]
+    arguments += ["--total-timesteps", str(args.total_timesteps)]
+    arguments += ["--runs-dir", args.runs_dir, *args.extra]
+    name = run_name(env_id, script.removesuffix(".py"), noises, rates, seed)
+    folder, kind = Path(args.runs_dir, name), (algorithm, env_id)
+    options = script_options(script, tuple(args.extra))
+    return Run(folder, kind, args.total_timesteps, script, arguments, options)
+
+
+def grid(args):
+    """Return the runs, each once, the first seed of everything first."""
+    seeds_of = {}
+    for algorithm in args.algos:
+        seeds_of[algorithm] = set(itertools.chain(*(args.seeds or [SEEDS[algorithm]])))
+    runs = {}
+    for seed in sorted(set().union(*seeds_of.values())):
+        for algorithm, env_id in itertools.product(seeds_of, args.envs):
+            if seed not in seeds_of[algorithm]:
+                continue
+            for noises, rates in [([], []), *cells(args, algorithm, env_id)]:
+                run = make_run(args, algorithm, env_id, noises, rates, seed)
+                runs.setdefault(run.folder, run)
+    return list(runs.values())
+
+
+def runs_in(folder):
+    """Return the runs that a folder or its logs tell of, for a status that names no grid."""
+    folder = Path(folder)
+    names = {path.parent.name for path in folder.glob("*/config.json")}
+    names |= {path.stem for path in folder.glob("logs/*__*.log")}
+    if not names:
+        fail(f"no runs in {folder}; name their folder with --runs-dir")
+    runs = []
+    for name in sorted(names):
+        path = folder / name / "config.json"
+        steps = 0  # unknown: it has failed before it began
+        if path.exists():
+            try:
+                steps = json.loads(path.read_text())["args"]["total_timesteps"]
+            except (OSError, ValueError, KeyError, TypeError) as error:
+                fail(f"cannot read {path} ({type(error).__name__}: {error}); delete its folder")
+        env_id, script = name.split("__")[:2]
+        runs.append(Run(folder / name, (script, env_id), steps, "", [], {}))
+    return runs
+
+
+def result(run):
+    """Return whether a run is finished, and what is wrong with its files, or "".
+
+    Exits if the folder holds a finished run of another length or with other options.
+    """
+    path = run.folder / "result.json"
+    if not path.exists():
+        return False, ""
+    try:
+        steps = json.loads(path.read_text())["total_timesteps"]
+        path = run.folder / "config.json"
+        made_with = json.loads(path.read_text())["args"]
+        differences = other_options(run, made_with)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = f"{path} cannot be read ({type(error).__name__}: {error})"
+        return False, f"{reason}; delete the run's folder to run it again"
+    if steps != run.total_timesteps:
+        fail(f"{run.folder} holds a finished run of {steps} steps; choose another --runs-dir")
+    if differences:
+        fail(
+            f"{run.folder} holds a finished run with {' and '.join(differences)}; choose another "
+            "--runs-dir, or the same options after the --"
+        )
+    return True, ""
+
+
+def other_options(run, made_with):
+    """Say in which options that change its result a run differs from the one that made its folder.
+
+    made_with: the arguments in the folder's config.json. One that an older version did not have
+    counts as today's default.
+    """
+    differences = []
+    for name, wanted in run.options.items():
+        default = defaults(run.script)[name]
+        made = made_with.get(name.replace("-", "_"), default)
+        if name not in MAY_DIFFER and made != wanted:
+            differences.append(f"--{name} {made}, not {wanted}")
+    return differences
+
+
+def command_line(run):
+    """Return a run's command, complete: it can be pasted into a shell in the project's folder."""
+    words = [os.environ.get("PYTHON", "python"), run.script, *run.arguments]
+    if ":" in run.kind[1] and "PYTHONPATH" in os.environ:  # where the environment's module lies
+        words = ["env", f"PYTHONPATH={os.environ['PYTHONPATH']}", *words]
+    return shlex.join(words)
+
+
+def check_extra(runs):
+    """Let each script read one command: a typing error is not worth 9,100 failed runs."""
+    read = "import sys, tyro; from {} import Args; sys.argv[0] = '{}'; tyro.cli(Args)"
+    for run in {run.script: run for run in runs}.values():
+        code = read.format(run.script.removesuffix(".py"), run.script)
+        command = [os.environ.get("PYTHON", "python"), "-c", code, *run.arguments]
+        answer = subprocess.run(command, capture_output=True, text=True)
+        if answer.returncode:
+            fail(f"{run.script}: {script_error(answer.stderr)}")
+
+
+def script_error(text):
+    """Return what a script says about a bad argument: tyro draws a box around it."""
+    told = []
+    for line in text.splitlines():
+        line = line.strip("\u2502 ")
+        if line.startswith("\u2500"):  # below this rule stands where to find help
+            break
+        if not line.startswith("\u256d"):
+            told.append(line)
+    return " ".join(told) or "cannot be started"
+
+
+def fail(message):
+    """Exit and say what to do."""
+    print(f"error: {message}", file=sys.stderr)
+    sys.exit(2)

@@ -1,0 +1,196 @@
+"""Which noise helps here? A search that is cheap, then one comparison on fresh seeds.
+
+Pure functions of the returns of finished runs, {(noise, noise_rate, seed): return}. What comes next
+is computed from them and from nothing else, so a choice can be interrupted anywhere. choose.py
+reads the returns from the run folders and names the runs that are due; benchmark.sh starts them.
+
+The search is sequential halving (Karnin, Koren and Somekh, 2013, "Almost Optimal Exploration in
+Multi-Armed Bandits", https://proceedings.mlr.press/v28/karnin13.html). An arm is a noise with its
+rate, a pull is a training run with a seed of its own. Runs are dear: a noise is judged by all its
+runs so far, those of earlier rounds included.
+
+The best of many looks better than it is on the seeds that chose it. So the winner meets the
+baseline on fresh seeds, in one comparison that is fixed beforehand.
+"""
+
+import math
+from statistics import fmean
+from typing import NamedTuple
+
+import numpy as np
+
+from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED
+from analysis.statistics import bootstrap_iqm, mann_whitney, probability_of_improvement
+from analysis.verdicts import interval, p_value, percent, power
+
+LEVEL = 0.05  # of a verdict, two-sided, over all verdicts of one command
+BASELINE = ("", "0.0")
+LAST_TESTS = 3  # a run's score in the search is the mean over so many of its last tests
+
+
+class Round(NamedTuple):
+    """A round of the search whose runs are all finished."""
+
+    noises: list[tuple[str, str]]
+    seeds: int  # each noise has run with the seeds from 1 to this one
+    scores: dict[tuple[str, str], float]
+    survivors: list[tuple[str, str]]
+
+
+class State(NamedTuple):
+    """How far the choice for one algorithm and environment has come."""
+
+    rounds: list[Round]  # those that are complete
+    noises: list[tuple[str, str]]  # still in the running, in the order given
+    seeds: range  # of the runs that the present round or the confirmation needs
+    due: list[tuple[str, str, int]]  # (noise, noise_rate, seed) of those that are not finished
+
+
+class Comparison(NamedTuple):
+    """The winner against the baseline on fresh seeds."""
+
+    winner: tuple[str, str]
+    seeds: int
+    improvement: float  # of the interquartile mean, in percent of |baseline mean|
+    low: float  # its 95 % interval
+    high: float
+    probability: float  # that a run with the noise beats one without
+    p: float  # exact two-sided Mann-Whitney
+    detectable: float  # the improvement in percent that is found with 80 % power
+
+
+# --------------------------------------------------------------------------------------- the search
+
+
+def schedule(noises, budget):
+    """Return the size of every round: [(noises, further seeds for each of them)].
+
+    As in Karnin et al.: ceil(log2 n) rounds share the budget equally, and each halves the noises.
+    The budget, in runs, is a target: every noise gets at least one seed in every round.
+    """
+    rounds = math.ceil(math.log2(noises))
+    sizes = []
+    for _ in range(rounds):
+        sizes.append((noises, max(1, budget // (rounds * noises))))
+        noises = math.ceil(noises / 2)
+    return sizes
+
+
+def number_of_runs(noises, budget, confirm):
+    """Return how many runs a choice takes, whatever they return."""
+    return sum(n * seeds for n, seeds in schedule(noises, budget)) + 2 * confirm
+
+
+def advance(noises, budget, confirm, returns):
+    """Return how far the choice has come, and which runs are due.
+
+    noises: [(noise, noise_rate)] in the order given, which decides between equal scores.
+    returns: {(noise, noise_rate, seed): return}, the score of a run for the seeds of the search,
+    the final test return for those of the confirmation; the baseline is ("", "0.0").
+    """
+    rounds, last_seed = [], 0
+    for _, further in schedule(len(noises), budget):
+        last_seed += further
+        seeds = range(1, last_seed + 1)
+        due = missing(noises, seeds, returns)
+        if due:
+            return State(rounds, noises, seeds, due)
+        scores = {noise: fmean(returns[*noise, seed] for seed in seeds) for noise in noises}
+        ranking = sorted(noises, key=scores.get, reverse=True)  # leaves equals in their order
+        best = ranking[: math.ceil(len(noises) / 2)]
+        survivors = [noise for noise in noises if noise in best]
+        rounds.append(Round(noises, last_seed, scores, survivors))
+        noises = survivors
+    seeds = range(FIRST_CONFIRMATION_SEED, FIRST_CONFIRMATION_SEED + confirm)
+    return State(rounds, noises, seeds, missing([*noises, BASELINE], seeds, returns))
+
+
+def missing(noises, seeds, returns):
+    """Return the runs that have no return yet, the first seed of every noise first."""
+    wanted = [(*noise, seed) for seed in seeds for noise in noises]
+    return [run for run in wanted if run not in returns]
+
+
+# ----------------------------------------------------------------------------------- the comparison
+
+
+def fewest_seeds(verdicts):
+    """Return the smallest number of fresh seeds with which every verdict can be significant."""
+    seeds = 4
+    while 2 / math.comb(2 * seeds, seeds) > LEVEL / verdicts:
+        seeds += 1
+    return seeds
+
+
+def compare(winner, seeds, returns):
+    """Compare the winner with the baseline on the fresh seeds, all of which have a return."""
+    noisy = np.array([[returns[*winner, seed]] for seed in seeds])
+    baseline = np.array([[returns[*BASELINE, seed]] for seed in seeds])
+    improvement, low, high = bootstrap_iqm(noisy, baseline)
+    probability, _, _ = probability_of_improvement(noisy, baseline)
+    p, _ = mann_whitney(noisy, baseline)
+    detectable, _ = power(noisy, baseline, improvement)
+    return Comparison(winner, len(seeds), improvement, low, high, probability, p, detectable)
+
+
+def helps(comparison, p_corrected):
+    """Tell whether the noise was shown to be better than none."""
+    return p_corrected <= LEVEL and comparison.probability > 0.5
+
+
+def spelled(noise):
+    """Spell a noise with its rate for a sentence."""
+    name, rate = noise
+    return f"{name} at {rate.replace(':', ' to ')}"
+
+
+def verdict(name, noises, comparison, p_corrected, verdicts):
+    """Say in one plain sentence what came out.
+
+    name: the algorithm and the environment. noises: how many were searched. verdicts: for how many
+    verdicts p is corrected.
+    """
+    named = spelled(comparison.winner)
+    seeds = f"{comparison.seeds} fresh seeds"
+    evidence = f"p {p_value(comparison.p)}"
+    if verdicts > 1:
+        corrected = p_value(p_corrected).removeprefix("= ")
+        evidence += f", corrected for {verdicts} verdicts {corrected}"
+    if math.isfinite(comparison.improvement):  # it is not where the baseline returns 0
+        change = f"{percent(comparison.improvement)} {interval(comparison.low, comparison.high)}"
+        evidence = f"{change}, {evidence}"
+    start = f"{name}:"
+    if helps(comparison, p_corrected):
+        chance = f"a run with it beats one without with probability {comparison.probability:.2f}"
+        return f"{start} {named} beats no noise: {seeds}, {evidence}; {chance}."
+    if noises == 1:
+        start += f" {named} could not be shown to help"
+    else:
+        start += f" none of {noises} noises could be shown to help; the best of them, {named}"
+    if p_corrected <= LEVEL:
+        return f"{start}, is worse than no noise: {seeds}, {evidence}."
+    text = f"{start}: {seeds}, {evidence}"
+    if math.isfinite(comparison.detectable):
+        difference = percent(comparison.detectable, sign="")
+        text += f"; with {comparison.seeds} seeds a difference of {difference} would have been seen"
+        text += " (80 % power)"
+    return f"{text}."
+
+
+def rows(algorithm, environment, state, returns, helped):
+    """Return the lines of choice.csv for one finished choice, as dicts; see CHOICE_COLUMNS."""
+    lines = []
+
+    def add(phase, number, noise, seeds, score, survives):
+        values = algorithm, environment, phase, number, *noise, seeds, score, survives
+        lines.append(dict(zip(CHOICE_COLUMNS, values, strict=True)))
+
+    for number, done in enumerate(state.rounds, start=1):
+        for noise in done.noises:
+            survives = "yes" if noise in done.survivors else "no"
+            add("search", number, noise, done.seeds, done.scores[noise], survives)
+    for noise in (BASELINE, *state.noises):
+        score = fmean(returns[*noise, seed] for seed in state.seeds)
+        survives = ("yes" if helped else "no") if noise != BASELINE else ""
+        add("confirmation", "", noise, len(state.seeds), score, survives)
+    return lines

@@ -1,0 +1,1175 @@
+"""analyze.py on small synthetic sweeps: hand-computed tables, recorded oracles, simulations.
+
+PYTHONPATH=. python tests/analysis/test_analyze.py    # time and memory for a paper-sized sweep
+"""
+
+import itertools
+import json
+import os
+import re
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from html import escape, unescape
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+
+import analysis.figures
+import analysis.runs
+import analysis.statistics
+import analyze
+
+NAN = float("nan")
+SCALE = "RandomUniformScaleReward(0.5, 1.5)"
+ENDING = "RandomEarlyTermination(50)"
+
+
+def write_run(
+    root,
+    curve,
+    algorithm="SAC",
+    env="Hopper-v5",
+    noise=(),
+    rate=(),
+    seed=1,
+    every=10_000,
+    spread=1.0,
+    folder=None,
+    finished=True,
+    versions=None,
+    **args,
+):
+    """Write one run folder: `curve` is its mean return at each evaluation (two episodes each)."""
+    noise, rate = ((noise,), (rate,)) if isinstance(noise, str) else (noise, rate)
+    steps = every * np.arange(1, len(curve) + 1)
+    name = f"{env}__{algorithm}__{'+'.join(map(str, noise + rate)) or 'baseline'}__{seed}"
+    folder = Path(root) / (folder or name.replace("/", "-"))
+    folder.mkdir(parents=True)
+    settings = {
+        "env_id": env,
+        "exp_name": algorithm,
+        "seed": seed,
+        "noise": noise,
+        "noise_rate": rate,
+    }
+    settings |= {"total_timesteps": int(steps[-1]), "eval_frequency": every, "eval_episodes": 2}
+    settings |= {"runs_dir": str(root), "torch_threads": 1, "gamma": 0.99, **args}
+    versions = versions or {"torch": "2.13.0", "mujoco": "3.15.0"}
+    config = {"algorithm": algorithm, "args": settings, "versions": versions}
+    config |= {"matmul_precision": "medium", "git_commit": None}
+    (folder / "config.json").write_text(json.dumps(config))
+    lines = [
+        f"{step},{episode},{float(value) + sign * spread!r},1000\n"
+        for step, value in zip(steps, curve, strict=True)
+        for episode, sign in enumerate((-1, 1))
+    ]
+    (folder / "eval.csv").write_text(
+        "step,episode,episodic_return,episodic_length\n" + "".join(lines)
+    )
+    if finished:
+        (folder / "result.json").write_text(json.dumps({"final_return_mean": float(curve[-1])}))
+    return folder
+
+
+# Final returns of the sweep that the tables below are computed from by hand.
+FINALS = {
+    ("Hopper-v5", "", 0): [100, 110, 120, 130],  # mean 115, std 12.9099
+    ("Hopper-v5", SCALE, 0.05): [130, 140, 150, 160],  # mean 145
+    ("Hopper-v5", SCALE, 0.2): [90, 100, 115, 155],  # mean 115: matched
+    ("Hopper-v5", ENDING, 0.05): [10, 20, 30, 40],  # mean 25
+    ("Pusher-v5", "", 0): [-50, -40, -30, -40],  # mean -40, std 8.1650
+    ("Pusher-v5", SCALE, 0.05): [-30, -20, -30, -20],  # mean -25
+    ("Pusher-v5", SCALE, 0.2): [-60, -50, -60, -50],  # mean -55
+    ("Pusher-v5", ENDING, 0.05): [-80, -80, -80, -80],
+}
+
+
+def small_sweep(root, order=1, **kwargs):
+    """Write the runs of FINALS: five evaluations at 0.2, 0.4, ... 1.0 times the final return."""
+    cells = [(key, seed) for key in FINALS for seed in range(4)][::order]
+    for i, ((env, noise, rate), seed) in enumerate(cells):
+        final = FINALS[env, noise, rate][seed]
+        start = 0 if final > 0 else 2 * final
+        curve = [start + (final - start) * part for part in (0.2, 0.4, 0.6, 0.8, 1)]
+        folder = f"{order}-{i:03}" if order != 1 else None
+        config = {"noise": noise, "rate": rate} if noise else {}
+        write_run(root, curve, env=env, seed=seed + 1, folder=folder, **config, **kwargs)
+
+
+def run(tmp_path, runs="runs", out="results", compare=None):
+    """Run analyze.py's main function and read its csv tables."""
+    args = analyze.Args(runs_dir=tmp_path / runs, out=tmp_path / out, compare=compare)
+    analyze.main(args)
+    text = {"noise": str, "noise_rate": str, "test_rate": str}
+    files = sorted((tmp_path / out).glob("*.csv"))
+    return {f.stem: pd.read_csv(f, dtype=text).fillna({"noise": ""}) for f in files}
+
+
+def row(table, **where):
+    """The only row of a table with these values."""
+    for name, value in where.items():
+        table = table[table[name] == value]
+    assert len(table) == 1, table
+    return table.iloc[0]
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory):
+    path = tmp_path_factory.mktemp("sweep")
+    small_sweep(path / "runs")
+    return SimpleNamespace(path=path, tables=run(path))
+
+
+# ------------------------------------------------------------------------ tables computed by hand
+
+
+def test_summary_by_hand(sweep):
+    table = sweep.tables["summary_SAC"]
+    assert list(table.columns) == analyze.COLUMNS["summary"].split()
+    assert len(table) == len(FINALS)
+    base = row(table, environment="Hopper-v5", noise="")
+    assert (base["algorithm"], base["noise_rate"], base["n"], base["mean"]) == (
+        "SAC",
+        "0.00",
+        4,
+        115,
+    )
+    assert base["std"] == pytest.approx(np.sqrt((15**2 + 5**2 + 5**2 + 15**2) / 3))
+    assert np.isnan(base["improvement_percent"]) and np.isnan(base["std_change_percent"])
+    assert base["steps_to_baseline"] == 50_000
+    best = row(table, environment="Hopper-v5", noise=SCALE, noise_rate="0.05")
+    assert best["mean"] == 145 and best["n_baseline"] == 4 and best["baseline_mean"] == 115
+    assert best["improvement_percent"] == pytest.approx(100 * 30 / 115)
+    assert best["p"] == pytest.approx(4 / 70)  # 130 ties 130: U = 15.5 of 16, taken as 15
+    assert best["std_change_percent"] == pytest.approx(0)
+    assert best["steps_to_baseline"] == 40_000  # 0.8 * 145 = 116 >= 115
+    bad = row(table, environment="Pusher-v5", noise=SCALE, noise_rate="0.20")
+    assert bad["improvement_percent"] == pytest.approx(100 * (-55 + 40) / 40)  # over |baseline|
+    assert bad["std"] == pytest.approx(np.sqrt(4 * 25 / 3))
+    assert bad["std_change_percent"] == pytest.approx(100 * (5 / np.sqrt(50) - 1))
+    assert np.isnan(bad["steps_to_baseline"])
+
+
+def test_the_baseline_reaches_its_own_final_mean():
+    """The mean of one test's returns and of a row of a table may round differently."""
+    rising = np.arange(4)[:, None, None] * 1000
+    curves = rising + np.random.default_rng(1).normal(0, 100, (4, 10, 100))
+    for e in range(100):
+        final_mean, _, _ = analysis.statistics.mean_std(curves[-1][:, e])
+        assert (
+            analysis.statistics.steps_to_reach(curves[..., e], [10, 20, 30, 40], final_mean) == 40
+        )
+
+
+def test_best_by_hand(sweep):
+    table = sweep.tables["best"]
+    assert list(table.columns) == analyze.COLUMNS["best"].split()
+    assert len(table) == 2
+    pusher = row(table, environment="Pusher-v5")
+    assert (pusher["noise"], pusher["noise_rate"]) == (SCALE, "0.05")
+    assert (pusher["n_baseline"], pusher["n"], pusher["chosen_from"]) == (4, 4, 3)
+    assert (pusher["baseline_mean"], pusher["noisy_mean"]) == (-40, -25)
+    assert pusher["baseline_std"] == pytest.approx(np.sqrt(200 / 3))
+    assert pusher["noisy_std"] == pytest.approx(np.sqrt(100 / 3))
+    assert pusher["improvement_percent"] == pytest.approx(37.5)
+    # -30 -20 -30 -20 against -50 -40 -30 -40: U = 15 of 16, p = 2 (1 + 1) / 70; the least of three
+    # is 2 / 70 (the noise that ends at -80), then twice 4 / 70
+    assert pusher["p"] == pytest.approx(4 / 70)
+    assert pusher["p_adjusted"] == pytest.approx(4 / 70)
+    assert pusher["leave_one_seed_out_mean"] == -25  # the same choice whatever seed is left out
+    assert pusher["leave_one_seed_out_percent"] == pytest.approx(37.5)
+
+
+def test_consistent_by_hand(sweep):
+    good, bad = sweep.tables["consistent"], sweep.tables["consistently_worse"]
+    percents = [100 * 30 / 115, 37.5]
+    best = row(good, noise=SCALE, noise_rate="0.05")
+    assert len(good) == 1 and best["algorithm"] == "SAC"
+    assert (best["percent_of_environments"], best["environments"], best["n"]) == (100, 2, 4)
+    assert best["average_improvement_percent"] == pytest.approx(np.mean(percents))
+    assert best["std_improvement_percent"] == pytest.approx(abs(np.diff(percents)[0]) / np.sqrt(2))
+    worst = row(bad, noise=ENDING)  # SCALE at 0.2 matches Hopper's baseline: 50 %, in neither table
+    assert len(bad) == 1 and worst["percent_of_environments"] == 0
+    assert worst["average_improvement_percent"] == pytest.approx((-90 / 1.15 - 100) / 2)
+    assert worst["fails_at_every_rate"] == "yes"
+    assert f"Worse at every rate that was tried: {ENDING} (SAC)" in read(
+        sweep, "consistently_worse.md"
+    )
+
+
+def test_consistent_is_80_percent_or_more_best_first():
+    shares = {
+        "a": (80, 1),
+        "b": (79.9, 9),
+        "c": (100, 0.5),
+        "d": (0.1, 9),
+        "e": (80, 2),
+        "f": (0, -9),
+    }
+    names = ("noise", "percent_of_environments", "average_improvement_percent")
+    rows = [dict(zip(names, (noise, *v), strict=True)) for noise, v in shares.items()]
+    rows = [{"algorithm": "SAC", "environments": 5} | row for row in rows]
+    rows.append(rows[2] | {"noise": "in one environment only", "environments": 1})
+    table = analyze.frame("consistency", rows)
+    good, bad = analyze.split_consistency(table)
+    assert list(good["noise"]) == ["c", "e", "a"] and list(bad["noise"]) == ["f"]
+
+
+def test_fails_at_every_rate_needs_every_rate(tmp_path):
+    for seed, (noise, rate, final) in enumerate(
+        [((), (), 10), (SCALE, 0.1, 5), (SCALE, 0.2, 20), (ENDING, 0.1, 5), (ENDING, 0.2, 9)]
+    ):
+        for env in ("Hopper-v5", "Walker2d-v5"):
+            write_run(tmp_path / "runs", [final], env=env, noise=noise, rate=rate, seed=seed)
+    table = run(tmp_path)["consistently_worse"]
+    assert dict(zip(table["noise"], table["fails_at_every_rate"], strict=True)) == {
+        SCALE: "no",
+        ENDING: "yes",
+    }
+
+
+def test_early_performance_by_hand(sweep):
+    table = sweep.tables["early_performance"]
+    assert list(table.columns) == analyze.COLUMNS["early_performance"].split()
+    assert set(table["steps_millions"]) == {0.01, 0.02, 0.03, 0.04, 0.05}  # fifths of a short run
+    where = {"environment": "Pusher-v5", "noise": SCALE, "steps_millions": 0.03}
+    assert set(table[(table[list(where)] == pd.Series(where)).all(axis=1)]["noise_rate"]) == {
+        "0.00",
+        "0.05",
+        "0.20",
+    }
+    early = row(table, noise_rate="0.05", **where)  # 2 final (1 - 0.6) + 0.6 final = 1.4 final
+    assert early["mean"] == pytest.approx(-25 * 1.4) and early["n"] == 4
+    assert early["std"] == pytest.approx(1.4 * np.sqrt(100 / 3))
+    base = row(table, noise_rate="0.00", **where)
+    assert base["mean"] == pytest.approx(-40 * 1.4)
+
+
+def test_early_performance_of_long_runs_is_every_200_000_steps(tmp_path):
+    write_run(tmp_path / "runs", range(24), every=50_000)
+    write_run(tmp_path / "runs", range(24), every=50_000, noise=SCALE, rate=0.5)
+    table = run(tmp_path)["early_performance"].query("noise_rate == '0.50'")
+    assert list(table["steps_millions"]) == [0.2, 0.4, 0.6, 0.8, 1.0, 1.2]
+    assert list(table["mean"]) == [3, 7, 11, 15, 19, 23]
+    assert table["std"].isna().all()  # one seed has no standard deviation
+
+
+def test_early_performance_needs_a_run_with_noise(tmp_path):
+    for env in ("Hopper-v5", "Pusher-v5"):
+        write_run(tmp_path / "runs", range(5), env=env)
+    write_run(tmp_path / "runs", range(5), env="Pusher-v5", noise=SCALE, rate=0.5)
+    table = run(tmp_path)["early_performance"]
+    assert set(table["environment"]) == {"Pusher-v5"} and len(table) == 10
+
+
+def test_statistics_by_hand(sweep):
+    table = sweep.tables["statistics"]
+    assert list(table.columns) == analyze.COLUMNS["statistics"].split()
+    base = row(table, environment="Hopper-v5", noise="")
+    assert (base["n"], base["iqm"]) == (4, 115) and np.isnan(base["p"])  # IQM: mean of 110 and 120
+    even = row(table, environment="Hopper-v5", noise=SCALE, noise_rate="0.20")
+    assert even["iqm"] == 107.5 and (even["n"], even["n_baseline"], even["environments"]) == (
+        4,
+        4,
+        1,
+    )
+    assert even["improvement_iqm_percent"] == pytest.approx(100 * (107.5 - 115) / 115)
+    # 90 wins 0, 100 wins 0.5, 115 wins 2, 155 wins 4 of 4: 6.5 of 16
+    assert even["probability_of_improvement"] == pytest.approx(6.5 / 16)
+    assert even["verdict"] == "no clear difference"
+    worst = row(table, environment="Hopper-v5", noise=ENDING)
+    assert worst["probability_of_improvement"] == 0 and worst["probability_low"] == 0
+    assert (
+        0 < worst["probability_high"] < 0.5
+    )  # certain about the order of four, not about the rest
+    assert worst["verdict"] == "perhaps worse" and worst["comparisons"] == 3
+    assert worst["p"] == pytest.approx(2 / 70) == worst["smallest_p"]  # C(8, 4) = 70
+    # Hopper's family of three: 2/70 (ENDING), 4/70 (130 ties 130, taken as U = 15), and the rest
+    assert worst["p_adjusted"] == pytest.approx(3 * 2 / 70) == worst["smallest_p_adjusted"]
+    both = row(table, environment="all", noise=ENDING)
+    assert both["environments"] == 2 and both["n"] == 4 and np.isnan(both["iqm"])
+    scores = [100 * (r - 115) / 115 for r in (10, 20, 30, 40)] + [-100] * 4
+    assert both["improvement_iqm_percent"] == pytest.approx(np.mean(sorted(scores)[2:6]))
+    assert both["p"] == pytest.approx(2 / 70**2) == both["smallest_p"]
+    assert both["improvement_low"] < both["improvement_iqm_percent"] < both["improvement_high"]
+    assert "all but Pusher" not in set(
+        table["environment"]
+    )  # one other environment is no aggregate
+
+
+def test_pusher_is_also_left_out_of_an_aggregate(tmp_path):
+    small_sweep(tmp_path / "runs")
+    for seed in range(3):
+        write_run(tmp_path / "runs", [100 + seed], env="Walker2d-v5", seed=seed, every=50_000)
+        args = {"env": "Walker2d-v5", "noise": SCALE, "rate": 0.05, "seed": seed, "every": 50_000}
+        write_run(tmp_path / "runs", [130 + seed], **args)
+    table = run(tmp_path)["statistics"]
+    rest = row(table, environment="all but Pusher", noise=SCALE, noise_rate="0.05")
+    every = row(table, environment="all", noise=SCALE, noise_rate="0.05")
+    assert (every["environments"], rest["environments"], rest["n"]) == (3, 2, 3)
+    # Hopper's 130 ties 130: U = 15.5 of 16, taken as 15; with Walker2d's 9 of 9, 3 orders reach 24
+    assert rest["p"] == pytest.approx(2 * 3 / (70 * 20)) != every["p"]
+
+
+def test_several_noises_are_one_configuration(tmp_path):
+    write_run(tmp_path / "runs", [10])
+    write_run(tmp_path / "runs", [20], noise=(SCALE, ENDING), rate=(0.05, 0.125))
+    best = run(tmp_path)["best"].iloc[0]
+    assert best["noise"] == f"{SCALE} + {ENDING}" and best["noise_rate"] == "0.05 + 0.125"
+
+
+def test_seeds_are_replicates_and_episodes_are_not(tmp_path):
+    for seed, final in enumerate([1, 2, 4]):
+        write_run(tmp_path / "runs", [final], seed=seed, spread=1000)
+    base = run(tmp_path)["summary_SAC"].iloc[0]
+    assert base["n"] == 3 and base["std"] == pytest.approx(np.std([1, 2, 4], ddof=1))
+
+
+def test_papers_sign_convention_and_data():
+    paper = Path(analyze.__file__).parent / "results/paper"
+    best = pd.read_csv(paper / "best.csv")
+    ours = analysis.statistics.improvement_percent(best["noisy_mean"], best["baseline_mean"])
+    np.testing.assert_allclose(
+        ours, best["improvement_percent"], atol=0.35
+    )  # means have one decimal
+    assert len(best) == 15 and {"noise", "noise_as_run"} <= set(best)
+    for name, ours in (("consistent", "consistency"), ("consistently_worse", "consistency")):
+        columns = set(pd.read_csv(paper / f"{name}.csv")) - {"noise_as_run"}
+        assert columns <= set(analyze.COLUMNS[ours].split())
+    columns = set(pd.read_csv(paper / "early_performance_sac.csv")) - {"noise_as_run"}
+    assert columns <= set(analyze.COLUMNS["early_performance"].split())
+    assert set(best) - {"noise_as_run"} <= set(analyze.COLUMNS["best"].split())
+
+
+# ------------------------------------------------------------------------------------- statistics
+
+# Inputs (5 x 3, 5 x 3 and 7 x 3) and outputs recorded from rliable 1.2.0.
+X = [[100, 109, 91.8], [73.3, 86.4, 70.3], [101.8, 140.2, 85.2], [81.4, 114.7, 110.7]]
+X = np.array([*X, [103.2, 72.1, 99.1]])
+Y = [[101.8, 49.7, 76.3], [33, 51.3, 91.8], [82.9, 52, 98.1], [94.7, 84.4, 14.5]]
+Y = np.array([*Y, [73.8, 88.5, 93.4]])
+Z = [[44.1, 75.7, 60.6], [65.7, 121.8, 65.8], [89, 116.5, 72.5], [86.6, 93.3, 91.9]]
+Z = np.array([*Z, [53.2, 92.3, 130.8], [43.6, 115.8, 93.6], [70.8, 150, 112.9]])
+
+
+def test_iqm_is_rliables():
+    recorded = [(X, 95.32222222222222), (Y, 77.15555555555555), (Z, 85.85454545454544)]
+    for scores, iqm in [*recorded, (Z[:, :1], 64.08)]:
+        assert analysis.statistics.iqm(scores.ravel()) == pytest.approx(iqm, rel=1e-12)
+        assert analysis.statistics.bootstrap_iqm(scores)[0] == pytest.approx(iqm, rel=1e-12)
+
+
+def test_probability_of_improvement_is_rliables():
+    recorded = [(X, Y, 0.72), (Y, X, 0.28), (X, Z, 0.5904761904761905), (X, X, 0.5)]
+    for x, y, probability in [*recorded, (X[:, :1], Z[:, :1], 0.8857142857142857)]:
+        p, low, high = analysis.statistics.probability_of_improvement(x, y)
+        assert p == pytest.approx(probability, rel=1e-12)
+        assert 0 <= low < p < high <= 1
+
+
+def test_a_missing_run_is_not_a_score():
+    padded = np.vstack([X, np.full((1, 3), NAN)])
+    assert analysis.statistics.bootstrap_iqm(padded, Y) == analysis.statistics.bootstrap_iqm(X, Y)
+    assert analysis.statistics.probability_of_improvement(
+        padded, Y
+    ) == analysis.statistics.probability_of_improvement(X, Y)
+    assert analysis.statistics.mann_whitney(padded, Y) == analysis.statistics.mann_whitney(X, Y)
+
+
+@pytest.mark.parametrize(("shift", "envs"), [(0, 1), (1.5, 1), (2.5, 1), (0, 5), (1.5, 5)])
+def test_coverage_of_the_probability_of_improvement(shift, envs):
+    rng = np.random.default_rng(1)
+    truth, inside, trials = stats.norm.cdf(shift / np.sqrt(2)), 0, 400
+    for _ in range(trials):
+        x, y = rng.normal(shift, 1, (5, envs)), rng.normal(0, 1, (5, envs))
+        _, low, high = analysis.statistics.probability_of_improvement(x, y)
+        inside += low - 1e-12 <= truth <= high + 1e-12
+    assert inside / trials >= 0.9
+
+
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (3, 5), (5, 5), (10, 10)])
+def test_mann_whitney_is_scipys_exact_test(n, m):
+    rng = np.random.default_rng(n)
+    for shift in 30 * (0, 0.7, 3):
+        x, y = rng.normal(shift, 1, (n, 1)), rng.normal(0, 1, (m, 1))
+        expected = stats.mannwhitneyu(x[:, 0], y[:, 0], method="exact").pvalue
+        p, smallest = analysis.statistics.mann_whitney(x, y)
+        assert p == pytest.approx(expected) and smallest <= p + 1e-12
+    best, smallest = analysis.statistics.mann_whitney(
+        np.arange(n)[:, None] + 100, np.arange(m)[:, None]
+    )
+    assert best == pytest.approx(smallest)
+
+
+def test_mann_whitney_over_environments_by_enumeration():
+    x, y = np.array([[5.0, 1], [7, 9], [3, 8]]), np.array([[4.0, 2], [1, 3], [2, 7]])
+    sums = []
+    for groups in itertools.product(itertools.combinations(range(6), 3), repeat=2):
+        u = 0
+        for values, group in zip(np.vstack([x, y]).T, groups, strict=True):
+            rest = np.delete(values, group)
+            u += (values[list(group)][:, None] > rest).sum()
+        sums.append(u)
+    observed = (x[:, None] > y).sum()
+    tails = np.mean(np.array(sums) >= observed), np.mean(np.array(sums) <= observed)
+    p, smallest = analysis.statistics.mann_whitney(x, y)
+    assert p == pytest.approx(2 * min(tails)) and smallest == pytest.approx(2 / 400)
+
+
+def test_benjamini_hochberg_by_hand_and_its_limit():
+    table = analyze.frame("statistics", [{"p": p} for p in (0.01, 0.04, 0.03, 0.2, NAN)])
+    table[["algorithm", "environment", "smallest_p"]] = "SAC", "Hopper-v5", 0.01
+    table = analyze.adjust(table)
+    expected = [0.04, 0.04 * 4 / 3, 0.04 * 4 / 3, 0.2]
+    np.testing.assert_allclose(table["p_adjusted"][:4].astype(float), expected)
+    assert np.isnan(table["p_adjusted"][4])
+    assert (table["smallest_p_adjusted"][:4] == 0.04).all()
+
+
+def test_five_against_five_cannot_reach_significance_alone_among_90(tmp_path):
+    rng = np.random.default_rng(0)
+    returns = {(f"N({i})", "0.05"): rng.normal(0, 1, (1, 5, 1)) for i in range(90)}
+    returns = {
+        analysis.runs.BASELINE: rng.normal(1000, 1, (1, 5, 1))
+    } | returns  # all lose every pair
+    study = analysis.runs.Study(
+        "SAC", "SAC", "", ["Hopper-v5"], [1, 2, 3, 4, 5], np.array([1]), returns
+    )
+    table = analyze.adjust(analyze.frame("statistics", analyze.statistics_rows(study)))
+    assert table["p"].iloc[1] == pytest.approx(2 / 252)
+    assert table["smallest_p_adjusted"].iloc[1] == pytest.approx(90 * 2 / 252)
+    (note,) = analyze.family_notes(table)
+    assert "with 5 seeds and 90 comparisons" in note and "0.0079" in note
+    assert "only if at least 15 of them are" in note  # 90 * 0.0079 / 0.05 = 14.3
+    assert "for one alone 0.71" in note
+    _, caption = analyze.make_tables([study])["statistics"]
+    assert note in caption and f"{analysis.statistics.COVERAGE[5]} % (n = 5)" in caption
+
+
+def test_leave_one_seed_out_by_hand():
+    finals = np.array([[10.0, 0, 0], [4, 4, 4], [1, 9, 1]])
+    # without seed 0: means 0, 4, 5, so 1; without 1: 5, 4, 1, so 0; without 2: 5, 4, 5, so 0
+    assert analysis.statistics.leave_one_seed_out(finals) == pytest.approx(1 / 3)
+    assert np.isnan(analysis.statistics.leave_one_seed_out(finals[:, :1]))
+    lucky = np.array([[4.0, 4, 4], [100, NAN, NAN]])  # one run has no other seeds to be chosen on
+    assert analysis.statistics.leave_one_seed_out(lucky) == 4
+
+
+def test_leave_one_seed_out_sees_through_luck():
+    rng = np.random.default_rng(0)
+    finals = rng.normal(0, 1, (200, 90, 5))  # 90 configurations that are all the same
+    best = np.mean([sweep.mean(axis=1).max() for sweep in finals])
+    held_out = np.mean([analysis.statistics.leave_one_seed_out(sweep) for sweep in finals])
+    assert best > 1 and abs(held_out) < 0.15
+
+
+def test_two_seeds_have_no_interval(tmp_path):
+    for seed in (1, 2):
+        write_run(tmp_path / "runs", [10 + seed], seed=seed)
+        write_run(tmp_path / "runs", [20 + seed], seed=seed, noise=SCALE, rate=0.5)
+    table = run(tmp_path)["statistics"]
+    assert list(table["n"]) == [2, 2] and table["iqm"].notna().all()
+    intervals = table.filter(regex="_(low|high)$")
+    assert intervals.shape[1] == 6 and intervals.isna().all(axis=None)
+    assert table["verdict"].iloc[1] == "no clear difference"
+    assert table["smallest_p"].iloc[1] == pytest.approx(1 / 3)
+
+
+# ---------------------------------------------------------------------- which runs count, and where
+
+
+def read(sweep, name):
+    return (sweep.path / "results" / name).read_text()
+
+
+def test_shuffling_the_run_folders_changes_nothing(sweep, tmp_path):
+    small_sweep(tmp_path / "runs", order=-1)
+    run(tmp_path)
+    for path in sorted((sweep.path / "results").glob("*")):
+        assert path.read_bytes() == (tmp_path / "results" / path.name).read_bytes(), path.name
+
+
+def test_a_second_analysis_gives_the_same_bytes(sweep):
+    command = [sys.executable, analyze.__file__, "--runs-dir", "runs", "--out", "again"]
+    env = os.environ | {"PYTHONHASHSEED": "7"}
+    done = subprocess.run(
+        command, cwd=sweep.path, env=env, capture_output=True, text=True, check=True
+    )
+    assert "HalfCheetah" not in done.stdout and "RandomUniformScaleReward(0.5, 1.5)" in done.stdout
+    first, second = sweep.path / "results", sweep.path / "again"
+    names = sorted(path.name for path in first.iterdir())
+    assert names == sorted(path.name for path in second.iterdir())
+    kinds = {Path(name).suffix for name in names}
+    assert kinds == {".csv", ".md", ".tex", ".svg", ".pdf", ".html"}
+    for name in names:
+        assert (first / name).read_bytes() == (second / name).read_bytes(), name
+
+
+CORRUPTIONS = {
+    "half a line": lambda text: text[:-9],
+    "no newline at the end": lambda text: text[:-1],
+    "a short line": lambda text: text.replace(",1000\n", "\n", 1),
+    "a word": lambda text: text.replace(",1000\n", ",many\n", 1),
+    "nan": lambda text: re.sub(r"(?m)^(10000,0,)[^,]*", r"\1nan", text),
+    "a missing episode": lambda text: re.sub(r"(?m)^20000,1,.*\n", "", text),
+    "one episode twice": lambda text: text.replace("\n20000,1,", "\n20000,0,"),
+    "a missing evaluation at the end": lambda text: re.sub(r"(?m)^50000,.*\n", "", text),
+    "an evaluation twice": lambda text: text + "".join(text.splitlines(keepends=True)[-2:]),
+    "steps out of order": lambda text: text.replace("\n30000,", "\n10000,"),
+    "another final return": lambda text: re.sub(r"(?m)^(50000,1,)[^,]*", r"\g<1>7.5", text),
+    "no header": lambda text: text.split("\n", 1)[1],
+    "only a header": lambda text: text.split("\n", 1)[0] + "\n",
+    "nothing": lambda text: "",
+    "binary": lambda text: text.replace("1000", "\x00"),
+}
+
+
+@pytest.mark.parametrize("name", CORRUPTIONS)
+def test_corrupt_evaluations_are_reported_and_left_out(name, tmp_path):
+    for seed in (1, 2, 3):
+        folder = write_run(tmp_path, [10, 20, 30, 40, 50.0 + seed], seed=seed)
+    text = (folder / "eval.csv").read_text()
+    assert CORRUPTIONS[name](text) != text
+    (folder / "eval.csv").write_text(CORRUPTIONS[name](text))
+    runs = analysis.runs.read_runs(tmp_path)
+    assert list(runs["status"]) == ["finished", "finished", "corrupt"]
+    assert runs["reason"].iloc[2].count("\n") == 0 and len(runs["reason"].iloc[2]) > 10
+    (study,), _ = analysis.runs.make_studies(runs)
+    assert study.final(analysis.runs.BASELINE).ravel().tolist() == [51, 52]
+    assert analysis.runs.missing_runs(runs).empty  # it is there, only broken
+
+
+def test_a_run_that_was_cut_short_is_not_finished(tmp_path):
+    folder = write_run(tmp_path, [5, 5, 5])
+    text = (folder / "eval.csv").read_text()
+    (folder / "eval.csv").write_text(re.sub(r"(?m)^30000,.*\n", "", text))
+    (status,), (reason,) = analysis.runs.read_runs(tmp_path)[["status", "reason"]].T.values
+    assert status == "corrupt" and "steps do not ascend to 30000" in reason
+
+
+@pytest.mark.parametrize("name", ["config.json", "result.json"])
+@pytest.mark.parametrize("text", ["", "{", "[]", "null", "{}", None])
+def test_corrupt_json_is_reported_and_left_out(name, text, tmp_path):
+    write_run(tmp_path, [1.0], seed=1)
+    folder = write_run(tmp_path, [2.0], seed=2)
+    (folder / name).unlink() if text is None else (folder / name).write_text(text)
+    runs = analysis.runs.read_runs(tmp_path)
+    expected = "unfinished" if (name, text) == ("result.json", None) else "corrupt"
+    assert list(runs["status"]) == ["finished", expected]
+
+
+def test_unfinished_missing_and_duplicate_runs_are_listed(tmp_path, capsys):
+    root = tmp_path / "runs"
+    small_sweep(root)
+    args = {"env": "Pusher-v5", "noise": SCALE, "rate": 0.05}
+    shutil.rmtree(root / f"Pusher-v5__SAC__{SCALE}+0.05__2")
+    shutil.rmtree(root / f"Pusher-v5__SAC__{SCALE}+0.05__3")
+    write_run(root, [-1, -1, -1, -1, 1e6], seed=3, finished=False, **args)
+    write_run(root, [-1, -1, -1, -1, 1e6], seed=4, folder="copy", **args)
+    (root / "Pusher-v5__empty").mkdir()
+    (root / "logs").mkdir()  # no run
+    (root / "a file").write_text("")
+    tables = run(tmp_path)
+    missing = tables["missing"].set_index("status")
+    assert sorted(missing.index) == ["corrupt", "duplicate", "missing", "unfinished"]
+    assert missing.loc["missing", "seeds"] == 2 and missing.loc["missing", "noise"] == SCALE
+    assert missing.loc["unfinished", "seeds"] == 3
+    assert "50,000" in missing.loc["unfinished", "reason"]
+    assert missing.loc["corrupt", "run"] == "Pusher-v5__empty"
+    noisy = row(tables["summary_SAC"], environment="Pusher-v5", noise=SCALE, noise_rate="0.05")
+    assert noisy["n"] == 2  # seeds 1 and 4
+    printed = capsys.readouterr().out
+    assert "WARNING: Runs left out: 4 (" in printed and "copy" in printed
+    html = (tmp_path / "results/report.html").read_text()
+    assert "Runs left out: 4 (" in html and "1 missing" in html
+
+
+def test_runs_left_out_have_one_row_per_configuration(tmp_path):
+    for seed in (1, 2, 3, 5, 6, 8):
+        finished = seed in (1, 8)
+        write_run(tmp_path, [10], seed=seed, finished=finished, noise=SCALE, rate=0.5)
+    write_run(tmp_path, [10], seed=9, folder="damaged__1")
+    write_run(tmp_path, [10], seed=9, folder="damaged__2")
+    for name in ("damaged__1", "damaged__2"):
+        (tmp_path / name / "config.json").write_text("{")
+    table, number = analysis.runs.left_out(analysis.runs.read_runs(tmp_path))
+    assert table[["status", "noise", "seeds"]].fillna("").to_numpy().tolist() == [
+        ["unfinished", SCALE, "2-3, 5-6"],
+        ["corrupt", "", ""],
+        ["corrupt", "", ""],
+        ["missing", "", "1-3, 5-6, 8"],  # the baseline
+    ]
+    assert number == {"unfinished": 4, "corrupt": 2, "missing": 6}
+    assert list(table["run"])[1:3] == ["damaged__1", "damaged__2"]
+    assert "3 more" in table["run"].iloc[0]
+
+
+def test_more_seeds_for_the_baseline_or_for_one_noise_are_nothing_missing(tmp_path):
+    for seed in range(1, 6):
+        write_run(tmp_path, [10], seed=seed)
+        if seed <= 3:
+            write_run(tmp_path, [10], seed=seed, noise=SCALE, rate=0.5)
+            write_run(tmp_path, [10], seed=seed, noise=SCALE, rate=0.2)
+        write_run(tmp_path, [10], seed=seed, noise=ENDING, rate=0.5)
+    assert analysis.runs.missing_runs(analysis.runs.read_runs(tmp_path)).empty
+    write_run(tmp_path, [10], seed=4, noise=SCALE, rate=0.2)  # now two of three noises have it
+    missing = analysis.runs.missing_runs(analysis.runs.read_runs(tmp_path))
+    assert missing[["noise_rate", "seed"]].to_numpy().tolist() == [["0.50", 4]]
+
+
+def test_only_the_older_versions_of_an_environment_are_labelled(tmp_path):
+    for env in ("Hopper-v5", "Walker2d-v9", "Walker2d-v10", "Ant", "Ant-v4"):
+        write_run(tmp_path, [10], env=env)
+    runs = analysis.runs.read_runs(tmp_path).set_index("environment")["algorithm"]
+    assert runs["Walker2d-v9"] == "SAC [environments v9]"
+    assert runs["Ant"] == "SAC [environments v]"
+    assert set(runs[["Hopper-v5", "Walker2d-v10", "Ant-v4"]]) == {"SAC"}
+    for env in ("Grid-v0", "Maze-v0", "Maze-v1"):
+        write_run(tmp_path, [10], env=env)
+    runs = analysis.runs.read_runs(tmp_path).set_index("environment")["algorithm"]
+    assert runs["Grid-v0"] == "SAC" and runs["Maze-v0"] == "SAC [environments v0]"
+
+
+def test_a_noise_is_not_missing_where_nobody_tried_it(tmp_path):
+    for seed in (1, 2):
+        write_run(tmp_path, [10], env="Hopper-v5", seed=seed)
+    write_run(tmp_path, [10], env="Hopper-v5", seed=1, noise=SCALE, rate=0.5)
+    write_run(tmp_path, [10], env="Pusher-v5", seed=2, noise=ENDING, rate=0.1)
+    missing = analysis.runs.missing_runs(analysis.runs.read_runs(tmp_path))
+    assert missing[["environment", "noise", "seed"]].to_numpy().tolist() == [
+        ["Hopper-v5", SCALE, 2],
+        ["Pusher-v5", "", 1],
+        ["Pusher-v5", "", 2],
+        ["Pusher-v5", ENDING, 1],
+    ]
+
+
+def test_a_missing_baseline_is_said(tmp_path, capsys):
+    write_run(tmp_path / "runs", [10], noise=SCALE, rate=0.5)
+    tables = run(tmp_path)
+    assert tables["best"].empty and tables["consistent"].empty
+    assert tables["summary_SAC"]["improvement_percent"].isna().all()
+    assert tables["missing"]["noise"].tolist() == [""]
+    assert "no finished baseline on Hopper-v5" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("change", "label"),
+    [
+        ({"env": "Hopper-v4"}, "SAC [environments v4]"),
+        ({"every": 20_000}, "SAC [total_timesteps=20000]"),
+        ({"gamma": 0.9}, "SAC [gamma=0.9]"),
+        ({"tau": 0.1}, "SAC [tau=0.1]"),
+        ({"exp_name": "other"}, "SAC [exp_name=other]"),
+        ({"algorithm": "TD3", "exp_name": "SAC"}, "TD3"),
+    ],
+)
+def test_runs_that_differ_never_share_a_row(change, label, tmp_path):
+    for seed in (1, 2):
+        write_run(tmp_path / "runs", [10], seed=seed, folder=f"a{seed}")
+        write_run(tmp_path / "runs", [99], seed=seed, folder=f"b{seed}", **change)
+        write_run(tmp_path / "runs", [50], seed=seed, folder=f"c{seed}", noise=SCALE, rate=0.1)
+    runs = analysis.runs.read_runs(tmp_path / "runs")
+    assert set(runs["status"]) == {"finished"} and label in set(runs["algorithm"])
+    tables = run(tmp_path)
+    summary = pd.concat([t for name, t in tables.items() if name.startswith("summary_")])
+    assert list(summary["n"]) == [2, 2, 2] and sorted(summary["std"]) == [0, 0, 0]
+    other = row(summary, algorithm=label)
+    assert other["mean"] == 99 and np.isnan(other["improvement_percent"])
+    noisy = row(summary, noise=SCALE)
+    assert noisy["baseline_mean"] == 10 and noisy["algorithm"] != label
+    assert noisy["algorithm"] == "SAC" or change.keys() <= {"every", "gamma", "tau", "exp_name"}
+    assert "all" not in set(tables["statistics"]["environment"])
+
+
+def test_paths_threads_and_evaluation_steps_do_not_split_rows(tmp_path, capsys):
+    write_run(tmp_path / "runs", [1, 2, 3, 4], seed=1)
+    write_run(tmp_path / "runs", [6, 8], seed=2, every=20_000, torch_threads=4, cuda=True)
+    write_run(tmp_path / "runs", [1, 2, 3, 5], seed=3, runs_dir="x", versions={"mujoco": "3.14.0"})
+    runs = analysis.runs.read_runs(tmp_path / "runs")
+    (study,), notes = analysis.runs.make_studies(runs)
+    assert study.algorithm == "SAC" and study.steps.tolist() == [20_000, 40_000]
+    assert study.returns[analysis.runs.BASELINE][:, :, 0].tolist() == [[2, 6, 2], [4, 8, 5]]
+    assert "cut to the 2 steps that all share (of up to 4)" in notes[0]
+    assert (
+        "some rows average runs with different mujoco" in notes[1] and "3.14.0 (n = 1)" in notes[1]
+    )
+    run(tmp_path)
+    printed = capsys.readouterr().out
+    assert notes[0] in printed and notes[0] in (tmp_path / "results/report.html").read_text()
+
+
+def test_changed_code_is_another_commit(tmp_path):
+    commit = "0123456789abcdef0123456789abcdef01234567"
+    for seed, changed in ((1, ""), (2, "-dirty")):
+        write_run(tmp_path, [1], seed=seed, folder=f"a{seed}")
+        path = tmp_path / f"a{seed}/config.json"
+        config = json.loads(path.read_text()) | {"git_commit": commit + changed}
+        path.write_text(json.dumps(config))
+    _, [note] = analysis.runs.make_studies(analysis.runs.read_runs(tmp_path))
+    assert (
+        "some rows average runs of different code versions" in note
+        and "0123456789-dirty (n = 1)" in note
+    )
+
+
+def test_what_an_earlier_analysis_left_is_said(tmp_path, capsys):
+    write_run(tmp_path / "runs", [1])
+    run(tmp_path)
+    assert "earlier analysis" not in capsys.readouterr().out
+    (tmp_path / "results/summary_TD3.csv").touch()
+    analyze.main(analyze.Args(runs_dir=tmp_path / "runs", out=tmp_path / "results"))
+    assert "earlier analysis, not renewed: summary_TD3.csv\n" in capsys.readouterr().out
+
+
+# ------------------------------------------------------------------------------ comparing, drawing
+
+
+def test_baselines_alone_stand_beside_the_papers(tmp_path):
+    write_run(tmp_path / "runs", [10])
+    tables = run(tmp_path, compare=Path(analyze.__file__).parent / "results/paper")
+    base = row(tables["compare_best"], algorithm="SAC", environment="Hopper-v5", noise="")
+    assert base["mean"] == 10 and base["paper_mean"] == 2928 and base["listed_by"] == "both"
+    assert len(tables["compare_consistent"]) == 29
+
+
+def test_compare_sets_the_paper_beside_ours(tmp_path):
+    rng = np.random.default_rng(0)
+    mixup = "RandomMixupObservation(0.5, recursive=True)"
+    for seed in range(5):
+        for config in ({}, {"noise": mixup, "rate": 0.05}, {"noise": SCALE, "rate": 0.05}):
+            curve = 3000 + 500 * rng.normal(size=100)
+            write_run(tmp_path / "runs", curve, env="Hopper-v5", seed=seed, **config)
+    tables = run(tmp_path, compare=Path(analyze.__file__).parent / "results/paper")
+    summary, table = tables["summary_SAC"], tables["compare_best"]
+    ours = row(summary, noise=mixup)
+    both = row(table, environment="Hopper-v5", noise=mixup)
+    assert both["n"] == 5 and both["mean"] == pytest.approx(ours["mean"])
+    assert both["paper_mean"] == 3597.2 and both["paper_std"] == 164.6
+    error = np.sqrt(ours["std"] ** 2 / 5 + 164.6**2 / 5)
+    assert both["difference_se"] == pytest.approx((ours["mean"] - 3597.2) / error)
+    base = row(table, environment="Hopper-v5", noise="")
+    assert base["paper_mean"] == 2928 and base["listed_by"] == "both"
+    best = tables["best"].iloc[0]["noise"]
+    assert row(table, algorithm="SAC", environment="Hopper-v5", noise=best)["listed_by"] in (
+        "both" if best == mixup else "ours",
+    )
+    other = row(table, algorithm="PPO", environment="Walker2d-v2", noise_rate="0.05")
+    assert (
+        np.isnan(other["mean"]) and other["listed_by"] == "paper" and other["paper_mean"] == 3424.6
+    )
+    early = tables["compare_early_performance"]
+    half = row(early, environment="Hopper-v5", noise_rate="0.05", steps_millions=0.4)
+    assert half["paper_mean"] == 2863 and half["n"] == 5 and np.isfinite(half["difference_se"])
+    assert half["listed_by"] == "both"
+    assert set(early[early["mean"].isna()]["listed_by"]) == {"paper"}
+    assert len(early) == 75  # the paper's rows
+    consistent = tables["compare_consistent"]
+    assert len(consistent[consistent["listed_by"] != "ours"]) == 29
+    assert "v2" in (tmp_path / "results/compare_best.md").read_text()
+    assert set(tables["compare_consistently_worse"]["listed_by"]) <= {"paper", "both", "ours"}
+
+
+def test_a_difference_needs_equal_steps_and_a_listing_one_version(tmp_path):
+    """Short runs and runs of v4 stand beside the paper's, but are neither scored nor listed."""
+    for seed in range(3):
+        for config in ({}, {"noise": SCALE, "rate": 0.05}):
+            more = {"seed": seed, "every": 200_000, **config}
+            final = 9 + seed if config else 10 + seed  # worse on v5
+            for env in ("Hopper", "HalfCheetah"):
+                write_run(tmp_path / "runs", 5 * [final], env=f"{env}-v5", **more)
+                write_run(tmp_path / "runs", 5 * [12 + seed], env=f"{env}-v4", **more)
+            write_run(tmp_path / "runs", [final], env="Walker2d-v5", **more)
+    tables = run(tmp_path, compare=Path(analyze.__file__).parent / "results/paper")
+    best = tables["compare_best"].set_index(["algorithm", "environment", "noise"]).sort_index()
+    whole, short = "SAC [total_timesteps=1000000]", "SAC [total_timesteps=200000]"
+    assert np.isfinite(best.loc[(whole, "Hopper-v5", ""), "difference_se"])
+    assert best.loc[(short, "Walker2d-v5", ""), "mean"] == 11
+    assert np.isnan(best.loc[(short, "Walker2d-v5", ""), "difference_se"])
+    early = tables["compare_early_performance"]
+    early = early[(early["algorithm"] == short) & (early["steps_millions"] == 0.2)]
+    assert len(early) == 2 and early["difference_se"].notna().all()
+    table = tables["compare_consistent"]  # the paper lists this noise: SAC, 100 %
+    table = table[(table["noise"] == SCALE) & (table["noise_rate"] == "0.05")]
+    listed = table.set_index("algorithm")["listed_by"]
+    assert listed[whole] == "paper" and listed[whole.replace("]", ", environments v4]")] == "both"
+
+
+def test_without_a_common_configuration_each_environment_has_its_interval(tmp_path):
+    for seed in (1, 2, 3):
+        for env, noise in (("Hopper-v5", SCALE), ("Walker2d-v5", ENDING)):
+            write_run(tmp_path, [seed], env=env, seed=seed)
+            write_run(tmp_path, [seed + 1], env=env, seed=seed, noise=noise, rate=0.1)
+    studies, _ = analysis.runs.make_studies(analysis.runs.read_runs(tmp_path))
+    drawn = list(analysis.figures.figures(studies, analyze.make_tables(studies)))
+    captions = {name: (figure, caption) for name, figure, caption in drawn}
+    figure, caption = captions["intervals_SAC"]
+    labels = [text.get_text() for text in figure.axes[0].get_yticklabels()]
+    assert sorted(labels) == [
+        f"Hopper-v5, {SCALE}, rate 0.10 (n = 3)",
+        f"Walker2d-v5, {ENDING}, rate 0.10 (n = 3)",
+    ]
+    assert "best" not in caption and "(1 in a cell)" in captions["heatmap_SAC"][1]
+
+
+def test_odd_sweeps_are_analysed_too(tmp_path):
+    """A baseline that is zero; a label longer than a file name may be."""
+    settings = {f"a_long_name_of_a_setting_{i}": i for i in range(12)}
+    write_run(tmp_path / "runs", [0.0], folder="a")
+    write_run(tmp_path / "runs", [1.0], folder="b", noise=SCALE, rate=0.1)
+    write_run(tmp_path / "runs", [1.0], folder="c", noise=SCALE, rate=0.1, **settings)
+    tables = run(tmp_path)
+    assert tables["summary_SAC"]["improvement_percent"].isna().all()
+    assert len(list((tmp_path / "results").glob("curves_*.svg"))) == 2
+
+
+def test_figures_have_labels_units_and_n(sweep):
+    studies, _ = analysis.runs.make_studies(analysis.runs.read_runs(sweep.path / "runs"))
+    tables = analyze.make_tables(studies)
+    drawn = {name: figure for name, figure, _ in analysis.figures.figures(studies, tables)}
+    assert set(drawn) == {
+        "intervals_SAC",
+        "heatmap_SAC",
+        "curves_SAC_RandomEarlyTermination_50",
+        "curves_SAC_RandomUniformScaleReward_0.5_1.5",
+    }
+    curves = drawn["curves_SAC_RandomUniformScaleReward_0.5_1.5"]
+    assert [text.get_text() for text in curves.legends[0].get_texts()] == [
+        "no noise (n = 4)",
+        "rate 0.05 (n = 4)",
+        "rate 0.20 (n = 4)",
+    ]
+    hopper, pusher = curves.axes
+    assert hopper.get_title() == "Hopper-v5" and hopper.get_xlabel() == "training steps (thousands)"
+    assert "return" in hopper.get_ylabel()
+    assert hopper.lines[1].get_ydata().tolist() == pytest.approx([29, 58, 87, 116, 145])
+    assert len({(line.get_linestyle(), line.get_marker()) for line in hopper.lines}) == 3
+    band = pusher.collections[0].get_paths()[0].vertices[:, 1]
+    assert band.min() == pytest.approx(-40 * 1.8 - 1.8 * np.sqrt(200 / 3))  # one sample std
+    cells = [text.get_text() for text in drawn["heatmap_SAC"].axes[0].texts]
+    assert cells == ["-89", "+32", "-19"]
+
+    [study] = studies  # an environment without this noise has no panel
+    for config, returns in study.returns.items():
+        returns[:, :, 0] = np.nan if config[0] == "RandomEarlyTermination(50)" else 1.0
+    _, fig, _ = analysis.figures.curves_figure(study, "RandomEarlyTermination(50)")
+    assert [ax.get_title() for ax in fig.axes] == ["Pusher-v5"]
+    study.returns[SCALE, "0.05"][:, :, 0] = np.nan  # nor has a rate that was not tried a line
+    _, fig, _ = analysis.figures.curves_figure(study, SCALE)
+    legend = [text.get_text() for text in fig.legends[0].get_texts()]
+    assert legend[1] == "rate 0.05 (n = 4)" and len(fig.axes) == 2
+    labels = [text.get_text() for text in drawn["intervals_SAC"].axes[0].get_yticklabels()]
+    assert labels[-1] == f"{SCALE}, rate 0.05 (n = 4)" and "-" not in labels[-1]
+
+
+def test_ablation_bars_stand_side_by_side(tmp_path):
+    other = "RandomUniformScaleReward(0.8, 1.2)"
+    for seed in (1, 2):
+        write_run(tmp_path, [10 * seed], seed=seed)
+        write_run(tmp_path, [20 * seed], seed=seed, noise=SCALE, rate=0.05)
+        write_run(tmp_path, [30 * seed], seed=seed, noise=other, rate=0.05)
+        write_run(tmp_path, [40 * seed], seed=seed, noise=other, rate=0.5)
+    studies, _ = analysis.runs.make_studies(analysis.runs.read_runs(tmp_path))
+    drawn = {n: f for n, f, _ in analysis.figures.figures(studies, analyze.make_tables(studies))}
+    figure = drawn["ablation_SAC_RandomUniformScaleReward"]
+    (ax,) = figure.axes
+    heights = [bar.get_height() for bar in ax.patches]
+    np.testing.assert_equal(heights, [15, 30, NAN, 45, 60])
+    assert [text.get_text() for text in ax.get_xticklabels()] == ["none", "0.05", "0.50"]
+    legend = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert legend == ["no noise (n = 2)", f"{SCALE} (n = 2)", f"{other} (n = 2)"]
+
+
+def test_markdown_and_latex_tables(sweep):
+    markdown, latex = read(sweep, "best.md"), read(sweep, "best.tex")
+    assert "115.0 \u00b1 12.9" in markdown and "leave one seed out %" in markdown
+    assert r"115.0 $\pm$ 12.9" in latex and r"\caption{" in latex
+    assert latex.count(r"\begin{longtable}") == latex.count(r"\end{longtable}") == 1
+    body = re.sub(r"\\[%&_#]", "", latex)
+    assert "%" not in body and "_" not in body and latex.isascii()
+
+
+def browser():
+    """Path of Chromium: without it the tests of the report skip, or fail under CI."""
+    found = (
+        shutil.which("chromium")
+        or shutil.which("chromium-browser")
+        or shutil.which("google-chrome")
+    )
+    if not found and os.environ.get("CI"):
+        pytest.fail("chromium is missing, and CI must have it")
+    if not found:
+        pytest.skip("chromium is not installed")
+    return found
+
+
+def in_browser(page, script, width, tmp_path):
+    """Open `page` in a frame of this width and return what `script` returns there."""
+    # In a frame, because a headless window is never narrower than 500 pixels.
+    frame = f'style="width: {width}px; height: 800px; border: 0"'
+    wrapper = f"""<!DOCTYPE html><meta charset="utf-8"><pre id="answer"></pre><script>
+        const answer = frame => {{ document.getElementById("answer").textContent =
+          JSON.stringify(frame.contentWindow.eval({json.dumps(f"(() => {{ {script} }})()")})); }}
+        </script>
+        <iframe {frame} onload="answer(this)" srcdoc="{escape(page.read_text())}"></iframe>"""
+    copy = tmp_path / "wrapper.html"
+    copy.write_text(wrapper)
+    flags = """--headless --no-sandbox --disable-gpu --disable-quic --no-first-run
+        --disable-background-networking --disable-component-update --disable-sync --dump-dom
+        --virtual-time-budget=10000 --window-size=1400,900"""
+    with tempfile.TemporaryDirectory() as profile:
+        command = [browser(), *flags.split(), f"--user-data-dir={profile}", copy.as_uri()]
+        dom = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
+    return json.loads(unescape(re.search(r'<pre id="answer">(.*?)</pre>', dom, re.DOTALL)[1]))
+
+
+def test_report_sorts_in_a_browser(sweep, tmp_path):
+    script = """
+        const table = document.getElementById("summary_SAC");
+        const heads = [...table.tHead.rows[0].cells];
+        const column = name => heads.findIndex(head => head.textContent === name);
+        const read = name => [...table.tBodies[0].rows].map(r => r.cells[column(name)].textContent);
+        const click = name => { heads[column(name)].querySelector("button").click();
+          return [heads[column(name)].getAttribute("aria-sort"), read(name)]; };
+        return [number("-1,234.5 \u00b1 6"), click("mean"), click("mean"), click("improvement %"),
+          click("noise")];"""
+    answer = in_browser(sweep.path / "results/report.html", script, 1280, tmp_path)
+    value, (_, first), (_, second), (state, improvements), (_, noises) = answer
+    assert value == -1234.5
+    means = [float(text.split()[0]) for text in (*first, *second)]
+    values = [-80, -55, -40, -25, 25, 115, 115, 145]
+    assert means == [*reversed(values), *values]  # numbers: the highest first
+    assert improvements[-2:] == ["\u2013", "\u2013"]  # the baselines' dashes come last
+    numbers = [float(text) for text in improvements[:-2]]
+    assert numbers == sorted(numbers, reverse=state == "descending")
+    assert noises == sorted(noises, key=str.lower)
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_report_has_no_horizontal_overflow(width, sweep, tmp_path):
+    script = """
+        document.querySelectorAll("details").forEach(details => details.open = true);
+        const images = [...document.images];
+        return [innerWidth, document.documentElement.scrollWidth,
+          images.length, images.filter(image => image.naturalWidth === 0 || !image.alt).length,
+          [...document.querySelectorAll("[src], link")].filter(node =>
+            !(node.src || node.href).startsWith("data:")).length];"""
+    answer = in_browser(sweep.path / "results/report.html", script, width, tmp_path)
+    inner, needed, images, broken, external = answer
+    assert inner == width and needed <= width
+    assert images == 4 and broken == 0 and external == 0
+
+
+def test_no_table_of_the_committed_report_scrolls_or_cuts_a_number(tmp_path):
+    script = """
+        document.querySelectorAll("details").forEach(details => details.open = true);
+        const cells = [...document.querySelectorAll("td")];
+        const box = node => node.getBoundingClientRect();
+        const lines = cell => { const range = document.createRange();
+          range.selectNodeContents(cell);
+          return new Set([...range.getClientRects()].map(line => line.top)).size; };
+        return [document.documentElement.scrollWidth,
+          [...document.querySelectorAll(".scroll")].filter(node =>
+            node.scrollWidth > node.clientWidth || node.scrollHeight > node.clientHeight).length,
+          cells.filter(cell => box(cell).right > 1280).length,
+          cells.filter(cell => /^-?[0-9,.]+$/.test(cell.textContent) && lines(cell) > 1).length,
+          cells.length];"""
+    page = Path(analyze.__file__).parent / "results/report.html"
+    width, scrolling, outside, broken, cells = in_browser(page, script, 1280, tmp_path)
+    assert width <= 1280 and scrolling == outside == broken == 0 and cells > 500
+
+
+def test_figures_are_of_one_size(sweep):
+    figures = sorted((sweep.path / "results").glob("*.svg"))
+    sizes = {re.search(r'width="([^"]*)" height="([^"]*)"', f.read_text())[0] for f in figures}
+    assert len(figures) == 4 and sizes == {'width="720pt" height="396pt"'}
+
+
+def test_heatmap_colours_fit_the_data(tmp_path):
+    for seed in (1, 2, 3):
+        write_run(tmp_path, [100 + seed], seed=seed)
+        write_run(tmp_path, [112 + seed], seed=seed, noise=SCALE, rate=0.1)
+        write_run(tmp_path, [95 + seed], seed=seed, noise=ENDING, rate=0.1)
+    for factor, limit in ((1, 12), (100, 100)):  # 12 / 102 = 11.8 %; at most 100 %
+        studies, _ = analysis.runs.make_studies(analysis.runs.read_runs(tmp_path))
+        studies[0].returns[SCALE, "0.10"] += 12 * (factor - 1)
+        tables = analyze.make_tables(studies)
+        drawn = {name: figure for name, figure, _ in analysis.figures.figures(studies, tables)}
+        image = drawn["heatmap_SAC"].axes[0].images[0]
+        assert image.get_clim() == (-limit, limit)
+
+
+# ------------------------------------------------------------------------------------ command line
+
+
+@pytest.mark.parametrize(
+    "case", ["no folder", "no runs", "none finished", "no paper", "not the paper"]
+)
+def test_nothing_to_analyze_is_an_error(case, tmp_path, capsys):
+    if case != "no folder":
+        (tmp_path / "runs").mkdir()
+    if case == "none finished":
+        write_run(tmp_path / "runs", [1], finished=False)
+    if case.endswith("paper"):
+        write_run(tmp_path / "runs", [1])
+    compare = {"no paper": tmp_path / "nowhere", "not the paper": tmp_path / "other"}.get(case)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/best.csv").write_text("algorithm,noise\nSAC,x\n")
+    with pytest.raises(SystemExit) as error:
+        run(tmp_path, compare=compare)
+    printed = capsys.readouterr()
+    assert error.value.code == 2 and not (tmp_path / "results").exists()
+    assert printed.err.startswith("error: ") and printed.err.count("\n") == 1
+    assert ("unfinished" in printed.out) == (case == "none finished")
+
+
+def test_a_folder_that_cannot_be_written_is_an_error(tmp_path, capsys):
+    write_run(tmp_path / "runs", [1])
+    (tmp_path / "results").write_text("a file")
+    with pytest.raises(SystemExit) as error:
+        run(tmp_path)
+    printed = capsys.readouterr().err
+    assert error.value.code == 2 and printed.startswith("error: --out: ")
+    assert printed.count("\n") == 1 and (tmp_path / "results").read_text() == "a file"
+
+
+def test_results_go_beside_the_runs_unless_another_analysis_lies_there(tmp_path, capsys):
+    write_run(tmp_path / "runs", [1])
+    analyze.main(analyze.Args(runs_dir=tmp_path / "runs"))
+    assert (tmp_path / "runs/results/report.html").exists()
+    analyze.main(analyze.Args(runs_dir=tmp_path / "runs"))  # its own results are renewed
+
+    (tmp_path / "runs/results/runs").mkdir()
+    before = sorted((tmp_path / "runs/results").iterdir())
+    with pytest.raises(SystemExit) as error:
+        analyze.main(analyze.Args(runs_dir=tmp_path / "runs"))
+    assert error.value.code == 2 and sorted((tmp_path / "runs/results").iterdir()) == before
+    assert "--out" in capsys.readouterr().err
+
+
+def test_results_that_git_tracks_are_not_overwritten_unasked(tmp_path, capsys):
+    write_run(tmp_path, [1])
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results/best.csv").write_text("kept")
+    for command in (["init", "-q"], ["add", "results"]):
+        subprocess.run(["git", "-C", tmp_path, *command], check=True)
+    with pytest.raises(SystemExit) as error:
+        analyze.main(analyze.Args(runs_dir=tmp_path))
+    assert error.value.code == 2 and (tmp_path / "results/best.csv").read_text() == "kept"
+    assert "tracked by git" in capsys.readouterr().err
+    analyze.main(analyze.Args(runs_dir=tmp_path, out=tmp_path / "results"))  # asked for
+
+
+def test_runs_one_folder_deeper_are_pointed_to(tmp_path, capsys):
+    write_run(tmp_path / "runs/demo", [1])
+    with pytest.raises(SystemExit):
+        analyze.main(analyze.Args(runs_dir=tmp_path / "runs"))
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and str(tmp_path / "runs/demo") in error
+    assert not (tmp_path / "runs/results").exists()
+
+
+def test_a_reader_that_stops_early_is_no_error(tmp_path):
+    write_run(tmp_path / "runs", [1])
+    command = f"{sys.executable} {analyze.__file__} --runs-dir {tmp_path}/runs"
+    # The reader is gone before the first line is printed, so the pipe is broken for certain.
+    script = f"set -o pipefail; {command} | true"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True)
+    assert done.stderr == "" and done.returncode == 0
+
+
+def test_one_baseline_run_is_enough_for_a_report(tmp_path, capsys):
+    write_run(tmp_path / "runs", [1.0, 2.0])
+    tables = run(tmp_path)
+    assert tables["best"].empty and row(tables["summary_SAC"], n=1)["mean"] == 2
+    assert (tmp_path / "results/curves_SAC_no_noise.svg").exists()
+    assert "Finished runs: 1." in capsys.readouterr().out
+
+
+def test_committed_results_are_those_of_the_committed_runs(tmp_path):
+    results = Path(analyze.__file__).parent / "results"
+    analyze.main(analyze.Args(results / "data/runs", tmp_path, results / "paper"))
+    tables, figures = results / "tables", results / "figures"
+    committed = {path.name for folder in (tables, figures) for path in folder.iterdir()}
+    pages = {"robustness.svg", "precision.png"}
+    assert committed - pages | {"report.html"} == {path.name for path in tmp_path.iterdir()}
+    for path in tables.glob("*.csv"):
+        both = [pd.read_csv(folder / path.name) for folder in (tables, tmp_path)]
+        pd.testing.assert_frame_equal(*both, rtol=1e-6)
+
+
+def test_committed_runs_had_the_noise_that_their_names_say():
+    """Each wrapper acted as often as a binomial sample at its rate would, up to 4 deviations."""
+    folders = sorted((Path(analyze.__file__).parent / "results/data/runs").iterdir())
+    assert folders
+    for folder in folders:
+        args = json.loads((folder / "config.json").read_text())["args"]
+        result = json.loads((folder / "result.json").read_text())
+        names = [text.partition("(")[0] for text in args["noise"]]
+        assert list(result["noise_applied"]) == names, folder
+        counts = result["noise_applied"].values()
+        for rate, (applied, calls) in zip(args["noise_rate"], counts, strict=True):
+            deviation = (calls * rate * (1 - rate)) ** 0.5
+            assert abs(applied - calls * rate) <= 4 * deviation, (folder, applied, calls)
+
+
+def test_help_names_every_option():
+    command = [sys.executable, analyze.__file__, "--help"]
+    text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert all(option in text for option in ("--runs-dir", "--out", "--compare"))
+
+
+# --------------------------------------------------------------------------------------- benchmark
+
+
+def paper_sized_sweep(root):
+    """Write 9,100 runs: 3 algorithms, 5 environments, 90 configurations and the baseline."""
+    rng = np.random.default_rng(0)
+    levels = {
+        "HalfCheetah": 9500,
+        "Hopper": 2900,
+        "Humanoid": 4500,
+        "Pusher": -25,
+        "Walker2d": 4500,
+    }
+    configs = [{}] + [
+        {"noise": f"Random{'ABCDEFGH'[i // 2]}Observation({i})", "rate": rate}
+        for i, rate in itertools.product(range(15), (0.01, 0.05, 0.1, 0.2, 0.5, 1.0))
+    ]
+    for algorithm, seeds in (("SAC", 5), ("TD3", 5), ("PPO", 10)):
+        for (env, level), config, seed in itertools.product(levels.items(), configs, range(seeds)):
+            curve = level + abs(level) * rng.normal(0, 0.2, 100).cumsum() / 10
+            folder = write_run(root, curve, algorithm, f"{env}-v5", seed=seed, **config)
+            text = (folder / "eval.csv").read_text().splitlines(keepends=True)
+            lines = [
+                re.sub(r",\d,", f",{e},", line, count=1) for line in text[1::2] for e in range(10)
+            ]
+            returns = [line.split(",")[2] for line in lines[-10:]]
+            config_text = (folder / "config.json").read_text()
+            config_text = config_text.replace('"eval_episodes": 2', '"eval_episodes": 10')
+            (folder / "config.json").write_text(config_text)
+            (folder / "eval.csv").write_text(text[0] + "".join(lines))
+            result = {"final_return_mean": np.mean([float(value) for value in returns])}
+            (folder / "result.json").write_text(json.dumps(result))
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as path:
+        paper_sized_sweep(Path(path) / "runs")
+        command = [sys.executable, analyze.__file__, "--runs-dir", "runs"]
+        start = time.perf_counter()
+        subprocess.run(command, cwd=path, check=True, stdout=subprocess.DEVNULL)
+        seconds = time.perf_counter() - start
+        usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+        memory, cpu = usage.ru_maxrss / 1024, usage.ru_utime + usage.ru_stime
+        runs = len(list((Path(path) / "runs").iterdir()))
+        print(f"{runs} runs of 100 evaluations x 10 episodes: ", end="")
+        print(f"{seconds:.1f} s ({cpu:.1f} s of CPU time), {memory:.0f} MiB")

@@ -1,0 +1,177 @@
+"""What analyze.py says of noise that was chosen, that changes during training, or that combines."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+from test_analyze import ENDING, SCALE, row, run, write_run
+
+import analysis.figures
+import analysis.runs
+import analyze
+import evaluate
+
+PUSH = "RandomNormalNoisyAction(0.3)"
+HEADER = "algorithm,environment,phase,round,noise,noise_rate,seeds,score,survives\n"
+
+
+def write_choice(root, env="Hopper-v5", seeds=range(1001, 1006), gain=30.0):
+    """Runs of a search in two rounds, which flatters its winner, and of a confirmation."""
+    for noise, n, final in ((SCALE, 3, 900.0), (ENDING, 1, 100.0)):
+        for seed in range(1, n + 1):
+            write_run(root, [final + seed], "PPO", env, noise, 1.0, seed)
+    for seed in seeds:
+        write_run(root, [100.0 + seed - 1000], "PPO", env, seed=seed)
+        write_run(root, [100.0 + gain + seed - 1000], "PPO", env, SCALE, 1.0, seed)
+    lines = [
+        f'PPO,{env},search,1,"{SCALE}",1.0,1,901.0,yes\n',
+        f'PPO,{env},search,1,"{ENDING}",1.0,1,101.0,no\n',
+        f"PPO,{env},confirmation,,,0.0,5,103.0,\n",
+        f'PPO,{env},confirmation,,"{SCALE}",1.0,5,133.0,yes\n',
+    ]
+    path = Path(root) / "choice.csv"
+    path.write_text((path.read_text() if path.exists() else HEADER) + "".join(lines))
+
+
+def test_search_and_confirmation_are_never_mixed(tmp_path, capsys):
+    write_choice(tmp_path / "runs")
+    tables = run(tmp_path)
+    summary = tables["summary_PPO"]
+    search, fresh = "PPO [search]", "PPO [confirmation]"
+    assert row(summary, algorithm=search, noise=SCALE)[["n", "mean"]].tolist() == [3, 902]
+    confirmed = row(summary, algorithm=fresh, noise=SCALE)
+    assert confirmed[["n", "mean", "n_baseline", "baseline_mean"]].tolist() == [5, 133, 5, 103]
+    assert np.isnan(row(summary, algorithm=search, noise=SCALE)["improvement_percent"])
+    # Only the confirmation is judged: five against five that are all higher.
+    for name in ("statistics", "best", "luck"):
+        assert set(tables[name]["algorithm"]) == {fresh}
+    assert row(tables["statistics"], noise=SCALE)["p"] == pytest.approx(2 / 252)
+    printed = capsys.readouterr().out
+    found = f"{fresh} on Hopper-v5 with {SCALE} at rate 1.00 is better than no noise: +29 %"
+    assert found in printed
+    assert "no finished baseline" not in printed and tables["missing"].empty
+    choice = tables["choice"]
+    assert choice["survives"].fillna("").tolist() == ["yes", "no", "", "yes"]
+    assert choice["noise_rate"].tolist() == ["1.00", "1.00", "0.00", "1.00"]
+    page = (tmp_path / "results/report.html").read_text()
+    assert "Choice of a noise" in page and page.index('id="choice"') < page.index('id="best"')
+
+
+def test_confirmations_are_one_family_of_holms(tmp_path):
+    for env in ("Hopper-v5", "Pusher-v5", "Walker2d-v5"):
+        write_choice(tmp_path / "runs", env, gain=0.5 if env == "Pusher-v5" else 30.0)
+    table = run(tmp_path)["statistics"]
+    table = table[table["p"].notna()].set_index("environment")
+    assert set(table.index) == {"Hopper-v5", "Pusher-v5", "Walker2d-v5"}  # no "all"
+    p = 2 / 252
+    assert table.loc["Hopper-v5", "p_adjusted"] == pytest.approx(3 * p)
+    assert table.loc["Walker2d-v5", "p_adjusted"] == pytest.approx(3 * p)  # never below another
+    assert table.loc["Pusher-v5", "p_adjusted"] == pytest.approx(table.loc["Pusher-v5", "p"])
+    assert set(table["comparisons"]) == {3}
+
+
+def test_without_choice_csv_high_seeds_are_seeds(tmp_path):
+    write_choice(tmp_path / "runs")
+    (tmp_path / "runs/choice.csv").unlink()
+    tables = run(tmp_path)
+    assert set(tables["summary_PPO"]["algorithm"]) == {"PPO"} and "choice" not in tables
+    assert row(tables["summary_PPO"], noise=SCALE)["n"] == 8
+
+
+def test_other_sweeps_in_the_folder_of_a_choice_stay_as_they_are(tmp_path):
+    write_choice(tmp_path / "runs")
+    for algorithm, env in (("PPO", "Pusher-v5"), ("SAC", "Hopper-v5")):
+        for seed in (1, 2, 3):
+            write_run(tmp_path / "runs", [100.0 + seed], algorithm, env, seed=seed)
+            write_run(tmp_path / "runs", [110.0 + seed], algorithm, env, SCALE, 1.0, seed)
+    tables = run(tmp_path)
+    found = tables["statistics"].query("environment != 'all'")
+    assert set(zip(found["algorithm"], found["environment"], strict=True)) == {
+        ("PPO [confirmation]", "Hopper-v5"),
+        ("PPO", "Pusher-v5"),
+        ("SAC", "Hopper-v5"),
+    }
+
+
+def test_a_choice_in_a_folder_of_its_own_disturbs_no_other_sweep(tmp_path):
+    for seed in (1, 2, 3):
+        write_run(tmp_path / "runs", [100.0 + seed], "PPO", seed=seed)
+        write_run(tmp_path / "runs", [110.0 + seed], "PPO", noise=SCALE, rate=1.0, seed=seed)
+    before = [run.folder.name for run in evaluate.find_runs([tmp_path / "runs"])]
+    tables = run(tmp_path)
+    write_choice(tmp_path / "runs/choose")
+    assert [run.folder.name for run in evaluate.find_runs([tmp_path / "runs"])] == before
+    again = run(tmp_path, out="again")
+    assert tables.keys() == again.keys() and "choice" not in again
+    for name, table in tables.items():
+        pd.testing.assert_frame_equal(table, again[name])
+
+
+def test_a_damaged_choice_is_one_line(tmp_path, capsys):
+    write_choice(tmp_path / "runs")
+    (tmp_path / "runs/choice.csv").write_text("algorithm,phase\n")
+    with pytest.raises(SystemExit) as error:
+        run(tmp_path)
+    printed = capsys.readouterr().err
+    assert error.value.code == 2 and printed.count("\n") == 1 and "choice.csv" in printed
+    assert not (tmp_path / "results").exists()
+
+
+def test_rates_that_change_are_read_sorted_and_shown(tmp_path):
+    for rate in (1.0, "1.0:0.0", 0.05, "0.0:1.0"):
+        for seed in (1, 2, 3):
+            write_run(tmp_path / "runs", [10 + seed], seed=seed, noise=SCALE, rate=rate)
+            write_run(tmp_path / "runs", [12 + seed], seed=seed, noise=PUSH, rate=rate)
+    both = {"noise": (SCALE, PUSH), "rate": ("1.0:0.0", 0.5)}
+    for seed in (1, 2, 3):
+        write_run(tmp_path / "runs", [10], seed=seed)
+        write_run(tmp_path / "runs", [20], seed=seed, **both)
+    tables = run(tmp_path)
+    rates = tables["summary_SAC"].query("noise == @PUSH")["noise_rate"].tolist()
+    assert rates == ["0.00 to 1.00", "0.05", "1.00 to 0.00", "1.00"]
+    combined = row(tables["summary_SAC"], noise=f"{SCALE} + {PUSH}")
+    assert combined["noise_rate"] == "1.00 to 0.00 + 0.50"
+    studies, _ = analysis.runs.make_studies(analysis.runs.read_runs(tmp_path / "runs"))
+    figures = analysis.figures.figures(studies, analyze.make_tables(studies))
+    drawn = {name: figure for name, figure, _ in figures}
+    ticks = [text.get_text() for text in drawn["heatmap_SAC"].axes[0].get_xticklabels()]
+    assert ticks == ["0.00 to 1.00", "0.05", "1.00 to 0.00", "1.00 to 0.00 +\n0.50", "1.00"]
+    legend = drawn[f"curves_SAC_{analysis.figures.slug(PUSH)}"].legends[0].get_texts()
+    named = [text.get_text().partition(" (")[0] for text in legend]
+    assert named == ["no noise", *(f"rate {rate}" for rate in rates)]
+
+
+def test_interactions_by_hand(tmp_path):
+    cells = {
+        ((), ()): [100, 104, 108],  # mean 104, variance 16
+        ((SCALE,), (0.5,)): [110, 120, 130],  # mean 120, variance 100
+        ((PUSH,), (1.0,)): [90, 92, 94, 96],  # mean 93, variance 20 / 3
+        ((SCALE, PUSH), (0.5, 1.0)): [140, 150, 160],  # mean 150, variance 100
+        ((SCALE, PUSH), (0.2, 1.0)): [1, 2, 3],  # there is no 0.2 alone
+        ((SCALE, ENDING), (0.5, 1.0)): [1, 2, 3],
+        ((ENDING,), (1.0,)): [1, 2],  # too few seeds
+    }
+    for (noise, rate), finals in cells.items():
+        for seed, final in enumerate(finals):
+            write_run(tmp_path / "runs", [final], noise=noise, rate=rate, seed=seed)
+    [found] = run(tmp_path)["interactions"].to_dict("records")
+    assert found["noise"] == f"{SCALE} + {PUSH}" and found["noise_rate"] == "0.50 + 1.00"
+    assert found["n"] == 3 and found["environment"] == "Hopper-v5"
+    assert found["interaction"] == 150 - 120 - 93 + 104  # 41
+    parts = np.array([16 / 3, 100 / 3, 20 / 3 / 4, 100 / 3])
+    error = np.sqrt(parts.sum())
+    freedom = parts.sum() ** 2 / (parts**2 / [2, 2, 3, 2]).sum()
+    half = stats.t.ppf(0.975, freedom) * error
+    assert found["standard_error"] == pytest.approx(error)
+    assert found["interaction_low"] == pytest.approx(41 - half)
+    assert found["interaction_high"] == pytest.approx(41 + half)
+    assert found["interaction_percent"] == pytest.approx(41 / 1.04)
+    assert found["percent_high"] == pytest.approx((41 + half) / 1.04)
+    assert "Two noises together" in (tmp_path / "results/report.html").read_text()
+
+
+def test_no_interactions_without_combinations(tmp_path):
+    write_run(tmp_path / "runs", [1.0])
+    assert "interactions" not in run(tmp_path)

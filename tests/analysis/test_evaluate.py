@@ -1,0 +1,547 @@
+"""evaluate.py as a user meets it: stored returns, the table, videos, bad input."""
+
+import csv
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import zlib
+from pathlib import Path
+
+import gymnasium as gym
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+
+import evaluate
+import ppo_continuous_noisy as ppo
+import sac_continuous_noisy as sac
+import td3_continuous_noisy as td3
+from evaluate import Args, main
+
+ROOT = Path(__file__).parents[2]
+SCRIPTS = {"SAC": sac, "TD3": td3, "PPO": ppo}
+OBSERVATION, ACTION = "RandomNormalNoisyObservation(0.1)", "RandomNormalNoisyAction(0.5)"
+SEED = 2_000_000  # of the first episode, unless --seed says otherwise
+COMBINED = "RandomUniformScaleReward(-3, 5)+RandomEarlyTermination(6)"
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A folder of small finished runs on InvertedPendulum: two of PPO, one each of SAC and TD3."""
+    runs_dir = tmp_path_factory.mktemp("trained")
+    common = {"env_id": "InvertedPendulum-v5", "compile": False, "runs_dir": str(runs_dir)}
+    off_policy = {"total_timesteps": 80, "learning_starts": 80, "batch_size": 8, "buffer_size": 100}
+    on_policy = {"total_timesteps": 256, "num_steps": 128, "num_minibatches": 4}
+    for seed in (1, 2):
+        ppo.train(ppo.Args(seed=seed, **on_policy, **common))
+    noise = {"noise": ("RandomNormalNoisyReward(0.1)",), "noise_rate": (0.5,)}
+    sac.train(sac.Args(**off_policy, **common, **noise))
+    td3.train(td3.Args(**off_policy, **common))
+    return runs_dir
+
+
+@pytest.fixture
+def runs(trained, tmp_path):
+    """A copy of the trained runs, to write into."""
+    return Path(shutil.copytree(trained, tmp_path / "runs"))
+
+
+def stored(run):
+    """The rows of a run's robustness.csv."""
+    with open(run / "robustness.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def one(runs, algorithm):
+    """The first run of an algorithm."""
+    return sorted(runs.glob(f"*{algorithm.lower()}_continuous_noisy*"))[0]
+
+
+def files(folder):
+    """All files below a folder with their content and time of writing."""
+    paths = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+    return {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in paths}
+
+
+def command(*options, **environment):
+    """The command line and the environment of a process that has no display."""
+    env = {
+        name: value for name, value in os.environ.items() if name not in ("DISPLAY", "MUJOCO_GL")
+    }
+    line = [sys.executable, str(ROOT / "evaluate.py"), *map(str, options)]
+    return {"args": line, "env": env | environment, "text": True}
+
+
+def run(*options, cwd=None, **environment):
+    """Call evaluate.py as a user does."""
+    line = command(*options, **environment)
+    return subprocess.run(capture_output=True, timeout=300, cwd=cwd, **line)
+
+
+# What is played
+
+
+@pytest.mark.parametrize("algorithm", SCRIPTS)
+def test_clean_returns_are_those_of_the_last_evaluation(runs, algorithm):
+    run_dir = one(runs, algorithm)
+    [finished] = evaluate.find_runs([run_dir])
+    played = evaluate.play(finished, [], [], Args((run_dir,), episodes=10, seed=1_000_000))
+    with open(run_dir / "eval.csv", newline="") as file:
+        last = list(csv.DictReader(file))[-10:]
+    rows = [(float(row["episodic_return"]), int(row["episodic_length"])) for row in last]
+    assert played == rows
+    assert len(set(rows)) > 1
+
+
+def streams(name, seed, position):
+    """The documented seeding: the gate's and the noise's generator."""
+    entropy = [seed, zlib.crc32(name.encode()), position]
+    return [np.random.default_rng(child) for child in np.random.SeedSequence(entropy).spawn(2)]
+
+
+@pytest.mark.parametrize("algorithm", SCRIPTS)
+def test_noisy_returns_are_those_of_a_loop_with_the_documented_seeds(runs, algorithm):
+    run_dir = one(runs, algorithm)
+    main(Args((run_dir,), noise=(OBSERVATION, COMBINED), noise_rate=(0.5,), episodes=6))
+    env = gym.make("InvertedPendulum-v5")
+    policy = SCRIPTS[algorithm].load_policy(run_dir, env)
+
+    def loop(seed, noisy, last_step=1000):
+        """Observation noise if `noisy`; the episode may end early."""
+        gate, noise = streams("RandomNormalNoisyObservation", seed, 0)
+
+        def observe(observation):
+            acts = noisy and gate.random() < 0.5
+            return observation + noise.normal(0, 0.1, 4) if acts else observation
+
+        observation, _ = env.reset(seed=seed)
+        total, length, done = 0.0, 0, False
+        while not done and length < last_step:
+            action = policy(observe(observation))
+            observation, reward, terminated, truncated, _ = env.step(action)
+            total, length, done = total + reward, length + 1, terminated or truncated
+        return total, length
+
+    ends = [streams("RandomEarlyTermination", SEED + i, 0)[0].random() < 0.5 for i in range(6)]
+    assert len(set(ends)) == 2
+    both = "RandomEarlyTermination(6) + RandomUniformScaleReward(-3.0, 5.0)"
+    expected = [("", "0.0", i, *loop(SEED + i, noisy=False)) for i in range(6)]
+    expected += [(OBSERVATION, "0.5", i, *loop(SEED + i, noisy=True)) for i in range(6)]
+    expected += [
+        (both, "0.5 + 0.5", i, *loop(SEED + i, noisy=False, last_step=6 if end else 1000))
+        for i, end in enumerate(ends)
+    ]
+    assert [tuple(row.values()) for row in stored(run_dir)] == [
+        (noise, rate, str(i), str(float(total)), str(length))
+        for noise, rate, i, total, length in expected
+    ]
+
+
+def test_the_time_limit_of_training_holds(runs):
+    path = one(runs, "PPO") / "config.json"
+    config = json.loads(path.read_text())
+    config["args"]["max_episode_steps"] = 3
+    path.write_text(json.dumps(config))
+    main(Args((path.parent,), episodes=3))
+    assert [row["episodic_length"] for row in stored(path.parent)] == ["3"] * 3
+
+
+# What is stored
+
+
+def test_what_is_stored_is_not_played_again(runs, monkeypatch, capsys):
+    args = Args((runs,), noise=(OBSERVATION,), noise_rate=(0.5, 1.0), episodes=4)
+    main(args)
+    table, before = capsys.readouterr().out, files(runs)
+    monkeypatch.setattr(evaluate, "play", None)
+    main(args)
+    assert capsys.readouterr().out == table
+    spelled = Args((runs,), (" RandomNormalNoisyObservation(.1)",), (1, 0.5, 0.50, 0.0), episodes=2)
+    main(spelled)
+    assert files(runs) == before
+    means = {}
+    for run_dir in runs.iterdir():
+        first = [row for row in stored(run_dir) if int(row["episode"]) < 2 and not row["noise"]]
+        means[run_dir] = np.mean([float(row["episodic_return"]) for row in first])
+    assert f" {means[one(runs, 'TD3')]:.1f} " in capsys.readouterr().out  # of the first two
+
+
+def test_more_episodes_replay_only_the_conditions_that_have_fewer(runs, monkeypatch):
+    run_dir = one(runs, "PPO")
+    main(Args((run_dir,), noise=(OBSERVATION,), noise_rate=(0.5, 1.0), episodes=2))
+    first = stored(run_dir)
+    main(Args((run_dir,), noise=(OBSERVATION, ACTION), noise_rate=(0.5,), episodes=3))
+    again = stored(run_dir)
+    counts = {}
+    for row in again:
+        key = row["noise"], row["noise_rate"]
+        counts[key] = counts.get(key, 0) + 1
+    assert list(counts.items()) == [
+        (("", "0.0"), 3),
+        ((OBSERVATION, "0.5"), 3),
+        ((OBSERVATION, "1.0"), 2),
+        ((ACTION, "0.5"), 3),
+    ]
+    assert [row for row in again if row["episode"] != "2" and row["noise"] != ACTION] == first
+
+
+def test_another_seed_plays_everything_and_stores_nothing(runs, capsys):
+    """What is stored would do for two of the three conditions."""
+    run_dir = one(runs, "PPO")
+    main(Args((run_dir,), (OBSERVATION,), (0.5,), episodes=3))
+    before, default = files(runs), capsys.readouterr().out
+    args = Args((run_dir,), (OBSERVATION,), (0.5, 1.0), episodes=3, seed=7)
+    main(args)
+    said, *table = capsys.readouterr().out.splitlines()
+    assert said == "--seed 7 is not the default: everything is played, nothing is stored"
+    assert files(runs) == before
+    [finished] = evaluate.find_runs([run_dir])
+    means = []
+    for rate in (0, 0.5, 1.0):
+        played = evaluate.play(finished, [OBSERVATION], [rate], args)
+        means.append(f"{np.mean(played, axis=0)[0]:.1f}")
+    assert table[-1].split()[-3:] == means
+    assert means[0] != default.split()[-2]
+
+
+def test_a_kill_leaves_whole_conditions_and_the_same_command_goes_on(runs):
+    run_dir = one(runs, "PPO")
+    options = ["--noise", OBSERVATION, ACTION, "--noise-rate", "0.3", "0.6", "--episodes", "30"]
+    process = subprocess.Popen(**command(run_dir, *options))
+    while not (run_dir / "robustness.csv").exists():
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    rows = stored(run_dir)
+    assert [int(row["episode"]) for row in rows] == [*range(30)] * (len(rows) // 30)
+    result = run(run_dir, one(runs, "SAC"), *options, "--jobs", "2")
+    assert (result.returncode, result.stderr) == (0, "")
+    before = (run_dir / "robustness.csv").read_bytes()
+    (run_dir / "robustness.csv").unlink()
+    main(Args((run_dir,), (OBSERVATION, ACTION), (0.3, 0.6), episodes=30))
+    assert (run_dir / "robustness.csv").read_bytes() == before
+
+
+def test_two_processes_on_one_run_lose_nothing(runs):
+    """Both find nothing stored; then each stores the clean condition and a noise at 20 rates."""
+    run_dir = one(runs, "PPO")
+    rates = [str(i / 20) for i in range(1, 21)]
+    noises = ("RandomNormalNoisyReward(1.0)", "RandomUniformNoisyReward(0.0, 1.0)")
+    processes = []
+    for noise, episodes in zip(noises, ("1", "2"), strict=True):
+        options = ["--noise", noise, "--noise-rate", *rates, "--episodes", episodes]
+        line = command(run_dir, *options)
+        processes.append(subprocess.Popen(**line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT))
+    for process in processes:
+        output, _ = process.communicate(timeout=100)
+        assert process.returncode == 0, output
+    found = sorted((row["noise"], row["noise_rate"], row["episode"]) for row in stored(run_dir))
+    expected = [("", "0.0", "0"), ("", "0.0", "1")]  # the longer one
+    expected += [(noises[0], str(float(rate)), "0") for rate in rates]
+    expected += [(noises[1], str(float(rate)), episode) for rate in rates for episode in "01"]
+    assert found == sorted(expected)
+    assert [path.name for path in run_dir.glob(".robustness*")] == [".robustness.lock"]
+
+
+def test_the_longer_of_two_results_is_kept(runs):
+    [finished] = evaluate.find_runs([one(runs, "PPO")])
+    short, long = [(1.0, 1)], [(1.0, 1), (2.0, 2)]
+    for results in (short, long, short):
+        evaluate.store(finished, ("", "0.0"), results)
+    assert evaluate.read_stored(finished) == {("", "0.0"): long}
+
+
+def test_training_again_deletes_nothing_of_a_write(runs, monkeypatch):
+    """The command that trained a run is called again in the middle of a write."""
+    run_dir = one(runs, "PPO")
+    arguments = json.loads((run_dir / "config.json").read_text())["args"]
+    arguments = ppo.Args(**arguments | {"runs_dir": str(runs)})
+    fsync = os.fsync
+
+    def train_then_fsync(descriptor):
+        ppo.train(arguments)
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", train_then_fsync)
+    main(Args((run_dir,), episodes=1))
+    assert len(stored(run_dir)) == 1
+
+
+def test_a_full_disk_leaves_the_previous_file(runs, monkeypatch, capsys):
+    run_dir = one(runs, "PPO")
+    main(Args((run_dir,), episodes=1))
+    before = files(runs)
+
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(SystemExit) as exit:
+        main(Args((run_dir,), episodes=2))
+    assert exit.value.code == 1
+    assert "No space left on device" in capsys.readouterr().err
+    assert files(runs) == before
+
+
+# The table
+
+
+def test_the_table_of_known_returns(capsys):
+    def a_run(noise, rate):
+        return evaluate.Run(Path(str(len(cells))), "PPO", "E", noise, rate, "{}")
+
+    cells = {}
+    for noise, rate, clean, noisy in [
+        ("", "0.00", [10, 30], [1, 2]),  # means 20 and 1.5
+        ("A(1)", "0.50", [5, 5], [7, 8]),
+        ("", "0.00", [40, 20], [4, 3]),  # means 30 and 3.5
+        ("", "0.00", [10, 90], [-5, 0]),  # means 50 and -2.5
+    ]:
+        # A third episode is stored and not asked for; the second number is the length.
+        cells[a_run(noise, rate)] = {
+            ("", "0.0"): [(value, 1) for value in (*clean, 1000)],
+            ("A(1) + B(2)", "0.1 + 0.1"): [(value, 1) for value in (*noisy, 1000)],
+            ("C(3)", "0.5"): [(-value, 1) for value in (*noisy, 1000)],
+        }
+    conditions = [("", "0.0"), ("A(1) + B(2)", "0.1 + 0.1"), ("C(3)", "0.5")]
+    evaluate.print_table(list(cells), conditions, cells, episodes=2)
+    lines = [re.split(r" {2,}", line.strip()) for line in capsys.readouterr().out.splitlines()]
+    # sd of (20, 30, 50): sqrt((13.33^2 + 3.33^2 + 16.67^2) / 2); of (1.5, 3.5, -2.5) about 0.833
+    assert lines[1] == ["Mean return, tested with A(1) + B(2)"]
+    assert lines[2][-2:] == ["clean", "at 0.1 + 0.1"]
+    assert lines[4:6] == [
+        ["E", "PPO", "no noise", "0.00", "3", "33.3 ± 15.3", "0.8 ± 3.1"],
+        ["E", "PPO", "A(1)", "0.50", "1", "5.0", "7.5"],
+    ]
+    assert lines[7] == ["Mean return, tested with C(3)"]
+    assert lines[8][-2:] == ["clean", "at 0.5"]
+    assert lines[10][-2:] == ["33.3 ± 15.3", "-0.8 ± 3.1"]
+    evaluate.print_table(list(cells), conditions[:1], cells, episodes=2)
+    alone = capsys.readouterr().out
+    assert "tested with" not in alone and alone.splitlines()[0].endswith("clean")
+
+
+def test_trainings_with_other_settings_are_other_rows_of_the_table(runs, capsys):
+    first, second = sorted(runs.glob("*ppo_continuous_noisy*"))
+    args = json.loads((second / "config.json").read_text())["args"]
+    edit_config(second, args=args | {"total_timesteps": 2560, "gamma": 0.9})
+    main(Args((first, second, one(runs, "TD3")), episodes=1))
+    table = [re.split(r" {2,}", line) for line in capsys.readouterr().out.splitlines()]
+    assert [(row[1], row[4]) for row in table[2:]] == [
+        ("PPO [gamma=0.99, total_timesteps=256]", "1"),
+        ("PPO [gamma=0.9, total_timesteps=2560]", "1"),
+        ("TD3", "1"),
+    ]
+
+
+def test_all_of_a_folder_with_logs_and_an_analysis(runs, capsys):
+    (runs / "logs").mkdir()
+    (runs / "results").mkdir()
+    (runs / "results" / "report.html").touch()
+    (runs / "choice.csv").touch()
+    options = ["--noise", OBSERVATION, "--noise-rate", "0.5", "1.0", "--episodes", "3"]
+    result = run(*sorted(runs.iterdir()), *options)
+    assert (result.returncode, result.stderr) == (0, "")
+    table = [re.split(r" {2,}", line) for line in result.stdout.splitlines()]
+    assert [row[1:5] for row in table[4:]] == [
+        ["PPO", "no noise", "0.00", "2"],
+        ["SAC", "RandomNormalNoisyReward(0.1)", "0.50", "1"],
+        ["TD3", "no noise", "0.00", "1"],
+    ]
+    means = []
+    for seed in (1, 2):
+        rows = stored(runs / f"InvertedPendulum-v5__ppo_continuous_noisy__baseline__{seed}")
+        assert len(rows) == 9
+        means.append(
+            np.mean([float(r["episodic_return"]) for r in rows if r["noise_rate"] == "0.5"])
+        )
+    assert table[4][6] == f"{np.mean(means):.1f} ± {np.std(means, ddof=1):.1f}"
+    before = files(runs)
+    main(Args((runs,), (OBSERVATION,), (0.5, 1.0), episodes=3))  # the folder stands for its runs
+    assert capsys.readouterr().out == result.stdout
+    assert files(runs) == before
+
+
+def test_the_demo_keeps_its_text_where_all_of_its_folder_can_be_tested():
+    """evaluate.py runs/demo/* refuses a file, but skips logs."""
+    written = re.findall(r"> ?(runs/demo/\S+)", (ROOT / "Makefile").read_text())
+    assert written and all(path.startswith("runs/demo/logs/") for path in written)
+
+
+def test_a_folder_stands_for_its_finished_runs(runs, capsys):
+    (one(runs, "SAC") / "result.json").unlink()
+    runs = runs.rename(runs.parent / "two__words")  # which is no run's name here
+    (runs / "report.html").touch()  # analyze.py --out may be the same folder
+    main(Args((runs, one(runs, "TD3")), episodes=1))
+    assert f"{runs}: unfinished runs are left out (1)" in capsys.readouterr().out
+    assert sum((run_dir / "robustness.csv").exists() for run_dir in runs.glob("Inv*")) == 3
+
+
+def test_an_environment_of_the_folder_that_it_is_called_from(runs, tmp_path):
+    run_dir = one(runs, "PPO")
+    limited = "gymnasium.envs.mujoco.inverted_pendulum_v5:InvertedPendulumEnv"
+    text = f"import gymnasium as gym\ngym.register('Mine-v0', '{limited}', max_episode_steps=3)\n"
+    (tmp_path / "my_envs.py").write_text(text)
+    other_environment(run_dir, "my_envs:Mine-v0")
+    result = run(run_dir, "--episodes", "2", "--jobs", "2", cwd=tmp_path)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert [row["episodic_length"] for row in stored(run_dir)] == ["3", "3"]
+
+
+def test_an_environment_that_takes_no_arguments(tmp_path):
+    short = {"total_timesteps": 64, "num_steps": 32, "num_minibatches": 2, "compile": False}
+    ppo.train(ppo.Args(env_id="toy_envs:Tiny-v0", runs_dir=str(tmp_path), **short))
+    [run_dir] = tmp_path.iterdir()
+    main(Args((run_dir,), episodes=3))
+    assert len(stored(run_dir)) == 3
+
+
+# Videos
+
+
+def test_videos(runs, tmp_path):
+    run_dir = one(runs, "PPO")
+    before = files(runs)
+    options = ["--noise", ACTION, "--noise-rate", "1.0", "--video", tmp_path / "a" / "b"]
+    result = run(run_dir, *options, "--episodes", "9")
+    assert (result.returncode, result.stderr) == (0, "")
+    assert files(runs) == before
+    names = ["RandomNormalNoisyAction_0.5_p1.0", "clean"]
+    paths = [tmp_path / "a" / "b" / f"{run_dir.name}__{name}.mp4" for name in names]
+    assert sorted((tmp_path / "a" / "b").iterdir()) == paths
+    main(Args((run_dir,), (ACTION,), (1.0,), episodes=1))
+    for path, row in zip(paths, reversed(stored(run_dir)), strict=True):
+        video = imageio.imread(path)
+        assert len(video) == int(row["episodic_length"]) + 1  # the reset's, and one per step
+        assert video.shape[1:] == (480, 480, 3)
+        assert video[0].std() > 10 and np.abs(video[0].astype(int) - video[-1]).max() > 50
+    assert f"return {float(row['episodic_return']):.1f}, " in result.stdout
+
+
+def test_videos_of_runs_of_one_name(runs, tmp_path, capsys):
+    other = shutil.copytree(one(runs, "PPO"), tmp_path / "other" / one(runs, "PPO").name)
+    args = Args((one(runs, "PPO"), other), video=tmp_path / "videos")
+    refused(args, "the same name", tmp_path, capsys)
+
+
+def test_without_an_opengl_library(runs, tmp_path):
+    """PyOpenGL is told to load a library that does not exist."""
+    run_dir = one(runs, "PPO")
+    result = run(run_dir, "--video", tmp_path / "videos", PYOPENGL_PLATFORM="none")
+    assert result.returncode == 2 and not result.stdout
+    assert result.stderr.startswith("error: --video needs") and result.stderr.count("\n") == 1
+    assert "libegl1" in result.stderr and "libosmesa6" in result.stderr
+    assert not list(tmp_path.rglob("*.mp4"))
+
+
+def test_a_window_needs_a_display(runs):
+    result = run(one(runs, "PPO"), "--render")
+    assert (result.returncode, result.stdout) == (2, "")
+    line = "error: --render needs a display; --video FOLDER makes videos without one\n"
+    assert result.stderr == line
+
+
+def test_a_window_shows_one_episode_of_each_condition(runs, monkeypatch, capsys):
+    """The window itself is replaced."""
+    modes = []
+    make_env = ppo.make_env
+
+    def make(env_id, render_mode=None, **kwargs):
+        modes.append(render_mode)
+        return make_env(env_id, **kwargs)
+
+    monkeypatch.setattr(evaluate, "works", lambda code: True)
+    monkeypatch.setattr(ppo, "make_env", make)
+    before = files(runs)
+    main(Args((one(runs, "PPO"),), (ACTION,), (1.0,), render=True, jobs=2))
+    assert modes == [None, "human", "human"]  # the first is the check
+    assert files(runs) == before
+    assert len(capsys.readouterr().out.splitlines()) == 2
+
+
+# Bad input
+
+
+def edit_config(run_dir, **values):
+    config = json.loads((run_dir / "config.json").read_text())
+    (run_dir / "config.json").write_text(json.dumps(config | values))
+
+
+def other_environment(run_dir, env_id="Reacher-v5"):
+    args = json.loads((run_dir / "config.json").read_text())["args"]
+    edit_config(run_dir, args=args | {"env_id": env_id})
+
+
+BAD_RUNS = {
+    "is not finished": lambda run_dir: (run_dir / "result.json").unlink(),
+    "is no policy for Reacher-v5": other_environment,
+    "is no policy for InvertedPendulum-v5": lambda run_dir: (run_dir / "policy.pt").write_bytes(
+        b"x"
+    ),
+    "cannot read": lambda run_dir: (run_dir / "config.json").write_text("{"),
+    "KeyError: 'args'": lambda run_dir: (run_dir / "config.json").write_text("{}"),
+    "cannot import": lambda run_dir: edit_config(run_dir, algorithm="DQN"),
+    "delete it": lambda run_dir: (run_dir / "robustness.csv").write_text("a,b\n1,2\n"),
+    "no environment|exist": lambda run_dir: other_environment(run_dir, "Nothing-v0"),
+}
+
+
+@pytest.mark.parametrize("message", BAD_RUNS)
+def test_bad_runs(runs, capsys, message):
+    run_dir = one(runs, "PPO")
+    BAD_RUNS[message](run_dir)
+    refused(Args((one(runs, "TD3"), run_dir)), message, runs, capsys)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"noise": ("Nothing(1)",), "noise_rate": (1.0,)}, "unknown name"),
+        ({"noise": (ACTION,), "noise_rate": (1.5,)}, "1.5"),
+        ({"noise": (ACTION,), "noise_rate": ("x",)}, "'x'"),
+        ({"noise": (ACTION,), "noise_rate": ("1:0",)}, "constant rates"),
+        ({"noise": (ACTION,)}, "--noise-rate"),
+        ({"noise_rate": (1.0,)}, "--noise"),
+        ({"noise": (f"{OBSERVATION[:-4]}(1, 2))",), "noise_rate": (1.0,)}, "has 2 numbers"),
+        ({"episodes": 0}, "--episodes must be at least 1, not 0"),
+        ({"jobs": 0}, "--jobs"),
+        ({"seed": -1}, "--seed"),
+        ({"render": True, "video": Path("v")}, "exclude each other"),
+        ({"video": Path(__file__, "v")}, "cannot write to"),
+        ({"runs": ()}, "name the runs"),
+        ({"runs": (Path("nowhere"),)}, "nowhere is neither a run nor a folder of runs"),
+        ({"runs": (Path(__file__),)}, "is neither a run nor a folder of runs"),
+        ({"runs": (ROOT / "docs",)}, "is neither a run nor a folder of runs"),
+        ({"runs": (Path("runs/logs"),)}, "no finished run"),
+    ],
+)
+def test_bad_arguments(runs, capsys, options, message):
+    refused(Args(**({"runs": (runs,)} | options)), message, runs, capsys)
+
+
+def refused(args, message, runs, capsys):
+    """One line, exit status 2, nothing written."""
+    before = files(runs)
+    with pytest.raises(SystemExit) as exit:
+        main(args)
+    out, err = capsys.readouterr()
+    assert (exit.value.code, out) == (2, "")
+    first, *others = err.splitlines()
+    assert first.startswith("error: ") and re.search(message, first)
+    assert all(line.startswith("  Random") for line in others)  # the list of the wrappers
+    assert bool(others) == ("unknown name" in message)
+    assert files(runs) == before
+
+
+def test_help_has_a_sentence_for_every_argument():
+    result = run("--help")
+    assert result.returncode == 0
+    assert "python evaluate.py runs --video videos" in result.stdout
+    for name in ("--noise-rate", "--episodes", "--seed", "--jobs", "--render", "--video"):
+        assert name in result.stdout

@@ -1,0 +1,269 @@
+"""Robustness in analyze.py: fabricated runs with known returns, tables computed by hand."""
+
+import gzip
+import json
+import shutil
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+from test_analyze import row, run, write_run
+
+import analysis.figures
+import analysis.robustness
+import analysis.runs
+import analysis.statistics
+
+SENSOR = "RandomNormalNoisyObservation(0.1)"
+PUSH = "RandomNormalNoisyAction(0.3)"
+REWARD = "RandomNormalNoisyReward(1.0)"
+ENDING = "RandomEarlyTermination(50)"
+OFFSETS = np.arange(-9, 10, 2)  # of ten episodes from their mean; the worst tenth is 9 below
+
+# Training configuration -> test condition -> mean return of seeds 1 to 4, on Hopper. C is 100.
+HOPPER = {
+    ("", 0.0): {
+        ("", "0.0"): [98, 100, 100, 102],
+        (SENSOR, "0.2"): [80, 80, 80, 80],
+        (SENSOR, "1.0"): [40, 40, 40, 40],
+        (PUSH, "1.0"): [61, 62, 63, 64],
+        (REWARD, "1.0"): [0, 0, 0, 0],
+        (ENDING, "1.0"): [0, 0, 0, 0],
+        (f"{SENSOR} + {PUSH}", "0.2 + 1.0"): [50, 50, 50, 50],
+    },
+    (PUSH, 1.0): {
+        ("", "0.0"): [90, 90, 90, 90],
+        (SENSOR, "0.2"): [86, 87, 88, 89],
+        (SENSOR, "1.0"): [60, 60, 60, 60],
+        (PUSH, "1.0"): [95, 95, 95, 95],
+        (REWARD, "1.0"): [70, 70, 70, 70],
+        (ENDING, "1.0"): [70, 70, 70, 70],
+        (f"{SENSOR} + {PUSH}", "0.2 + 1.0"): [70, 70, 70, 70],
+    },
+    (SENSOR, 0.2): {
+        ("", "0.0"): [110, 110, 110, 110],
+        (SENSOR, "0.2"): [105, 105, 105, 105],
+        (SENSOR, "1.0"): [70, 70, 70, 70],
+        (PUSH, "1.0"): [56, 57, 58, 59],
+    },
+}
+
+
+def write_tests(root, table, env, seeds=(1, 2, 3, 4)):
+    """Write runs with a robustness.csv of ten episodes under every condition."""
+    for (noise, rate), conditions in table.items():
+        for i, seed in enumerate(seeds):
+            config = {"noise": noise, "rate": rate} if noise else {}
+            folder = write_run(root, [100.0], "PPO", env, seed=seed, **config)
+            lines = ["noise,noise_rate,episode,episodic_return,episodic_length\n"]
+            for (tested, at), means in conditions.items():
+                for episode, offset in enumerate(OFFSETS):
+                    quoted = f'"{tested}"' if tested else ""
+                    lines.append(f"{quoted},{at},{episode},{means[i] + offset},1000\n")
+            (folder / "robustness.csv").write_text("".join(lines))
+
+
+def test_score_and_conditions_by_hand(tmp_path, capsys):
+    write_tests(tmp_path / "runs", HOPPER, "Hopper-v5")
+    tables = run(tmp_path)
+    scores = tables["robustness_score"]
+    assert list(scores.columns) == analysis.robustness.SCORE_COLUMNS and len(scores) == 2
+
+    push = row(scores, noise=PUSH)  # on the sensor noise alone: ((86 .. 89) - 100 + 60 - 100) / 2
+    assert push["environment"] == "Hopper-v5" and push["conditions"] == 2
+    assert (push["n"], push["n_baseline"]) == (4, 4)
+    assert push["score"] == pytest.approx(np.mean([-27, -26.5, -26, -25.5]))
+    assert push["baseline_score"] == pytest.approx(-40)  # (80 - 100 + 40 - 100) / 2
+    assert push["difference"] == pytest.approx(13.75)
+    half = stats.t.ppf(0.975, 3) * np.std([27, 26.5, 26, 25.5], ddof=1) / 2
+    assert push["difference_low"] == pytest.approx(13.75 - half)
+    assert push["p"] == pytest.approx(2 / 70)  # C(8, 4) = 70
+    assert push["smallest_p"] == pytest.approx(2 / 70)
+    assert push["detectable"] == pytest.approx(2.801585 * np.std([27, 26.5, 26, 25.5], ddof=1) / 2)
+    assert push["p_holm"] == pytest.approx(2 * 2 / 70)
+    assert push["clean_change_percent"] == pytest.approx(-10)
+    assert push["worst_score"] == pytest.approx(-40) and push["baseline_worst_score"] == -60
+    assert push["worst_condition"] == f"{SENSOR} at 1.00"
+    assert push["cvar_score"] == pytest.approx(-26.25 - 9)
+    assert push["baseline_cvar_score"] == pytest.approx(-49)
+
+    sensor = row(scores, noise=SENSOR)  # its wrapper was in training, so the action noise alone
+    assert sensor["conditions"] == 1 and sensor["score"] == pytest.approx(57.5 - 100)
+    assert sensor["baseline_score"] == pytest.approx(62.5 - 100)
+    assert sensor["p"] == pytest.approx(2 / 70) and sensor["clean_change_percent"] == 10
+
+    table = tables["robustness"]
+    same = row(table, noise=PUSH, test_noise=PUSH)
+    assert same["tested_on"] == "the same noise" and same["mean"] == 95 and same["n"] == 4
+    assert same["change_percent"] == pytest.approx(100 * (95 - 62.5) / 62.5)
+    assert same["cvar"] == pytest.approx(86)
+    wrapper = row(table, noise=SENSOR, test_noise=SENSOR, test_rate="1.00")
+    assert wrapper["tested_on"] == "the same wrapper"
+    assert wrapper["change_percent"] == pytest.approx(75)
+    both = row(table, noise=PUSH, test_noise=f"{SENSOR} + {PUSH}")
+    assert both["tested_on"] == "the same wrapper" and both["test_rate"] == "0.20 + 1.00"
+    new = table[(table["noise"] == PUSH) & (table["test_noise"] == SENSOR)]
+    assert set(new["tested_on"]) == {"new noise"}
+    assert new["std"].tolist() == pytest.approx([np.std([1, 2, 3, 4], ddof=1), 0])
+    clean = table[(table["noise"] == "") & (table["test_noise"].isna())].iloc[0]
+    assert clean["tested_on"] == "clean" and clean["mean"] == 100
+    assert np.isnan(clean["change_percent"])
+
+    text = capsys.readouterr().out
+    assert f"PPO on Hopper-v5, trained with {PUSH} at rate 1.00: perhaps more robust" in text
+    assert f"trained with {SENSOR} at rate 0.20: perhaps less robust" in text
+    assert "Primary figure" in (tmp_path / "results/report.html").read_text()
+
+
+def test_environments_count_equally_and_the_test_is_stratified(tmp_path):
+    few = {config: HOPPER[config] for config in (("", 0.0), (PUSH, 1.0))}
+    pusher = {
+        ("", 0.0): {("", "0.0"): [-50] * 3, (SENSOR, "0.2"): [-100, -101, -102]},
+        (PUSH, 1.0): {("", "0.0"): [-60] * 3, (SENSOR, "0.2"): [-75, -76, -77]},
+    }
+    write_tests(tmp_path / "runs", few, "Hopper-v5")
+    write_tests(tmp_path / "runs", pusher, "Pusher-v5", seeds=(1, 2, 3))
+    scores = run(tmp_path)["robustness_score"]
+    assert list(scores["environment"]) == ["all", "Hopper-v5", "Pusher-v5"]
+    every, _, one = (scores.iloc[i] for i in range(3))
+    assert one["score"] == pytest.approx(100 * (-76 + 50) / 50)  # -52
+    assert one["baseline_score"] == pytest.approx(-102)
+    assert every["score"] == pytest.approx((-26.25 - 52) / 2)
+    assert every["difference"] == pytest.approx((13.75 + 50) / 2)
+    assert every["p"] == pytest.approx(2 / (70 * 20)) == every["p_holm"]
+    assert every["clean_change_percent"] == pytest.approx((-10 - 20) / 2)
+    assert every["worst_condition"] == f"{SENSOR} at 0.20 on Pusher-v5"
+    assert every["worst_score"] == pytest.approx(-52) and every["n"] == 3
+    assert scores["p_holm"].isna().tolist() == [False, True, True]  # the others are secondary
+
+
+def test_sentences_say_what_the_seeds_could_have_shown(tmp_path, capsys):
+    alike = {("", 0.0): HOPPER["", 0.0], (PUSH, 1.0): dict(HOPPER["", 0.0])}
+    alike[PUSH, 1.0][SENSOR, "0.2"] = [78, 79, 81, 82]
+    write_tests(tmp_path / "runs", alike, "Hopper-v5")
+    run(tmp_path, out="four")
+    error = np.std([78, 79, 81, 82], ddof=1) / 2 / 2  # of the score: the mean of two conditions
+    limit = f"; a difference of {2.801585 * error:.0f} would have been seen (80 % power)."
+    assert limit in capsys.readouterr().out
+    for folder in (tmp_path / "runs").glob(f"*{PUSH}*__[34]"):
+        shutil.rmtree(folder)
+    run(tmp_path, out="two")
+    assert "; 2 seeds against 4 cannot show any." in capsys.readouterr().out
+
+
+def test_the_score_on_noise_of_the_training(tmp_path):
+    write_tests(tmp_path, HOPPER, "Hopper-v5")
+    found, _ = analysis.robustness.read_robustness(tmp_path, analysis.runs.read_runs(tmp_path))
+    rows = analysis.robustness.score_rows(found, analysis.robustness.is_seen)
+    by_noise = {line["noise"]: line for line in rows}
+    assert by_noise[PUSH]["conditions"] == 1  # not both together: the sensor noise is new
+    assert by_noise[PUSH]["score"] == pytest.approx(-5)
+    assert by_noise[PUSH]["baseline_score"] == pytest.approx(62.5 - 100)
+    assert by_noise[SENSOR]["conditions"] == 2
+    assert by_noise[SENSOR]["score"] == pytest.approx((5 - 30) / 2)
+
+
+def test_conditions_that_a_run_lacks_do_not_count(tmp_path):
+    write_tests(tmp_path / "runs", HOPPER, "Hopper-v5")
+    path = next((tmp_path / "runs").glob(f"*{PUSH}*__2")) / "robustness.csv"
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(line for line in lines if f'"{SENSOR}",1.0' not in line))
+    push = row(run(tmp_path)["robustness_score"], noise=PUSH)
+    assert push["conditions"] == 1 and push["score"] == pytest.approx(87.5 - 100)
+    assert push["baseline_score"] == pytest.approx(-20)
+
+
+def test_compressed_damaged_and_unfinished_runs(tmp_path, capsys):
+    write_tests(tmp_path / "runs", HOPPER, "Hopper-v5")
+    first = run(tmp_path, out="plain")
+    for path in (tmp_path / "runs").glob("*/robustness.csv"):
+        with gzip.open(f"{path}.gz", "wb") as file:
+            file.write(path.read_bytes())
+        path.unlink()
+    second = run(tmp_path, out="packed")
+    pd.testing.assert_frame_equal(first["robustness"], second["robustness"])
+    capsys.readouterr()
+
+    damaged = next((tmp_path / "runs").glob(f"*{PUSH}*__1"))
+    (damaged / "robustness.csv").write_text("noise,rate\n")
+    unfinished = next((tmp_path / "runs").glob(f"*{PUSH}*__2"))
+    (unfinished / "result.json").unlink()
+    tables = run(tmp_path, out="fewer")
+    assert row(tables["robustness_score"], noise=PUSH)["n"] == 2
+    printed = capsys.readouterr().out
+    assert f"{damaged.name}: robustness.csv is left out: unexpected header" in printed
+    for path in (tmp_path / "runs").glob("*baseline*"):
+        shutil.rmtree(path)
+    assert run(tmp_path, out="none")["robustness_score"].empty  # nothing to compare with
+
+
+def test_no_robustness_without_its_files(tmp_path):
+    write_run(tmp_path / "runs", [1.0])
+    assert not [name for name in run(tmp_path) if "robustness" in name]
+
+
+def test_cvar_is_the_mean_of_the_worst_tenth():
+    returns = np.random.default_rng(0).permutation(100).astype(float)
+    assert analysis.robustness.cvar(returns) == 4.5
+    assert analysis.robustness.cvar(returns[:1]) == returns[0]
+    assert analysis.robustness.cvar(np.arange(30.0)) == 1  # three of thirty
+    assert analysis.robustness.cvar(np.arange(11.0)) == 0.5  # two of eleven
+
+
+def test_holm_and_contrast_by_hand():
+    np.testing.assert_allclose(analysis.statistics.holm([0.04, 0.01, 0.03]), [0.06, 0.03, 0.06])
+    np.testing.assert_allclose(analysis.statistics.holm([0.6, 0.7]), [1, 1])
+    x, y = np.array([1.0, 2, 3, 4]), np.array([5.0, 9, 7])
+    found = analysis.statistics.contrast([x, y], [1, -1])
+    welch = stats.ttest_ind(x, y, equal_var=False)
+    low, high = welch.confidence_interval(0.95)
+    assert found[0] == -4.5 and found[1] == pytest.approx(np.sqrt(5 / 3 / 4 + 4 / 3))
+    assert found[2:] == pytest.approx((low, high))
+    assert np.isnan(analysis.statistics.contrast([x, y[:2]], [1, -1])[1:]).all()
+
+
+def test_heatmap_and_curves(tmp_path):
+    table = {config: dict(conditions) for config, conditions in HOPPER.items()}
+    for conditions in table.values():
+        conditions[SENSOR, "0.5"] = [50, 50, 50, 50]
+    write_tests(tmp_path, table, "Hopper-v5")
+    runs = analysis.runs.read_runs(tmp_path)
+    found, notes = analysis.robustness.read_robustness(tmp_path, runs)
+    tables = analysis.robustness.robustness_tables(found)
+    drawn = analysis.figures.robustness_figures(tables["robustness"][0])
+    drawn = {name: (figure, caption) for name, figure, caption in drawn}
+    heatmap = "robustness_heatmap_PPO_Hopper-v5"
+    curves = f"robustness_curves_PPO_{analysis.figures.slug(SENSOR)}"
+    assert notes == [] and set(drawn) == {heatmap, curves}
+
+    ax = drawn[heatmap][0].axes[0]
+    rows = [label.get_text() for label in ax.get_yticklabels()]
+    columns = [label.get_text() for label in ax.get_xticklabels()]
+    assert rows == ["no noise", f"{PUSH}, 1.00", f"{SENSOR}, 0.20"]
+    assert columns[0] == "clean" and f"{SENSOR}, 0.20" in columns
+    numbers = {text.get_position(): text.get_text() for text in ax.texts}
+    assert numbers[columns.index(f"{SENSOR}, 0.20"), 1] == "-12"  # 87.5, of 100
+    assert numbers[columns.index("clean"), 2] == "+10"
+    frames = {(round(box.get_x() + 0.46), round(box.get_y() + 0.46)) for box in ax.patches}
+    same = {(columns.index(f"{PUSH}, 1.00"), 1), (columns.index(f"{SENSOR}, 0.20"), 2)}
+    assert frames == same and "Framed" in drawn[heatmap][1]
+
+    [ax] = drawn[curves][0].axes
+    assert len(ax.lines) == 3
+    assert ax.lines[0].get_xdata().tolist() == [0, 0.2, 0.5, 1]
+    assert ax.lines[0].get_ydata().tolist() == [100, 80, 50, 40]
+    legend = [text.get_text() for text in drawn[curves][0].legends[0].get_texts()]
+    assert legend == rows
+
+
+def test_robustness_of_runs_with_other_settings_is_apart(tmp_path):
+    write_tests(tmp_path, {("", 0.0): HOPPER["", 0.0]}, "Hopper-v5")
+    write_tests(tmp_path, {(PUSH, 1.0): HOPPER[PUSH, 1.0]}, "Hopper-v5")
+    for path in tmp_path.glob(f"*{PUSH}*/config.json"):
+        config = json.loads(path.read_text())
+        config["args"]["gamma"] = 0.5
+        path.write_text(json.dumps(config))
+    found, _ = analysis.robustness.read_robustness(tmp_path, analysis.runs.read_runs(tmp_path))
+    scores, _ = analysis.robustness.robustness_tables(found)["robustness_score"]
+    assert scores.empty and set(found["algorithm"]) == {"PPO [gamma=0.99]", "PPO [gamma=0.5]"}

@@ -1,0 +1,364 @@
+"""The page of results: its numbers are those of claims.py, and claims.py's are right."""
+
+import json
+
+import claims
+import future_work
+import numpy as np
+import pandas as pd
+import pytest
+import reward_scale
+import robustness
+from gymnasium.wrappers import NormalizeReward
+from scipy import stats
+
+from analysis.verdicts import detectable_shift
+
+RESULTS, DATA = claims.RESULTS, claims.DATA
+
+
+def test_the_page_is_what_its_command_writes():
+    assert (RESULTS / "README.md").read_text() == claims.page()
+    assert (RESULTS / "future_work.md").read_text() == future_work.page()
+    assert (RESULTS / "robustness.md").read_text() == robustness.page()
+
+
+def test_the_choice_on_the_page_is_that_of_the_runs():
+    """choice.csv follows from the run folders, and the winner from its last round."""
+    found = future_work.choice()
+    runs = claims.read_returns(DATA / "choice")
+    fresh = runs[runs["seed"] > 1000]
+    x, y = (fresh.loc[fresh["noise"] == noise, "test"] for noise in (found["winner"], ""))
+    assert len(x) == len(y) == 10
+    assert found["p"] == pytest.approx(stats.mannwhitneyu(x, y, method="exact").pvalue)
+    assert found["search"]["runs"] + found["confirmation"]["runs"] == len(runs) == 61
+
+
+def test_the_robustness_on_the_page_is_that_of_the_episodes():
+    """Scores and their difference by hand: the noises that the policies were not trained with."""
+    tables = []
+    for path in (DATA / "robustness").glob("*/robustness.csv.gz"):
+        environment, _, trained_with, seed = path.parent.name.split("__")
+        table = pd.read_csv(path, keep_default_na=False)
+        assert table.groupby(["noise", "noise_rate"]).size().tolist() == 10 * [100]
+        tables.append(table.assign(environment=environment, trained_with=trained_with, seed=seed))
+    assert len(tables) == 90
+    episodes = pd.concat(tables)
+    baseline = episodes[episodes["trained_with"] == "baseline"]
+    clean = baseline[baseline["noise"] == ""].groupby("environment")["episodic_return"].mean()
+
+    def score(policies, noises):
+        tested = policies[policies["noise"].str.split("(").str[0].isin(noises)]
+        returns = tested.groupby("environment")["episodic_return"].mean()
+        return (100 * (returns - clean) / clean.abs()).mean()
+
+    def kept(policies, noises):
+        tested = policies[policies["noise"].str.split("(").str[0].isin(noises)]
+        policy = ["environment", "seed"]
+        own = policies[policies["noise"] == ""].groupby(policy)["episodic_return"].mean()
+        shares = tested.groupby(policy)["episodic_return"].mean() / own
+        return 100 * shares.groupby("environment").mean().mean()
+
+    numbers = robustness.numbers()
+    found, shares = numbers["unseen"], numbers["kept"]
+    dropout, observation, action = (
+        "RandomDropoutObservation",
+        "RandomNormalNoisyObservation",
+        "RandomNormalNoisyAction",
+    )
+    for name, own, noises in (
+        ("observation noise", observation, [action, dropout]),
+        ("action noise", action, [observation, dropout]),
+    ):
+        noisy = episodes[episodes["trained_with"].str.startswith(own)]
+        assert found[name]["score"] == pytest.approx(score(noisy, noises))
+        difference = score(noisy, noises) - score(baseline, noises)
+        assert found[name]["difference"] == pytest.approx(difference)
+        assert shares[name]["share"] == pytest.approx(kept(noisy, noises))
+        assert shares[name]["baseline_share"] == pytest.approx(kept(baseline, noises))
+
+
+# ----------------------------------------------------------------------------------- statistics
+
+
+def test_cleanrls_deviations_are_those_of_a_population():
+    """Three seeds: their sample standard deviation is sqrt(3/2) times what CleanRL prints."""
+    returns = np.array([1.0, 2, 6])
+    claims_std = claims.CLEANRL["CleanRL, v2"]["Hopper"][1]
+    hopper = claims.cleanrl(claims.CLEANRL["CleanRL, v2"]).loc["Hopper"]
+    assert hopper["mean"] == 2311.49 and hopper["n"] == 3
+    assert hopper["std"] / claims_std == pytest.approx(returns.std(ddof=1) / returns.std())
+
+
+def test_welch_is_scipys():
+    rng = np.random.default_rng(0)
+    runs = pd.DataFrame({"environment": ["a"] * 5 + ["b"] * 7, "test": rng.normal(size=12)})
+    other = runs.assign(test=rng.normal(size=12))
+    x, y = claims.sample(runs, "test"), claims.sample(other, "test")
+    errors, p = claims.welch(x, y)
+    for i, name in enumerate("ab"):
+        pair = [table.loc[table["environment"] == name, "test"] for table in (runs, other)]
+        expected = stats.ttest_ind(*pair, equal_var=False)
+        assert p[i] == pytest.approx(expected.pvalue)
+        assert errors.iloc[i] == pytest.approx(expected.statistic)
+
+
+def test_power_is_that_of_the_test():
+    """Without an effect it is the level of the exact test, which is 0.043 for ten against ten."""
+    assert claims.power(0, 1, 10, 1, 10) == pytest.approx(0.043, abs=0.012)
+    assert claims.power(3, 1, 10, 1, 10) > 0.99
+    assert claims.power(50 * detectable_shift(10, 10), 50, 10, 50, 10) == pytest.approx(
+        0.8, abs=0.03
+    )
+    assert 0.02 < claims.power_of_levene(1, 10) < 0.06 and claims.power_of_levene(9, 10) > 0.9
+
+
+def test_the_share_of_the_test_in_the_variance(tmp_path):
+    """Episodes of 1, 2, 3: variance 1, of their mean 1/3; between seeds 2 and 4: variance 2."""
+    lines = ["step,episode,episodic_return,episodic_length", "10,0,9,1", "10,1,0,1", "10,2,5,1"]
+    lines += ["20,0,1,1", "20,1,2,1", "20,2,3,1"]
+    (tmp_path / "eval.csv").write_text("\n".join(lines) + "\n")
+    assert claims.test_error(tmp_path) == pytest.approx(1 / 3)
+    runs = pd.DataFrame({"environment": ["a", "a"], "test": [2.0, 4.0], "error": [1 / 3, 1 / 3]})
+    assert claims.variance_share(runs)["a"] == pytest.approx(100 / 3 / 2)
+
+
+# ------------------------------------------------------------------------------- which runs count
+
+
+def make_runs(seeds_of_noise, shift=0.0):
+    """Runs of PPO on Pusher: seed s has the return -50 - s % 10 + 20 (+ shift from seed 11 on)."""
+    rows = [
+        ("PPO", "Pusher", noise, "1.00" if noise else "0.00", seed, value)
+        for noise, seeds, gain in seeds_of_noise
+        for seed in seeds
+        for value in [-50.0 - seed % 10 + gain + (shift if noise and seed > 10 else 0)]
+    ]
+    names = ["algorithm", "environment", "noise", "noise_rate", "seed", "test"]
+    return pd.DataFrame(rows, columns=names)
+
+
+def test_fresh_seeds_are_apart_and_only_whole_sets_are_shown():
+    runs = make_runs([("", range(1, 31), 0), (claims.ENDING, range(1, 31), 20)], shift=-20)
+    found = claims.pusher(runs)
+    assert set(found["p"]) == {"fixed", "fresh", "all"}
+    assert found["p"]["fixed"] < 1e-4 and found["p"]["fresh"] == pytest.approx(1)
+    assert found["percent"]["fixed"] == pytest.approx(100 * 20 / 54.5)
+    assert found["percent"]["fresh"] == pytest.approx(0)
+    incomplete = claims.pusher(runs[runs["seed"] != 30])
+    assert set(incomplete["p"]) == {"fixed"}
+    truncated = make_runs([(claims.TRUNCATING, range(1, 21), 20)])
+    found = claims.pusher(pd.concat([runs, truncated]))
+    assert set(found["p"]) == {"fixed", "fresh", "all", "truncated", "ways"}
+    assert found["p"]["truncated"] < 1e-4
+
+
+def test_the_five_comparisons_stay_on_seeds_1_to_10():
+    runs = make_runs([("", range(1, 31), 0), (claims.ENDING, range(1, 31), 20), ("N(1)", [1], 5)])
+    kept = claims.fixed_beforehand(runs, [("Pusher", claims.ENDING, "1.00")])
+    assert set(kept["seed"]) == set(range(1, 11)) and set(kept["noise"]) == {"", claims.ENDING}
+    other = claims.fixed_beforehand(runs, [("Hopper", claims.ENDING, "1.00")])
+    assert set(other["noise"]) == {""} and len(other) == 10
+
+
+def test_the_sets_of_runs_are_whole():
+    """The page names the seeds of each comparison; a run that is lost must not go unnoticed."""
+    runs = claims.read_returns(DATA / "runs")
+    few, cheetah = claims.FEW_SEEDS, [*claims.FIXED_SEEDS, *claims.CHEETAH_SEEDS]
+    expected = [
+        ("PPO", "HalfCheetah", "", "0.00", cheetah),
+        ("TD3", "HalfCheetah", "", "0.00", few),
+    ]
+    expected += [("TD3", "HalfCheetah", claims.NORMAL, rate, few) for rate in ("0.01", "1.00")]
+    for noise, environments in claims.WORSE.items():
+        expected += [("PPO", environment, noise, "1.00", few) for environment in environments]
+    keys = ["algorithm", "environment", "noise", "noise_rate"]
+    found = runs.groupby(keys)["seed"].apply(sorted)
+    for *key, seeds in expected:
+        assert found[tuple(key)] == list(seeds), key
+    assert sorted(claims.read_returns(DATA / "long")["seed"]) == [1, 2, 3]
+
+
+def test_worse_noises_by_hand(monkeypatch):
+    """Runs of 10 become 5, 8 and 12 in three environments: changes of -50, -20 and +20 %."""
+    plain_mixup = "RandomMixupObservation(0.0)"
+    rows = [
+        ("PPO", name, noise, rate, seed, value + seed / 1e6)
+        for name, noisy in (("HalfCheetah", 5.0), ("Pusher", 8.0), ("Walker2d", 12.0))
+        for noise, rate, seeds, value in (
+            ("", "0.00", range(1, 11), 10.0),
+            (plain_mixup, "1.00", range(1, 6), noisy),
+            (plain_mixup, "0.50", range(1, 6), -1e6),
+        )
+        for seed in seeds
+    ]
+    runs = pd.DataFrame(rows, columns=list(make_runs([]).columns))
+    paper = claims.read_paper(RESULTS / "paper")
+    monkeypatch.setattr(claims, "WORSE", {plain_mixup: claims.WORSE[plain_mixup]})
+    found = claims.worse_noises(runs, paper)
+    assert found[plain_mixup]["average"] == pytest.approx(-50 / 3, abs=1e-3)
+    assert found[plain_mixup]["lowest"] == ["HalfCheetah", "Pusher"]
+    # U is 0 + 0 + 50 of 150: the null is the sum of three independent Mann-Whitney statistics
+    draws = np.random.default_rng(0).permuted(np.tile(np.arange(15), (3 * 40_000, 1)), axis=1)
+    u = (draws[:, :5, None] > draws[:, None, 5:]).sum(axis=(1, 2)).reshape(3, -1).sum(axis=0)
+    assert found[plain_mixup]["p"] == pytest.approx(2 * (u <= 50).mean(), abs=0.01)
+    cells = [cell.strip() for cell in found["table"].splitlines()[-1].split("|")]
+    assert cells[2:9] == ["-50 %", "–", "–", "-20 %", "+20 %", "-17 ± 35 %", "–"]
+
+
+def test_the_two_mixtures_by_hand():
+    """-50, -20 and +20 % with a memory, 10 points less without; all weigh alike."""
+    rows = [
+        ("PPO", name, noise, rate, seed, 10.0 + gain + spread * (seed - 3))
+        for name, change in (("HalfCheetah", -5.0), ("Pusher", -2.0), ("Walker2d", 2.0))
+        for noise, rate, seeds, gain, spread in (
+            ("", "0.00", range(1, 31), 0.0, 0.0),
+            (claims.MIXUP, "1.00", range(1, 6), change, 0.1),
+            (claims.PLAIN_MIXUP, "1.00", range(1, 6), change - 1, 0.2),
+        )
+        for seed in seeds
+    ]
+    paper = claims.read_paper(RESULTS / "paper")
+    found = claims.mixtures(pd.DataFrame(rows, columns=list(make_runs([]).columns)), paper)
+    assert found["recursive"] == pytest.approx(-50 / 3)
+    assert found["plain"] == pytest.approx(-80 / 3) and found["difference"] == pytest.approx(10)
+    assert found["needed"] == pytest.approx((5 * -76.4 + 80) / 2)  # the paper has -76.4 on average
+    error = np.sqrt(3 * (1 + 4) * 2.5 / 5) / 3  # in percent: the variance of 1 ... 5 is 2.5
+    df = 15**2 / (3 * (1 + 16) / 4)
+    half = stats.t.ppf(0.975, df) * error
+    assert found["low"] == pytest.approx(10 - half) and found["high"] == pytest.approx(10 + half)
+
+
+def test_td3_with_noise_is_compared_on_halfcheetah_and_five_seeds():
+    paper = claims.read_paper(RESULTS / "paper")
+    names = ["environment", "noise", "noise_rate", "seed", "test"]
+    here, other = "HalfCheetah", "Hopper"
+    rows = [(here, "", "0.00", seed, 100.0 + seed) for seed in range(1, 7)]
+    rows += [(here, claims.NORMAL, "1.00", seed, 50.0 + seed) for seed in range(1, 6)]
+    rows += [(here, claims.NORMAL, "0.01", seed, 101.5 + seed) for seed in range(1, 6)]
+    rows += [(other, claims.NORMAL, "0.01", seed, 50.0 + seed) for seed in range(1, 6)]
+    found = claims.td3(pd.DataFrame(rows, columns=names), paper)
+    assert "-33 ± 15 %" in found["table"] and "-92 ± 7 %" in found["table"]
+    assert found["0.01"]["percent"] == pytest.approx(100 * 1.5 / 103)
+    assert found["1.00"]["percent"] == pytest.approx(100 * -50 / 103)
+    assert found["1.00"]["p"] == pytest.approx(2 / 252)
+
+
+def test_td3_at_full_length_is_compared_with_its_papers(monkeypatch):
+    paper = claims.read_paper(RESULTS / "paper")
+    returns = {"environment": "Walker2d", "test": [3900.0, 4000, 4100], "training": [3, 4, 5.0]}
+    monkeypatch.setattr(claims, "read_returns", lambda _: pd.DataFrame(returns))
+    found = claims.long_td3(RESULTS, paper)
+    rows = found["table"].splitlines()[2:]
+    ours = {"mean": 4000, "std": 100, "n": 3}
+    theirs = {"mean": 4015.6, "std": 415.4, "n": 5}
+    samples = [pd.DataFrame(x, index=[0]) for x in (ours, theirs)]
+    low, high = (limit[0] for limit in claims.welch_interval(*samples))
+    assert f"4,000 ± 100 | 4,016 ± 415 | -16 [{low:,.0f}, {high:,.0f}]" in rows[0]
+    assert found["the paper, v2, test"]["low"] == pytest.approx(100 * low / 4015.6)
+    assert f"| 4.0 ± 1.0   | 4,058 ± {658.78 * np.sqrt(1.5):.0f} |" in rows[1]
+
+
+def test_runs_that_end_far_above_the_rest_by_hand():
+    """Of 50 runs one ends at 5,000: it is in the first ten of 20 that are drawn, or is not."""
+    runs = make_runs([("", range(1, 51), 0), ("RandomUniformNoisyReward(1)", range(1, 11), 0)])
+    runs["environment"], runs["test"] = "HalfCheetah", 1000 - runs["seed"] / 1e6
+    runs.loc[(runs["noise"] == "") & (runs["seed"] == 3), "test"] = 5000
+    found = claims.half_cheetah(runs, 30)
+    assert found["fixed"]["count"] == 1 and found["tops"] == [5000]
+    assert found["fixed"]["high"] == pytest.approx(44.5, abs=0.1)  # 1 of 10, Clopper and Pearson
+    assert found["percent_of_rest"] == pytest.approx(0, abs=1e-3)
+    assert found["all"]["percent"] == pytest.approx(100 * (1000 / 1080 - 1), abs=1e-3)
+    assert found["fresh"]["count"] == found["between"] == 0
+    assert found["fresh"]["high"] == pytest.approx(100 * (1 - 0.025 ** (1 / 40)))
+    assert found["luck"] == pytest.approx(100 * 10 / 50, abs=1.5)
+    assert claims.half_cheetah(runs, 41)["luck"] == 0
+
+
+def test_the_interval_of_a_difference_is_scipys():
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(5, 1, 7), rng.normal(3, 2, 4)
+    samples = [
+        pd.DataFrame({"mean": [a.mean()], "std": [a.std(ddof=1)], "n": [len(a)]}) for a in (x, y)
+    ]
+    low, high = claims.welch_interval(*samples)
+    expected = stats.ttest_ind(x, y, equal_var=False).confidence_interval(0.95)
+    assert (low[0], high[0]) == pytest.approx((expected.low, expected.high))
+
+
+def test_noise_and_baseline_of_a_seed_share_their_commit():
+    """So that no change of the code can be taken for an effect, in the comparisons fixed before."""
+    runs = claims.read_runs(DATA / "runs").query("algorithm == 'PPO' and seed <= 10")
+    late = runs["noise"].isin([claims.NORMAL, claims.TRUNCATING, claims.MIXUP, claims.PLAIN_MIXUP])
+    runs = runs[~late].assign(
+        commit=[
+            json.loads((DATA / "runs" / run / "config.json").read_text())["git_commit"]
+            for run in runs.loc[~late, "run"]
+        ]
+    )
+    commits = runs.groupby(["environment", "seed"])["commit"]
+    assert len(commits) == 50 and (commits.size() == 2).all() and (commits.nunique() == 1).all()
+
+
+def test_the_luck_of_the_winners_spread():
+    """The best of useless noises with ten times the spread is easily as good as the paper's."""
+    paper = claims.read_paper(RESULTS / "paper")
+    alike = paper["best"].assign(noisy_std=paper["best"]["baseline_std"])
+    p = claims.with_luck(paper)[0]["best"]["p_luck"].min()
+    assert claims.luck_with_the_winners_spread({"best": alike})["p"] == pytest.approx(p, abs=0.03)
+    wide = paper["best"].assign(noisy_std=10 * paper["best"]["baseline_std"])
+    assert claims.luck_with_the_winners_spread({"best": wide})["p"] > 0.9
+
+
+# ---------------------------------------------------------------------- what the paper's tables say
+
+
+def test_what_the_papers_tables_say_by_hand():
+    paper = claims.read_paper(RESULTS / "paper")
+    found = claims.rates(paper)
+    assert [found[name]["count"] for name in found] == [6, 3, 14]
+    assert found["best"]["p"] == pytest.approx(stats.binomtest(6, 15, 1 / 6).pvalue)
+    found = claims.mixture(paper)["TD3"]
+    assert found["fifth"] == pytest.approx(5 * -269.8 + 400)
+    assert found["std_then"] == pytest.approx((found["fifth"] + 100) / -np.sqrt(5))
+    assert found["std_then"] == pytest.approx(found["std"], rel=0.01)
+    kinds = claims.kinds(paper)
+    assert "| PPO | 0" in kinds["table"]
+    assert kinds["fisher"] == pytest.approx({"observation": 2 / 252, "reward": 12 / 252})
+    worse = claims.worse_everywhere(paper)
+    assert worse["of"]["RandomNormalNoisyObservation(1.0)"] == 3 + 5 + 6
+    assert (worse["at_every_rate"], worse["next"]) == (1, 5)
+
+
+def test_a_noise_in_all_three_algorithms_by_luck():
+    """P(consistent at one of six rates) cubed; a single rate has 6/32."""
+    found = claims.scaled_rewards(claims.read_paper(RESULTS / "paper"))
+    assert (6 / 32) ** 3 < found["this"] / 100 < 0.7**3
+    assert found["this"] < found["any"] < 15 * found["this"]
+
+
+# ------------------------------------------------------------------------------- the reward's scale
+
+
+def test_the_reward_scale_is_gymnasiums(monkeypatch):
+    """The sum that begins anew at termination is the one that NormalizeReward keeps."""
+    monkeypatch.setattr(reward_scale, "STEPS", 250)
+    kept = []
+
+    class Recorded(NormalizeReward):
+        def step(self, action):
+            result = super().step(action)
+            kept.append(float(self.discounted_reward[0]))
+            return result
+
+    def wrapped(env, noises, rates):
+        return Recorded(reward_scale_make_noisy(env, noises, rates), gamma=reward_scale.GAMMA)
+
+    reward_scale_make_noisy = reward_scale.make_noisy
+    plain = reward_scale.discounted_returns(reward_scale.NOISES[1])
+    assert plain["terminated"] == plain["any end"]
+    truncated = reward_scale.discounted_returns(reward_scale.NOISES[2])
+    assert truncated["any end"] == plain["any end"] != truncated["terminated"]
+    monkeypatch.setattr(reward_scale, "make_noisy", wrapped)
+    reward_scale.discounted_returns(reward_scale.NOISES[2])
+    np.testing.assert_allclose(kept, truncated["terminated"], rtol=1e-5)

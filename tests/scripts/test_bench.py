@@ -1,0 +1,205 @@
+"""bench.py: what it counts, who runs when, what it prints. No timings."""
+
+import io
+import itertools
+import json
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import bench
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+# Stands for a script of the project: it says in a file whenever it runs, and logs as they do.
+SCRIPT = """
+import os, signal, sys, time
+from pathlib import Path
+from torch.utils.tensorboard import SummaryWriter
+
+stopped = []
+signal.signal(signal.SIGTERM, lambda *_: stopped.append(True))
+writer = SummaryWriter("runs/one")
+for step in range(100, 1_000_000, 100):
+    with open("{log}", "a") as log:
+        log.write("{name}\\n")
+    time.sleep(0.01)
+    writer.add_scalar("losses/actor_loss", 1.0, step)
+    writer.add_scalar("losses/critic_loss", 1.0, step)
+    if step % 1000 == 0:
+        writer.add_scalar("charts/episodic_return", 1.0, step)
+        if stopped:
+            Path("runs/one/checkpoint.pt").write_bytes(bytes(2**20))
+            sys.exit(128 + signal.SIGTERM)
+"""
+
+
+def checkout(folder, text):
+    """Make a checkout of a project with one script."""
+    folder.mkdir()
+    (folder / "sac_continuous_noisy.py").write_text(text)
+    return folder
+
+
+def test_waiting_is_not_counted(monkeypatch, capsys):
+    now = SimpleNamespace(wall=0.0, cpu=0.0)
+
+    def wait():
+        now.wall += 100
+        now.cpu += 1
+        return "go on\n"
+
+    monkeypatch.setattr(bench.time, "perf_counter", lambda: now.wall)
+    monkeypatch.setattr(bench.time, "process_time", lambda: now.cpu)
+    monkeypatch.setattr(sys, "stdin", SimpleNamespace(readline=wait))
+    marks = bench.Marks()
+    for step in (100, 200):
+        now.wall += 3
+        now.cpu += 2
+        marks.mark(step)
+    reported = [
+        json.loads(line.removeprefix("mark ")) for line in capsys.readouterr().out.split("\n")[:2]
+    ]
+    assert [values[:3] for values in reported] == [[100, 3, 2], [200, 6, 4]]
+    assert all(memory > 1 for *_, memory in reported)
+
+
+def test_an_orphan_ends(monkeypatch):
+    def leave(code):
+        raise SystemExit(code)
+
+    monkeypatch.setattr(sys, "stdin", io.StringIO(""))
+    monkeypatch.setattr(bench.os, "_exit", leave)
+    with pytest.raises(SystemExit):
+        bench.Marks()
+
+
+@pytest.mark.parametrize(("clock", "speed"), [("wall", 50), ("cpu", 200)])
+def test_a_block_lasts_long_enough_and_counts_from_its_start(clock, speed, monkeypatch):
+    def advance(*programs):
+        for program in programs:
+            program.step, program.wall, program.cpu = (
+                program.step + 100,
+                program.wall + 2,
+                program.cpu + 0.5,
+            )
+
+    monkeypatch.setattr(bench, "advance", advance)
+    program = SimpleNamespace(step=5000, wall=70.0, cpu=9.0, speeds=[], shares=[])
+    bench.measure(SimpleNamespace(seconds=5, clock=clock), program)
+    assert program.step == 5300
+    assert (program.speeds, program.shares) == ([speed], [0.25])
+
+
+def test_the_interval_of_a_median():
+    # ranks from the table of the sign test at 95 %: 6 and 15 of 20, 10 and 21 of 30
+    assert bench.interval_of_median(range(20, 0, -1)) == (6, 15)
+    assert bench.interval_of_median(range(1, 31)) == (10, 21)
+    assert bench.interval_of_median([2, 3, 1]) == (1, 3)
+
+
+def test_programs_run_in_turn(tmp_path, monkeypatch, capsys):
+    log = tmp_path / "log"
+    folders = [checkout(tmp_path / name, SCRIPT.format(log=log, name=name)) for name in "ab"]
+    monkeypatch.setattr(bench, "PROJECT", folders[0])
+    figures = tmp_path / "figures.json"
+    arguments = ["--algos", "sac", "--envs", "Any-v5", "--against-checkout", str(folders[1])]
+    bench.main([*arguments, "--pairs", "3", "--seconds", "0.1", "--json", str(figures)])
+
+    ran = [(name, len(list(group))) for name, group in itertools.groupby(log.read_text().split())]
+    assert [name for name, _ in ran] == ["a", "b", "a", "b", "a", "b"]  # b b and a a of ABBA join
+    assert ran[0] == ("a", 3) and ran[1] == ("b", 3)  # warming up, one mark for each step
+    ours, theirs = json.loads(figures.read_text())["compare"]
+    assert (ours["program"], theirs["program"]) == ("ours", "checkout")
+    assert theirs["ratios"] == [
+        a / b for a, b in zip(ours["speeds"], theirs["speeds"], strict=True)
+    ]
+    assert len(theirs["ratios"]) == 3 and theirs["ours / its"] == sorted(theirs["ratios"])[1]
+    assert theirs["memory MB"] > 1
+    header, _, first, second = capsys.readouterr().out.splitlines()
+    assert header.split()[:3] == ["script", "env_id", "program"] and "ratios" not in header
+    assert first.split()[:3] == ["sac", "Any-v5", "ours"] and second.split()[2] == "checkout"
+
+
+def test_side_by_side(tmp_path, monkeypatch):
+    def measure(options, *programs):
+        for program in programs:
+            program.speeds.append(100 if len(programs) == 1 else 80)
+
+    folder = checkout(tmp_path / "a", SCRIPT.format(log=tmp_path / "log", name="a"))
+    monkeypatch.setattr(bench, "PROJECT", folder)
+    monkeypatch.setattr(bench, "measure", measure)
+    [row] = bench.side_by_side("sac", "Any-v5", bench.parse(["--jobs", "2", "--pairs", "3"]))
+    assert (row["alone"], row["2 jobs"], row["efficiency"]) == (100, 160, 0.8)
+    assert row["efficiencies"] == [0.8] * 3
+
+
+def test_a_checkpoint_is_measured(tmp_path, monkeypatch):
+    folder = checkout(tmp_path / "a", SCRIPT.format(log=tmp_path / "log", name="a"))
+    monkeypatch.setattr(bench, "PROJECT", folder)
+    options = bench.parse(["--checkpoint", "--stored", "3000"])
+    [row] = bench.checkpoint("sac", "Any-v5", options)
+    assert (row["step"], row["MB"]) == (4000, 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "message"),
+    [
+        ("raise SystemExit('error: no such\\n  thing')", 1, "error: ours: no such thing\n"),
+        ("print('error: bad flag'); raise SystemExit(2)", 2, "error: ours: bad flag\n"),
+        ("print('done')", 1, "error: ours: done\n"),
+    ],
+)
+def test_a_failure_is_told(tmp_path, monkeypatch, capsys, text, code, message):
+    monkeypatch.setattr(bench, "PROJECT", checkout(tmp_path / "a", text))
+    with pytest.raises(SystemExit) as exit_:
+        bench.main(["--algos", "sac", "--envs", "Any-v5"])
+    assert exit_.value.code == code
+    assert capsys.readouterr().err.endswith(message)
+
+
+@pytest.mark.parametrize("algo", bench.ALGOS)
+def test_the_real_scripts_are_measured(algo, tmp_path):
+    figures = tmp_path / "figures.json"
+    mode = ["--checkpoint"] if algo == "ppo" else ["--stored", "300"]
+    arguments = ["--algos", algo, "--envs", "Pendulum-v1", "--pairs", "1", "--seconds", "0.1"]
+    bench.main([*arguments, *mode, "--json", str(figures), "--", "--no-compile"])
+    rows = json.loads(figures.read_text())
+    if algo == "ppo":
+        [row] = rows["checkpoint"]
+        assert row["step"] == 2200 and 0.05 < row["MB"] < 5  # the next episode's end
+    else:
+        [row] = rows["compare"]
+        assert row["program"] == "ours" and row["steps/s"] > 0
+
+
+def test_a_relative_interpreter_is_found_from_the_folder_of_a_run(tmp_path, monkeypatch):
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin/python").symlink_to(sys.executable)  # as in a virtual environment
+    monkeypatch.chdir(tmp_path / "bin")
+    options = bench.parse(["--against-sbx", "../bin/python"])
+    assert options.against_sbx == str(tmp_path / "bin/python")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--algos dqn", "invalid choice: 'dqn'"),
+        ("--seconds nan", "--seconds must be at least 0.1, not nan"),
+        ("--pairs 0", "--pairs must be at least 1, not 0"),
+        ("--jobs 1", "--jobs must be at least 2, not 1"),
+        ("--stored 0", "--stored must be at least 1, not 0"),
+        ("--against-checkout .github", "--against-checkout: there is no .github/sac_continuous"),
+        ("--against-cleanrl .", "--against-cleanrl and --cleanrl-python go together"),
+        ("--against-cleanrl . --cleanrl-python python3", "--against-cleanrl: there is no"),
+        ("--json no-folder/figures.json", "--json: there is no folder no-folder"),
+        ("--against-sbx ./no-python", "--against-sbx: ./no-python is not a program"),
+    ],
+)
+def test_bad_arguments(arguments, message, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        bench.main(arguments.split())
+    error = capsys.readouterr().err
+    assert exit_.value.code == 2
+    assert error.startswith("error: ") and message in error and error.count("\n") == 1

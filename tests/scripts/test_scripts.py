@@ -1,0 +1,990 @@
+"""The three scripts as a user meets them: runs, run folders, TensorBoard, errors, learning."""
+
+import ast
+import csv
+import inspect
+import json
+import math
+import os
+import re
+import subprocess
+import sys
+import urllib.parse
+import urllib.request
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from unittest import mock
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import ppo_continuous_noisy as ppo
+import sac_continuous_noisy as sac
+import td3_continuous_noisy as td3
+from noisy_wrappers import NoiseWrapper, signatures
+
+ROOT = Path(__file__).parents[2]
+SCRIPTS = {"SAC": sac, "TD3": td3, "PPO": ppo}
+OFF_POLICY = {"total_timesteps": 60, "learning_starts": 20, "batch_size": 8, "buffer_size": 50}
+ON_POLICY = {"total_timesteps": 60, "num_steps": 12, "num_minibatches": 3, "update_epochs": 2}
+SMALL = {"SAC": OFF_POLICY, "TD3": OFF_POLICY, "PPO": ON_POLICY}
+NOISES = ("RandomNormalNoisyReward(0.5)", "RandomEarlyTermination(2, 4)")
+RATES = (0.5, 0.25)
+
+each_script = pytest.mark.parametrize("algorithm", SCRIPTS)
+
+
+def arguments(algorithm, runs_dir, **kwargs):
+    """Return the arguments of a run of a second or less."""
+    common = {"env_id": "toy_envs:Tiny-v0", "eval_frequency": 20, "eval_episodes": 3}
+    common |= {"compile": False, "runs_dir": str(runs_dir)}
+    return SCRIPTS[algorithm].Args(**common | SMALL[algorithm] | kwargs)
+
+
+def run(algorithm, runs_dir, **kwargs):
+    """Train in this process; return the run's folder."""
+    assert SCRIPTS[algorithm].train(arguments(algorithm, runs_dir, **kwargs))
+    [run_dir] = Path(runs_dir).iterdir()
+    return run_dir
+
+
+def command(algorithm, *options, **kwargs):
+    """Run a script as a user does."""
+    path = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
+    line = [sys.executable, SCRIPTS[algorithm].__file__, *map(str, options)]
+    env = os.environ | {"PYTHONPATH": path}
+    return subprocess.run(line, capture_output=True, text=True, env=env, timeout=240, **kwargs)
+
+
+def flags(args):
+    """Return the command line of arguments."""
+    line = []
+    for name, value in asdict(args).items():
+        flag = "--" + name.replace("_", "-")
+        if isinstance(value, bool):
+            line.append(flag if value else "--no-" + flag[2:])
+        elif value is not None:
+            line += [flag, *(value if isinstance(value, tuple) else (value,))]
+    return [str(word) for word in line if word not in ("--noise", "--noise-rate") or args.noise]
+
+
+def evaluations(run_dir):
+    """Return eval.csv as [(step, episode, return, length)]."""
+    with open(run_dir / "eval.csv") as file:
+        header, *rows = csv.reader(file)
+    assert header == ["step", "episode", "episodic_return", "episodic_length"]
+    return [(int(step), int(i), float(value), int(length)) for step, i, value, length in rows]
+
+
+def policy(run_dir):
+    """Return the tensors of policy.pt."""
+    saved = torch.load(run_dir / "policy.pt", weights_only=True)
+    tensors = saved if torch.is_tensor(next(iter(saved.values()))) else {}
+    for part in () if tensors else saved:
+        tensors |= {f"{part}.{name}": tensor for name, tensor in saved[part].items()}
+    return tensors
+
+
+# THE RUN
+
+
+@each_script
+def test_evaluation_does_not_touch_training(algorithm, tmp_path):
+    noise = {"noise": NOISES, "noise_rate": RATES}
+    off = run(algorithm, tmp_path / "off", eval_frequency=0, **noise)
+    on = run(algorithm, tmp_path / "on", eval_frequency=14, eval_episodes=2, **noise)
+    torch.testing.assert_close(policy(on), policy(off), rtol=0, atol=0)
+    assert {row[0] for row in evaluations(off)} == {60}
+    steps = {14, 28, 42, 60} if algorithm == "PPO" else {14, 28, 42, 56, 60}
+    assert {row[0] for row in evaluations(on)} == steps
+
+
+@each_script
+def test_a_seed_gives_one_eval_csv(algorithm, tmp_path):
+    noise = {"noise": NOISES, "noise_rate": RATES}
+    first, again, other = (
+        run(algorithm, tmp_path / name, seed=seed, **noise)
+        for name, seed in (("first", 1), ("again", 1), ("other", 2))
+    )
+    assert (first / "eval.csv").read_bytes() == (again / "eval.csv").read_bytes()
+    assert (first / "eval.csv").read_bytes() != (other / "eval.csv").read_bytes()
+    torch.testing.assert_close(policy(first), policy(again), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("algorithm", ["SAC", "TD3"])
+def test_a_buffer_takes_no_more_memory_than_the_run_fills(algorithm, tmp_path):
+    enough, huge = (run(algorithm, tmp_path / str(n), buffer_size=n) for n in (60, 10**15))
+    assert (enough / "eval.csv").read_bytes() == (huge / "eval.csv").read_bytes()
+    torch.testing.assert_close(policy(enough), policy(huge), rtol=0, atol=0)
+
+
+@each_script
+def test_the_test_environment_is_clean(algorithm, tmp_path):
+    script = SCRIPTS[algorithm]
+    noises = (
+        "RandomEarlyTermination(2)",
+        "RandomNormalNoisyReward(1.0, loc=100)",
+        "RandomUniformNoisyObservation(50, 60)",
+    )
+    with (
+        mock.patch.object(script, "evaluate", wraps=script.evaluate) as evaluate,
+        mock.patch.object(script.noisy, "make_noisy", wraps=script.noisy.make_noisy) as make_noisy,
+    ):
+        run_dir = run(algorithm, tmp_path, noise=noises, noise_rate=(1.0,))
+    assert evaluate.call_count == 3
+    for call in evaluate.call_args_list:
+        env = call.args[1]
+        assert env.unwrapped is not make_noisy.call_args.args[0].unwrapped
+        while isinstance(env, gym.Wrapper):
+            assert not isinstance(env, NoiseWrapper)
+            env = env.env
+
+    # the last evaluation, played again: mean actions, raw rewards, initial states of its own
+    clean = gym.make("toy_envs:Tiny-v0")
+    act = script.load_policy(run_dir, clean)
+    for step, episode, episodic_return, length in evaluations(run_dir)[-3:]:
+        observation, _ = clean.reset(seed=1_000_000 + episode)
+        total = steps = 0
+        done = False
+        while not done:
+            observation, reward, terminated, truncated, _ = clean.step(act(observation))
+            total, steps, done = total + reward, steps + 1, terminated or truncated
+        assert (step, length) == (60, steps)
+        assert episodic_return == pytest.approx(total)
+
+
+@each_script
+def test_evaluate(algorithm):
+    def policy(observation):
+        seen.append(observation)
+        return np.float32([0.1, 0.1])
+
+    script, seen = SCRIPTS[algorithm], []
+    env = script.make_env("toy_envs:Tiny-v0")
+    results = script.evaluate(policy, env, 4)
+    assert results.shape == (4, 2)
+    assert results[:, 1].sum() == len(seen)
+    starts = [seen[int(i)] for i in (0, *results[:-1, 1].cumsum())]
+    expected = [env.reset(seed=1_000_000 + episode)[0] for episode in range(4)]
+    np.testing.assert_array_equal(starts, expected)
+    np.testing.assert_array_equal(script.evaluate(policy, env, 4), results)
+
+
+@each_script
+def test_returns_are_recorded_before_reward_noise(algorithm, tmp_path):
+    noises = ("RandomUniformScaleReward(100, 100)", "RandomEarlyTermination(3)")
+    run_dir = run(algorithm, tmp_path, env_id="toy_envs:Count-v0", noise=noises, noise_rate=(1.0,))
+    result = json.loads((run_dir / "result.json").read_text())
+    assert result["train_return_mean_last_100"] == 3  # of 3 steps, as early termination has it
+    assert {row[2:] for row in evaluations(run_dir)} == {(8.0, 8)}
+
+
+@each_script
+def test_run_folder(algorithm, tmp_path, capsys):
+    noise = {"noise": (*NOISES, "RandomMixupObservation(.1)"), "noise_rate": (0.5, 0.25, 0.0)}
+    run_dir = run(algorithm, tmp_path, exp_name="an experiment", seed=7, **noise)
+    slug = "RandomEarlyTermination_2_4_p0.25+RandomNormalNoisyReward_0.5_p0.5"
+    assert run_dir.name == f"toy_envs--Tiny-v0__an--experiment__{slug}__7"
+    files = {re.sub(r"tfevents.*", "tfevents", path.name) for path in run_dir.iterdir()}
+    expected = {"config.json", "eval.csv", "events.out.tfevents", "policy.pt", "result.json"}
+    assert files - {".lock"} == expected
+
+    config = json.loads((run_dir / "config.json").read_text())
+    args = arguments(algorithm, tmp_path, exp_name="an experiment", seed=7)
+    args.noise = ["RandomEarlyTermination(2, 4)", "RandomNormalNoisyReward(0.5)"]
+    args.noise_rate = [0.25, 0.5]
+    assert config["args"] == asdict(args)
+    assert config["algorithm"] == algorithm
+    assert config["matmul_precision"] in ("highest", "high", "medium")
+    assert config["versions"] == {
+        "python": ".".join(map(str, sys.version_info[:3])),
+        "torch": torch.__version__,
+        "gymnasium": gym.__version__,
+        "mujoco": mujoco.__version__,
+        "numpy": np.__version__,
+    }
+    commit, changes = (
+        subprocess.run(["git", "-C", ROOT, *words], capture_output=True, text=True).stdout.strip()
+        for words in (["rev-parse", "HEAD"], ["status", "--porcelain", "--untracked-files=no"])
+    )
+    assert config["git_commit"] == (commit + "-dirty" * bool(changes) or None)
+
+    rows = evaluations(run_dir)
+    assert [row[:2] for row in rows] == [(s, i) for s in (20, 40, 60) for i in range(3)]
+    last = np.array([row[2] for row in rows[-3:]])
+    result = json.loads((run_dir / "result.json").read_text())
+    assert result["final_return_mean"] == pytest.approx(last.mean())
+    assert result["final_return_std"] == pytest.approx(last.std(ddof=1))
+    assert result["final_return_n"] == 3
+    assert result["total_timesteps"] == 60
+    assert result["steps_per_second"] == pytest.approx(60 / result["wall_time_seconds"])
+    assert math.isfinite(result["train_return_mean_last_100"])
+    applied, counts = result["noise_applied_fraction"], result["noise_applied"]
+    names = ["RandomEarlyTermination", "RandomNormalNoisyReward"]
+    assert list(applied) == list(counts) == names
+    assert counts["RandomNormalNoisyReward"][1] == 60  # steps; of the other, episodes
+    assert 60 / 8 <= counts["RandomEarlyTermination"][1] <= 60
+    for name, rate in zip(names, (0.25, 0.5), strict=True):
+        assert applied[name] == counts[name][0] / counts[name][1]
+        assert applied[name] == pytest.approx(rate, abs=0.3)
+    assert set(result) == {
+        "final_return_mean",
+        "final_return_std",
+        "final_return_n",
+        "train_return_mean_last_100",
+        "noise_applied_fraction",
+        "noise_applied",
+        "steps_per_second",
+        "wall_time_seconds",
+        "total_timesteps",
+    }
+
+    # the same again, in another spelling: finished, and nothing is written
+    mean = result["final_return_mean"]
+    before = {path: path.stat().st_mtime_ns for path in run_dir.iterdir()}
+    capsys.readouterr()
+    noise = {"noise": ("RandomEarlyTermination(2,4)", "RandomNormalNoisyReward(.50)")}
+    run(algorithm, tmp_path, exp_name="an experiment", seed=7, noise_rate=(0.25, 0.5), **noise)
+    assert capsys.readouterr().out == f"{run_dir} is finished: mean test return {mean:.1f}\n"
+    lock = run_dir / ".lock"
+    after = {path: path.stat().st_mtime_ns for path in run_dir.iterdir()}
+    assert after.keys() == before.keys()
+    assert all(after[path] == before[path] for path in before.keys() - {lock})
+
+
+@each_script
+def test_other_arguments_need_overwrite(algorithm, tmp_path, capsys):
+    run_dir = run(algorithm, tmp_path)
+    before = (run_dir / "result.json").read_text()
+    with pytest.raises(SystemExit) as stopped:
+        run(algorithm, tmp_path, gamma=0.5)
+    message = capsys.readouterr().err
+    assert stopped.value.code == 2
+    assert message.count("\n") == 1 and message.startswith("error: ")
+    assert "gamma 0.99, not 0.5" in message
+    assert message.index("--exp-name") < message.index("--runs-dir") < message.index("--overwrite")
+    assert (run_dir / "result.json").read_text() == before
+    run(algorithm, tmp_path, gamma=0.5, overwrite=True)
+    assert json.loads((run_dir / "config.json").read_text())["args"]["gamma"] == 0.5
+    assert len(list(run_dir.glob("events*"))) == 1
+    assert len(evaluations(run_dir)) == 9
+
+
+@pytest.mark.parametrize("content", ["", "{}", "[]", '{"final_return_mean": 1'])
+@each_script
+def test_a_result_that_cannot_be_read_is_no_result(algorithm, content, tmp_path, capsys):
+    short = {"total_timesteps": 12, "eval_frequency": 0, "learning_starts": 5}
+    short = {name: short[name] for name in short.keys() & asdict(SCRIPTS[algorithm].Args()).keys()}
+    result = run(algorithm, tmp_path, **short) / "result.json"
+    whole = result.read_text()
+    result.write_text(content)
+    with pytest.raises(SystemExit) as stopped:
+        run(algorithm, tmp_path, **short)
+    assert stopped.value.code == 2
+    assert_one_line(capsys.readouterr().err, f"cannot read {result} (if damaged, --overwrite ")
+    assert result.read_text() == content
+    run(algorithm, tmp_path, overwrite=True, **short)
+    assert json.loads(result.read_text()).keys() == json.loads(whole).keys()
+
+
+@each_script
+def test_overwrite_of_nothing_and_a_short_run(algorithm, tmp_path):
+    short = {"total_timesteps": 5, "eval_frequency": 3, "eval_episodes": 1}
+    short |= {"num_steps": 5, "num_minibatches": 1} if algorithm == "PPO" else {}
+    run_dir = run(algorithm, tmp_path, env_id="toy_envs:Count-v0", overwrite=True, **short)
+    steps = [row[:2] for row in evaluations(run_dir)]
+    assert steps == ([(5, 0)] if algorithm == "PPO" else [(3, 0), (5, 0)])
+    result = json.loads((run_dir / "result.json").read_text())
+    assert result["train_return_mean_last_100"] is None  # no episode ended
+    assert result["final_return_std"] == 0
+    assert result["noise_applied"] == {}
+
+
+def test_ppo_evaluates_at_the_end_of_rollouts_under_the_nominal_step(tmp_path):
+    rollouts = {"num_steps": 16, "num_minibatches": 2, "eval_episodes": 1}
+    run_dir = run("PPO", tmp_path, total_timesteps=100, eval_frequency=20, **rollouts)
+    # rollouts end at 16, 32, ..., 96; 100 is what was asked for
+    assert [row[0] for row in evaluations(run_dir)] == [20, 40, 60, 80, 100]
+    run_dir = run("PPO", tmp_path / "often", total_timesteps=48, eval_frequency=5, **rollouts)
+    assert [row[0] for row in evaluations(run_dir)] == [15, 30, 48]
+    run_dir = run("PPO", tmp_path / "seldom", total_timesteps=64, eval_frequency=32, **rollouts)
+    assert [row[0] for row in evaluations(run_dir)] == [32, 64]
+
+
+@each_script
+def test_observations_of_any_box_and_module_names(algorithm, tmp_path):
+    run_dir = run(
+        algorithm,
+        tmp_path,
+        env_id="toy_envs:Square-v0",
+        noise=("RandomDropoutObservation(0.5)",),
+        noise_rate=(0.5,),
+    )
+    env = SCRIPTS[algorithm].make_env("toy_envs:Square-v0")
+    assert env.observation_space.shape == (4,)
+    act = SCRIPTS[algorithm].load_policy(run_dir, env)
+    assert env.action_space.contains(act(env.reset()[0]))
+
+
+@each_script
+def test_networks_are_float32_where_actions_are_float64(algorithm, tmp_path):
+    saved = policy(run(algorithm, tmp_path, env_id="toy_envs:DoubleAction-v0"))
+    networks = {name: x for name, x in saved.items() if "stats" not in name}
+    assert {x.dtype for x in networks.values()} == {torch.float32}
+
+
+@pytest.mark.parametrize(
+    ("env_id", "observations", "actions", "horizon"),
+    [
+        ("HalfCheetah-v5", 17, 6, 1000),
+        ("Hopper-v5", 11, 3, 1000),
+        ("Humanoid-v5", 348, 17, 1000),
+        ("Pusher-v5", 23, 7, 100),
+        ("Walker2d-v5", 17, 6, 1000),
+    ],
+)
+def test_environments(env_id, observations, actions, horizon):
+    for script in SCRIPTS.values():
+        env = script.make_env(env_id)
+        assert env.observation_space.shape == (observations,)
+        assert env.action_space.shape == (actions,)
+        assert env.spec.max_episode_steps == horizon
+    if env_id in ("HalfCheetah-v5", "Pusher-v5"):  # the others fall over
+        zero = np.zeros(actions, np.float32)
+        lengths = script.evaluate(lambda observation: zero, env, 1)[:, 1]
+        assert lengths == [horizon]
+
+
+# THE THREE FILES
+
+
+def definitions(script):
+    """Return {name: source} of the functions and classes at the top level of a file."""
+    source = Path(script.__file__).read_text()
+    nodes = [node for node in ast.parse(source).body if hasattr(node, "name")]
+    return {node.name: inspect.getsource(getattr(script, node.name)) for node in nodes}
+
+
+def run_block(script):
+    """Return the file from the comment on: helpers and main block."""
+    return Path(script.__file__).read_text().partition("\n# THE RUN: ")[2]
+
+
+def test_repeated_helpers_are_word_for_word_identical():
+    everywhere = "make_env fail fail_on read_args check evaluate can_compile "
+    everywhere += "use_matmul_precision Run"
+    off_policy = "mlp in_numpy TwinLinear Critic ReplayBuffer updater"
+    by_design = {"Args", "Actor", "load_policy", "critic_loss", "actor_loss", "train"}
+    found = [definitions(script) for script in (sac, td3, ppo)]
+    for name in everywhere.split():
+        assert len({source[name] for source in found}) == 1, name
+    for name in off_policy.split():
+        assert found[0][name] == found[1][name], name
+    # whatever else two files define is the same, or one of those that differ by design
+    for one, other in ((0, 1), (0, 2), (1, 2)):
+        common = found[one].keys() & found[other].keys()
+        differ = {name for name in common if found[one][name] != found[other][name]}
+        assert (
+            differ <= by_design | {"mlp", "in_numpy", "updater"}
+            if other == 2
+            else differ <= by_design
+        )
+    assert run_block(sac) == run_block(td3) == run_block(ppo) != ""
+    assert sac.TEST_SEED == td3.TEST_SEED == ppo.TEST_SEED
+
+
+def test_arguments_that_scripts_share_have_one_meaning():
+    """Defaults and help differ only where CleanRL's defaults do."""
+    pattern = re.compile(r"((?:^    # .+\n)*)^    (\w+): (.+?) = (.+?)(?:  # (.+))?$", re.M)
+    per_algorithm = {"eval_frequency", "learning_starts", "matmul_precision", "policy_frequency"}
+    per_algorithm.add("total_timesteps")
+    meanings = {}
+    for script in SCRIPTS.values():
+        documented = pattern.findall(inspect.getsource(script.Args))
+        assert [name for _, name, *_ in documented] == [f.name for f in fields(script.Args)]
+        for above, name, kind, default, behind in documented:
+            assert above or behind, name
+            above = "" if behind else above  # tyro takes what stands behind, if anything does
+            meanings.setdefault(name, set()).add((kind, default, above, behind))
+    differ = {name for name, values in meanings.items() if len(values) > 1}
+    assert differ - {"learning_rate"} <= per_algorithm
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "defaults"),
+    [
+        (
+            "SAC",
+            "total_timesteps=1000000 buffer_size=1000000 gamma=0.99 tau=0.005 batch_size=256 "
+            "learning_starts=5000 policy_lr=0.0003 q_lr=0.001 policy_frequency=2 "
+            "target_network_frequency=1 alpha=0.2 autotune=True",
+        ),
+        (
+            "TD3",
+            "total_timesteps=1000000 learning_rate=0.0003 buffer_size=1000000 gamma=0.99 "
+            "tau=0.005 batch_size=256 policy_noise=0.2 exploration_noise=0.1 "
+            "learning_starts=25000 policy_frequency=2 noise_clip=0.5",
+        ),
+        (
+            "PPO",
+            "total_timesteps=1000000 learning_rate=0.0003 num_steps=2048 anneal_lr=True "
+            "gamma=0.99 gae_lambda=0.95 num_minibatches=32 update_epochs=10 norm_adv=True "
+            "clip_coef=0.2 clip_vloss=True ent_coef=0.0 vf_coef=0.5 max_grad_norm=0.5 "
+            "target_kl=None",
+        ),
+    ],
+)
+def test_defaults_are_cleanrls(algorithm, defaults):
+    actual = asdict(SCRIPTS[algorithm].Args())
+    assert [
+        f"{name}={actual[name]}" for name in re.findall(r"(\w+)=", defaults)
+    ] == defaults.split()
+
+
+# COMPILATION
+
+
+@each_script
+def test_compiled_and_plain_updates_agree(algorithm, tmp_path, capsys, monkeypatch):
+    graphs, real = [], torch.compile
+
+    def spy(function, **kwargs):
+        graphs.append(function.__name__)
+        return real(function, **kwargs)
+
+    monkeypatch.setattr(torch, "compile", spy)
+    short = {} if algorithm == "PPO" else {"total_timesteps": 30}
+    plain = run(algorithm, tmp_path / "plain", matmul_precision="highest", **short)
+    assert graphs == []
+    compiled = run(
+        algorithm, tmp_path / "compiled", matmul_precision="highest", compile=True, **short
+    )
+    if "not compiled" in (output := capsys.readouterr().out):
+        pytest.skip(re.search(r"not compiled: .*", output)[0])
+    losses = {
+        "SAC": {"critic_loss", "actor_loss", "temperature_loss"},
+        "TD3": {"critic_loss", "actor_loss"},
+        "PPO": {"clipped_gradient"},
+    }
+    assert set(graphs) == losses[algorithm] | {"neg"}
+    torch.testing.assert_close(policy(compiled), policy(plain), rtol=1e-4, atol=1e-5)
+
+    if algorithm == "PPO":
+        return  # too small for bfloat16 to be an option
+    rough = run(algorithm, tmp_path / "bf16", matmul_precision="bf16", compile=True, **short)
+    assert json.loads((rough / "config.json").read_text())["matmul_precision"] == "bf16"
+    exact, rough = (torch.cat([x.flatten() for x in policy(r).values()]) for r in (plain, rough))
+    assert 1e-5 < (rough - exact).abs().max() < 0.05
+
+
+@each_script
+def test_no_compiler_means_plain_updates(algorithm, tmp_path, capsys, monkeypatch):
+    def no_compiler(*_, **__):
+        raise RuntimeError("no compiler\nand more")
+
+    plain = run(algorithm, tmp_path / "plain")
+    monkeypatch.setattr(torch, "compile", no_compiler)
+    fallback = run(algorithm, tmp_path / "fallback", compile=True)
+    output = capsys.readouterr().out
+    assert "not compiled: no compiler\n" in output and output.count("not compiled") == 1
+    torch.testing.assert_close(policy(fallback), policy(plain), rtol=0, atol=0)
+
+
+# ENVIRONMENTS THAT ARE UNUSUAL
+
+
+@each_script
+def test_dict_observations_are_flattened(algorithm, tmp_path, capsys):
+    noise = {"noise": ("RandomDropoutObservation(0.5)",), "noise_rate": (0.5,)}
+    run_dir = run(algorithm, tmp_path, env_id="toy_envs:DictObservation-v0", **noise)
+    assert capsys.readouterr().out.count("observations are flattened") == 1
+    env = SCRIPTS[algorithm].make_env("toy_envs:DictObservation-v0")
+    assert env.reset()[0].tolist() == [0, 0, 0]
+    assert env.step(env.action_space.sample())[0].tolist() == [1, 1, -1]
+    assert env.action_space.contains(SCRIPTS[algorithm].load_policy(run_dir, env)(env.reset()[0]))
+
+
+@each_script
+def test_reward_noise_works_beside_a_one_hot_observation(algorithm, tmp_path):
+    noise = {"noise": ("RandomNormalNoisyReward(0.5)",), "noise_rate": (0.5,)}
+    run(algorithm, tmp_path, env_id="toy_envs:OneHotObservation-v0", **noise)
+
+
+@each_script
+def test_rewards_of_shape_1_are_numbers(algorithm, tmp_path):
+    array = run(algorithm, tmp_path / "array", env_id="toy_envs:ArrayReward-v0")
+    plain = run(algorithm, tmp_path / "plain", env_id="toy_envs:Count-v0")
+    assert (array / "eval.csv").read_bytes() == (plain / "eval.csv").read_bytes()
+    torch.testing.assert_close(policy(array), policy(plain), rtol=0, atol=0)
+
+
+@each_script
+def test_a_time_limit_of_ones_own(algorithm, tmp_path, capsys):
+    limit = {"env_id": "toy_envs:Endless-v0", "max_episode_steps": 5}
+    run_dir = run(algorithm, tmp_path, **limit)
+    assert {row[2:] for row in evaluations(run_dir)} == {(5.0, 5)}
+    assert "time limit" not in capsys.readouterr().out
+    assert json.loads((run_dir / "config.json").read_text())["args"]["max_episode_steps"] == 5
+    run(algorithm, tmp_path / "none", env_id="toy_envs:NoLimit-v0")
+    assert capsys.readouterr().out.count("toy_envs:NoLimit-v0 declares no time limit") == 1
+
+
+@each_script
+def test_a_test_without_a_time_limit_can_be_stopped(algorithm):
+    script, asked = SCRIPTS[algorithm], []
+
+    def stop():
+        asked.append(True)
+        return len(asked) == 30
+
+    def act(observation):
+        return np.zeros(1, np.float32)
+
+    assert script.evaluate(act, script.make_env("toy_envs:Endless-v0"), 2, stop) is None
+    assert len(asked) == 30
+    assert (
+        script.evaluate(act, script.make_env("toy_envs:Count-v0"), 2, stop).tolist() == [[8, 8]] * 2
+    )
+    assert len(asked) == 30  # it has a time limit: it was not asked again
+
+
+@each_script
+def test_a_test_that_was_stopped_is_not_written(algorithm, tmp_path):
+    ends = {"env_id": "toy_envs:NoLimit-v0"}
+    stops = iter([False] * 25 + [True])
+    args = arguments(algorithm, tmp_path, **ends)
+    assert not SCRIPTS[algorithm].train(args, stop=lambda: next(stops))
+    whole = run(algorithm, tmp_path, **ends)
+    alone = run(algorithm, tmp_path / "alone", **ends)
+    assert (whole / "eval.csv").read_bytes() == (alone / "eval.csv").read_bytes()
+    torch.testing.assert_close(policy(whole), policy(alone), rtol=0, atol=0)
+
+
+@each_script
+def test_a_name_without_version_is_recorded_with_it(algorithm, tmp_path):
+    run_dir = run(algorithm, tmp_path, env_id="toy_envs:Tiny")
+    assert run_dir.name.startswith("toy_envs--Tiny-v0__")
+    assert json.loads((run_dir / "config.json").read_text())["args"]["env_id"] == "toy_envs:Tiny-v0"
+
+
+@each_script
+def test_a_rate_that_changes_follows_the_steps(algorithm, tmp_path):
+    script, rates = SCRIPTS[algorithm], []
+    noise = {"noise": ("RandomNormalNoisyReward(0.5)",), "noise_rate": ("1:0",)}
+    with mock.patch.object(script.noisy, "set_progress", wraps=script.noisy.set_progress) as spy:
+        run_dir = run(algorithm, tmp_path, env_id="toy_envs:Count-v0", **noise)
+    rates = [call.args[1] for call in spy.call_args_list]
+    assert rates == [step / 60 for step in range(8, 60, 8)]  # episodes of 8 steps
+    assert run_dir.name.endswith("RandomNormalNoisyReward_0.5_p1.0to0.0__1")
+    assert json.loads((run_dir / "config.json").read_text())["args"]["noise_rate"] == ["1.0:0.0"]
+    applied, of = json.loads((run_dir / "result.json").read_text())["noise_applied"][
+        "RandomNormalNoisyReward"
+    ]
+    steps = np.arange(60)
+    p = 1 - steps // 8 * 8 / 60
+    assert of == 60
+    assert abs(applied - p.sum()) < 4 * np.sqrt((p * (1 - p)).sum())
+
+
+# BAD INPUT
+
+OFF_POLICY_ONLY = ("SAC", "TD3")
+BAD = [  # arguments, what the message names, of which scripts
+    ({"env_id": "NoSuchEnv-v0"}, "NoSuchEnv", SCRIPTS),
+    ({"env_id": "no_such_module:Env-v0"}, "no_such_module", SCRIPTS),
+    ({"env_id": ""}, "there is no environment ''", SCRIPTS),
+    ({"env_id": "Ant-v1"}, "Ant-v1", SCRIPTS),
+    ({"env_id": "toy_envs:Broken-v0"}, "first line second line", SCRIPTS),
+    ({"env_id": "CartPole-v1"}, "Discrete(2)", SCRIPTS),
+    ({"env_id": "toy_envs:Silent-v0"}, "AssertionError", SCRIPTS),
+    ({"env_id": "toy_envs:DiscreteAction-v0"}, "needs Box actions", SCRIPTS),
+    ({"env_id": "toy_envs:SequenceObservation-v0"}, "needs Box observations", SCRIPTS),
+    ({"env_id": "toy_envs:IntegerAction-v0"}, "needs Box actions of floats", SCRIPTS),
+    ({"env_id": "toy_envs:BooleanObservation-v0"}, "needs Box observations", SCRIPTS),
+    (
+        {
+            "env_id": "toy_envs:OneHotObservation-v0",
+            "noise": ("RandomDropoutObservation(0.5)",),
+            "noise_rate": (0.1,),
+        },
+        "RandomDropoutObservation cannot perturb categories",
+        SCRIPTS,
+    ),
+    ({"env_id": "toy_envs:Unbounded-v0"}, "bounded actions", OFF_POLICY_ONLY),
+    ({"noise": ("RandomNoise(1)",), "noise_rate": (0.1,)}, "RandomMixupObservation", SCRIPTS),
+    ({"noise": ("RandomUniformScaleReward(0.5)",), "noise_rate": (0.1,)}, "high", SCRIPTS),
+    ({"noise": ("RandomNormalNoisyReward(1, 2)",), "noise_rate": (0.1,)}, "scale", SCRIPTS),
+    ({"noise": ("RandomNormalNoisyReward(-1)",), "noise_rate": (0.1,)}, "scale", SCRIPTS),
+    ({"noise": ("__import__('os')",), "noise_rate": (0.1,)}, "unknown name", SCRIPTS),
+    ({"noise": NOISES, "noise_rate": (0.1, 1.1)}, "1.1", SCRIPTS),
+    ({"noise": NOISES, "noise_rate": (-0.1,)}, "-0.1", SCRIPTS),
+    ({"noise": NOISES, "noise_rate": (math.nan,)}, "nan", SCRIPTS),
+    ({"noise": NOISES, "noise_rate": (0.1, 0.2, 0.3)}, "3 noise rates", SCRIPTS),
+    ({"noise": NOISES}, "noise without a noise rate", SCRIPTS),
+    ({"noise_rate": (0.1,)}, "a noise rate without noise", SCRIPTS),
+    ({"noise": NOISES, "noise_rate": ("1:2",)}, "1:2", SCRIPTS),
+    ({"noise": NOISES, "noise_rate": ("0.5:",)}, "0.5:", SCRIPTS),
+    ({"noise": NOISES, "noise_rate": ("a:b",)}, "a:b", SCRIPTS),
+    ({"max_episode_steps": 0}, "--max-episode-steps", SCRIPTS),
+    ({"torch_threads": 100_000}, "--torch-threads", SCRIPTS),
+    ({"torch_threads": 2**70}, "--torch-threads", SCRIPTS),
+    ({"target_kl": math.nan}, "--target-kl", ("PPO",)),
+    ({"env_id": "toy_envs:MatrixAction-v0"}, "in one dimension", SCRIPTS),
+    ({"seed": -1}, "--seed", SCRIPTS),
+    ({"seed": 2**64}, "--seed", SCRIPTS),
+    ({"gamma": 1.1}, "--gamma", SCRIPTS),
+    ({"gamma": -0.1}, "--gamma", SCRIPTS),
+    ({"gamma": math.nan}, "--gamma", SCRIPTS),
+    ({"total_timesteps": 0}, "--total-timesteps", SCRIPTS),
+    ({"total_timesteps": -5}, "--total-timesteps", SCRIPTS),
+    ({"eval_episodes": 0}, "--eval-episodes", SCRIPTS),
+    ({"eval_episodes": -1}, "--eval-episodes", SCRIPTS),
+    ({"eval_frequency": -1}, "--eval-frequency", SCRIPTS),
+    ({"checkpoint_frequency": 0}, "--checkpoint-frequency", SCRIPTS),
+    ({"torch_threads": 0}, "--torch-threads", SCRIPTS),
+    ({"torch_threads": -1}, "--torch-threads", SCRIPTS),
+    ({"batch_size": 0}, "--batch-size", OFF_POLICY_ONLY),
+    ({"batch_size": -1}, "--batch-size", OFF_POLICY_ONLY),
+    ({"buffer_size": 0}, "--buffer-size", OFF_POLICY_ONLY),
+    ({"buffer_size": -1}, "--buffer-size", OFF_POLICY_ONLY),
+    ({"learning_starts": -1}, "--learning-starts", OFF_POLICY_ONLY),
+    ({"policy_frequency": 0}, "--policy-frequency", OFF_POLICY_ONLY),
+    ({"tau": 1.5}, "--tau", OFF_POLICY_ONLY),
+    ({"target_network_frequency": 0}, "--target-network-frequency", ("SAC",)),
+    ({"alpha": -1.0}, "--alpha", ("SAC",)),
+    ({"q_lr": -1.0}, "--q-lr", ("SAC",)),
+    ({"q_lr": math.inf}, "--q-lr", ("SAC",)),
+    ({"learning_rate": -1.0}, "--learning-rate", ("TD3", "PPO")),
+    ({"noise_clip": -1.0}, "--noise-clip", ("TD3",)),
+    ({"num_steps": 0}, "--num-steps", ("PPO",)),
+    ({"num_steps": -1}, "--num-steps", ("PPO",)),
+    ({"num_steps": 61}, "--num-steps must be from 2 * --num-minibatches (6) to", ("PPO",)),
+    ({"num_minibatches": 0}, "--num-minibatches", ("PPO",)),
+    ({"num_minibatches": 13}, "--num-minibatches", ("PPO",)),
+    ({"update_epochs": 0}, "--update-epochs", ("PPO",)),
+    ({"gae_lambda": 1.1}, "--gae-lambda", ("PPO",)),
+    ({"clip_coef": -0.1}, "--clip-coef", ("PPO",)),
+]
+BAD_CASES = [pytest.param(*case, a) for *case, of in BAD for a in of]
+
+
+def assert_one_line(stderr, word):
+    """Check an error that says what to do, in one line; a bad noise lists the wrappers below it."""
+    lines = stderr.split("\n")
+    assert stderr.startswith("error: ") and lines.pop() == ""
+    if "bad noise" in lines[0]:
+        assert lines[1:] == [f"  {signature}" for signature in signatures()]
+    else:
+        assert len(lines) == 1
+    assert word in stderr
+
+
+@pytest.mark.parametrize(("bad", "word", "algorithm"), BAD_CASES)
+def test_bad_input(bad, word, algorithm, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    args = replace(arguments(algorithm, "runs"), **bad)
+    with pytest.raises(SystemExit) as stopped:
+        SCRIPTS[algorithm].train(args)
+    assert stopped.value.code == 2
+    output = capsys.readouterr()
+    assert_one_line(output.err, word)
+    assert output.out == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+@each_script
+def test_runs_dir_that_cannot_be_written(algorithm, tmp_path, capsys):
+    (tmp_path / "file").write_text("mine")
+    for runs_dir in (tmp_path / "file", tmp_path / "file" / "runs", "/proc/runs"):
+        with pytest.raises(SystemExit) as stopped:
+            SCRIPTS[algorithm].train(arguments(algorithm, runs_dir))
+        assert stopped.value.code == 2
+        assert_one_line(capsys.readouterr().err, "--runs-dir")
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="has a GPU")
+@each_script
+def test_cuda_without_a_gpu(algorithm, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        SCRIPTS[algorithm].train(arguments(algorithm, tmp_path / "runs", cuda=True))
+    assert stopped.value.code == 2
+    assert_one_line(capsys.readouterr().err, "--cuda")
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "options", "word"),
+    [
+        ("SAC", ["--env-id", "NoSuchEnv-v0"], "NoSuchEnv"),
+        ("TD3", ["--env-id", "CartPole-v1"], "Discrete(2)"),
+        ("PPO", ["--noise", "RandomUniformScaleReward(0.5)", "--noise-rate", "0.1"], "high"),
+        ("PPO", ["--gamma", "2"], "--gamma"),
+        ("SAC", ["--runs-dir", __file__], "--runs-dir"),
+    ],
+)
+def test_bad_command(algorithm, options, word, tmp_path):
+    """As test_bad_input, in a process of its own."""
+    result = command(algorithm, *options, cwd=tmp_path)
+    assert result.returncode == 2
+    assert_one_line(result.stderr, word)
+    assert result.stdout == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_module_beside_the_caller_and_steps_as_1e2(tmp_path):
+    (tmp_path / "my_envs.py").write_text("from toy_envs import *\n")
+    options = ["--env-id", "my_envs:Tiny-v0", "--total-timesteps", "1.2E2", "--no-compile"]
+    options += ["--learning-starts=5e1", "--eval-frequency", "0", "--eval-episodes", "1"]
+    options += ["--exp-name", "1e3", "--runs-dir=2e1"]  # these are names
+    result = command("SAC", *options, cwd=tmp_path)
+    assert (result.returncode, result.stderr) == (0, "")
+    [run_dir] = (tmp_path / "2e1").iterdir()
+    assert "__1e3__" in run_dir.name
+    args = json.loads((run_dir / "config.json").read_text())["args"]
+    assert (args["total_timesteps"], args["learning_starts"]) == (120, 50)
+    assert args["env_id"] == "my_envs:Tiny-v0"
+
+
+@each_script
+def test_help_has_examples_and_noises(algorithm):
+    result = command(algorithm, "--help")
+    assert result.returncode == 0
+    text = result.stdout
+    assert f"python {algorithm.lower()}_continuous_noisy.py --env-id HalfCheetah-v5" in text
+    assert "module:Name-v0" in text
+    for signature in signatures():
+        assert f"  {signature}\n" in text
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "options", "word"),
+    [("TD3", ["--total-timesteps", "many"], "many"), ("SAC", ["--no-such-option"], "no-such")],
+)
+def test_bad_command_of_tyros(algorithm, options, word, tmp_path):
+    result = command(algorithm, *options, cwd=tmp_path)
+    assert result.returncode == 2
+    assert word in result.stderr + result.stdout
+    assert "Traceback" not in result.stderr + result.stdout
+    assert list(tmp_path.iterdir()) == []
+
+
+# DIVERGENCE
+
+
+@each_script
+@pytest.mark.parametrize("what", ["Reward", "Observation"])
+def test_nan_stops_the_run(algorithm, what, tmp_path):
+    nan = {"env_id": f"toy_envs:Nan{what}-v0"}  # from step 70 on; episodes have 8 steps
+    message = f"step 6 of an episode: the environment returned the {what.lower()} "
+    with pytest.raises(FloatingPointError, match=message):
+        run(algorithm, tmp_path, eval_frequency=0, total_timesteps=200, **nan)
+    [run_dir] = tmp_path.iterdir()
+    assert not (run_dir / "result.json").exists()
+    assert not (run_dir / "policy.pt").exists()
+
+
+@pytest.mark.parametrize("algorithm", SCRIPTS)
+def test_nan_at_the_end_is_no_result(algorithm, tmp_path):
+    late = {"env_id": "toy_envs:NanLate-v0", "total_timesteps": 190}  # NaN from step 130 on
+    with pytest.raises(FloatingPointError):
+        run(algorithm, tmp_path, eval_frequency=0, **late)
+    [run_dir] = tmp_path.iterdir()
+    assert not (run_dir / "result.json").exists()
+
+
+@each_script
+def test_a_loss_that_is_not_finite_stops_the_run(algorithm, tmp_path):
+    rate = {
+        "SAC": {"q_lr": 1e18, "total_timesteps": 22},  # before an action is NaN
+        "TD3": {"learning_rate": 1e18, "total_timesteps": 22},
+        "PPO": {"learning_rate": 1e18},
+    }[algorithm]
+    with pytest.raises(FloatingPointError, match=r"^step \d+: training diverged.*losses/"):
+        run(algorithm, tmp_path, **rate)
+    [run_dir] = tmp_path.iterdir()
+    assert not (run_dir / "result.json").exists()
+
+
+# THE COMMAND LINE AND TENSORBOARD
+
+CURVES = {
+    "SAC": "qf1_values qf2_values qf1_loss qf2_loss qf_loss actor_loss alpha alpha_loss",
+    "TD3": "qf1_values qf2_values qf1_loss qf2_loss qf_loss actor_loss",
+    "PPO": "value_loss policy_loss entropy old_approx_kl approx_kl clipfrac explained_variance",
+}
+CHARTS = "charts/SPS charts/episodic_return charts/episodic_length eval/episodic_return_mean "
+CHARTS += "eval/episodic_return_std eval/episodic_length_mean "
+CHARTS += "noise/RandomNormalNoisyReward/applied_fraction noise/RandomNormalNoisyReward/rate "
+CHARTS += "noise/RandomEarlyTermination/applied_fraction noise/RandomEarlyTermination/rate"
+
+
+@pytest.fixture(scope="module")
+def commands(tmp_path_factory):
+    """Return a folder with a run of each script, made by real commands, and their results."""
+    runs_dir = tmp_path_factory.mktemp("commands")
+    results = {}
+    for algorithm in SCRIPTS:
+        args = arguments(algorithm, runs_dir, noise=NOISES, noise_rate=RATES, total_timesteps=240)
+        results[algorithm] = flags(args), command(algorithm, *flags(args))
+    return runs_dir, results
+
+
+@each_script
+def test_command_line(algorithm, commands):
+    runs_dir, results = commands
+    line, result = results[algorithm]
+    assert (result.returncode, result.stderr) == (0, "")
+    [run_dir] = runs_dir.glob(f"*__{algorithm.lower()}_continuous_noisy__*")
+    last, finished = result.stdout.splitlines()[-2:]  # not a terminal: plain lines
+    assert re.search(r"step=240/240 sps=\d+ .*eval_return=-?\d+\.\d", last)
+    assert re.fullmatch(rf"{re.escape(str(run_dir))} is finished: mean test return .*", finished)
+    assert json.loads((run_dir / "config.json").read_text())["args"]["seed"] == 1
+    again = command(algorithm, *line)
+    assert (again.returncode, again.stderr) == (0, "")
+    assert again.stdout == f"{finished}\n"
+
+
+@pytest.fixture(scope="module")
+def tensorboard(commands):
+    """Serve the runs and return a function from a path of the HTTP API to its JSON."""
+    line = [sys.executable, "-m", "tensorboard.main", "--logdir", commands[0]]
+    line += ["--host", "127.0.0.1", "--port", "0", "--load_fast", "false"]
+    with subprocess.Popen(line, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            for text in process.stderr:
+                if address := re.search(r"http://127\.0\.0\.1:\d+", text):
+                    break
+
+            def get(path, body=None):
+                data = body and json.dumps(body).encode()
+                headers = {"Content-Type": "application/json"}
+                request = urllib.request.Request(address[0] + path, data, headers)
+                return json.load(urllib.request.urlopen(request, timeout=30))
+
+            yield get
+        finally:
+            process.terminate()
+            process.stderr.close()
+
+
+@pytest.fixture
+def scalars(tensorboard, commands):
+    """Return a function from an algorithm to the name of its run and {tag: {step: value}}."""
+
+    def read(algorithm):
+        [run_dir] = commands[0].glob(f"*__{algorithm.lower()}_continuous_noisy__*")
+        tags = tensorboard("/data/plugin/scalars/tags")[run_dir.name]
+        values = {}
+        for tag in tags:
+            query = urllib.parse.urlencode({"run": run_dir.name, "tag": tag})
+            points = tensorboard(f"/data/plugin/scalars/scalars?{query}")
+            values[tag] = {step: value for _, step, value in points}
+        return run_dir, values
+
+    return read
+
+
+def test_alpha_has_a_curve_when_it_is_not_tuned(tmp_path):
+    run_dir = run("SAC", tmp_path, autotune=False, alpha=0.3)
+    events = EventAccumulator(str(run_dir)).Reload()
+    values = [event.value for event in events.Scalars("losses/alpha")]
+    assert values == pytest.approx([0.3] * len(values)) and len(values) > 0
+    assert "losses/alpha_loss" not in events.Tags()["scalars"]
+
+
+@each_script
+def test_tensorboard_shows_the_curves(algorithm, scalars):
+    run_dir, values = scalars(algorithm)
+    losses = {f"losses/{name}" for name in CURVES[algorithm].split()}
+    rate = {"charts/learning_rate"} if algorithm == "PPO" else set()
+    assert set(values) == losses | rate | set(CHARTS.split())
+    rows = np.array(evaluations(run_dir)).reshape(-1, 3, 4)
+    steps = rows[:, 0, 0].astype(int).tolist()
+    if algorithm == "PPO":  # eval.csv has the step that an evaluation was due at
+        steps = [math.ceil(step / 12) * 12 for step in steps]
+    for tag, expected in (
+        ("eval/episodic_return_mean", rows[:, :, 2].mean(1)),
+        ("eval/episodic_return_std", rows[:, :, 2].std(1, ddof=1)),
+        ("eval/episodic_length_mean", rows[:, :, 3].mean(1)),
+    ):
+        assert list(values[tag]) == steps
+        assert list(values[tag].values()) == pytest.approx(list(expected))
+    result = json.loads((run_dir / "result.json").read_text())
+    episodes = list(values["charts/episodic_return"].values())
+    assert len(episodes) > 30
+    assert np.mean(episodes[-100:]) == pytest.approx(result["train_return_mean_last_100"])
+    lengths = values["charts/episodic_length"]
+    assert list(np.cumsum(list(lengths.values()))) == list(lengths)
+    assert max(lengths.values()) <= 8
+    every = 12 if algorithm == "PPO" else 100
+    for tag in losses:
+        assert set(values[tag]) == {*range(every, 241, every), 240}
+    for name, fraction in result["noise_applied_fraction"].items():
+        curve = values[f"noise/{name}/applied_fraction"]
+        assert 0 < curve[max(curve)] < 1
+        if max(curve) == 240:
+            assert curve[240] == pytest.approx(fraction)
+    assert min(values["charts/SPS"].values()) > 0
+
+
+def test_tensorboard_knows_the_hyperparameters(tensorboard, commands):
+    names = {path.name for path in commands[0].iterdir()}
+    assert set(tensorboard("/data/runs")) == names  # no runs besides
+    texts = tensorboard("/data/plugin/text/tags")
+    assert all("hyperparameters/text_summary" in texts[name] for name in names)
+    statuses = ["STATUS_UNKNOWN", "STATUS_SUCCESS", "STATUS_FAILURE", "STATUS_RUNNING"]
+    body = {"experimentName": "", "allowedStatuses": statuses, "startIndex": 0, "sliceSize": 10}
+    body["colParams"] = [{"metric": {"group": "", "tag": "eval/episodic_return_mean"}}]
+    groups = tensorboard("/data/plugin/hparams/session_groups", body)["sessionGroups"]
+    assert len(groups) == 3
+    assert {group["name"] for group in groups} == names  # readable, and one for each run
+    experiment = tensorboard("/data/plugin/hparams/experiment", {"experimentName": ""})
+    columns = [info["name"] for info in experiment["hparamInfos"]]
+    assert columns == ["env_id", "exp_name", "noise", "noise_rate", "seed"]
+    for group in groups:
+        noise = "RandomEarlyTermination(2, 4) + RandomNormalNoisyReward(0.5)"
+        assert group["hparams"]["noise"] == noise
+        assert group["hparams"]["noise_rate"] == 0.5  # the highest, to sort runs by
+        assert group["hparams"]["env_id"] == "toy_envs:Tiny-v0"
+        [metric] = group["metricValues"]
+        assert metric["name"]["tag"] == "eval/episodic_return_mean"
+        assert metric["trainingStep"] == 240
+
+
+# LEARNING
+
+MILD = {
+    "noise": ("RandomNormalNoisyReward(0.001)", "RandomUniformScaleReward(0.8, 1.2)"),
+    "noise_rate": (0.1, 0.2),
+}
+FAST = {"buffer_size": 10_000, "learning_starts": 400, "batch_size": 64, "tau": 0.02}
+FAST |= {"gamma": 0.95, "eval_frequency": 500, "eval_episodes": 10}
+LEARNERS = {
+    "SAC": FAST | {"total_timesteps": 3000, "policy_lr": 1e-3, "q_lr": 2e-3},
+    "TD3": FAST
+    | {"total_timesteps": 4000, "learning_starts": 1000, "batch_size": 128}
+    | {"learning_rate": 1e-3, "exploration_noise": 0.3},
+    "PPO": {"total_timesteps": 16384, "num_steps": 1024, "num_minibatches": 16}
+    | {"learning_rate": 1e-3, "update_epochs": 10, "eval_frequency": 2048},
+}
+
+
+@each_script
+@pytest.mark.parametrize("noise", [{}, MILD], ids=["baseline", "noisy"])
+def test_learning(algorithm, noise, tmp_path):
+    """Within the budget, the mean return of one evaluation shows that the task is solved."""
+    env_id = "InvertedPendulum-v5" if algorithm == "PPO" else "Pendulum-v1"
+    run_dir = run(algorithm, tmp_path, **LEARNERS[algorithm] | noise, env_id=env_id)
+    means = {}
+    for step, _, episodic_return, _ in evaluations(run_dir):
+        means.setdefault(step, []).append(episodic_return)
+    means = {step: np.mean(returns) for step, returns in means.items()}
+    assert max(means.values()) > (500 if algorithm == "PPO" else -250), means
+    result = json.loads((run_dir / "result.json").read_text())
+    for name, rate in zip(result["noise_applied"], noise.get("noise_rate", ()), strict=True):
+        assert result["noise_applied_fraction"][name] == pytest.approx(rate, rel=0.2)

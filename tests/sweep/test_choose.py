@@ -1,0 +1,383 @@
+"""The choice of a noise, with training replaced by returns that are known."""
+
+import csv
+import math
+import multiprocessing
+import os
+import re
+from pathlib import Path
+from statistics import fmean
+
+import numpy as np
+import pytest
+import stub_run
+
+from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED
+from analysis.statistics import holm
+from sweep import choose
+from sweep.grid import check, parse_args
+from sweep.halving import (
+    BASELINE,
+    Comparison,
+    advance,
+    compare,
+    fewest_seeds,
+    helps,
+    number_of_runs,
+    rows,
+    schedule,
+    verdict,
+)
+
+SEARCH_SEEDS, CONFIRM = 50, 10  # columns of a table of returns
+A = "RandomNormalNoisyReward(1.0)"
+
+
+def named(count):
+    return [("noise", str(i)) for i in range(count)]
+
+
+def play(noises, budget, table, confirm=CONFIRM):
+    """Run a choice to its end; table (noises, and the baseline last; seeds) holds the returns."""
+    place = {noise: i for i, noise in enumerate([*noises, BASELINE])}
+    returns = {}
+    state = advance(noises, budget, confirm, returns)
+    while state.due:
+        for noise, rate, seed in state.due:
+            column = seed - 1
+            if seed >= FIRST_CONFIRMATION_SEED:
+                column = SEARCH_SEEDS + seed - FIRST_CONFIRMATION_SEED
+            returns[noise, rate, seed] = table[place[noise, rate], column]
+        state = advance(noises, budget, confirm, returns)
+    return state, returns
+
+
+def draw(rng, effects):
+    """Draw returns around the effects (noises), with seeds of sd 0.3 and a baseline at 0."""
+    return np.append(effects, 0)[:, None] + rng.normal(
+        0, 0.3, (len(effects) + 1, SEARCH_SEEDS + CONFIRM)
+    )
+
+
+# THE SEARCH
+
+
+def test_schedule():
+    assert schedule(1, 3) == []
+    assert schedule(2, 6) == [(2, 3)]
+    assert schedule(4, 12) == [(4, 1), (2, 3)]
+    assert schedule(5, 15) == [(5, 1), (3, 1), (2, 2)]
+    assert schedule(90, 270) == [(90, 1), (45, 1), (23, 1), (12, 3), (6, 6), (3, 12), (2, 19)]
+    assert schedule(64, 640)[0] == (64, 1) and len(schedule(64, 640)) == 6
+    assert len(schedule(65, 640)) == 7
+    assert number_of_runs(5, 15, 4) == 5 + 3 + 4 + 8
+    assert number_of_runs(90, 270, 10) == 90 + 45 + 23 + 36 + 36 + 36 + 38 + 20
+
+
+def test_advance_by_hand():
+    a, b, c = noises = [("a", "1.0"), ("b", "1.0"), ("c", "0.5")]
+    returns = {}
+
+    def due():
+        return advance(noises, 9, 4, returns).due
+
+    assert due() == [(*noise, 1) for noise in noises]  # rounds: 3 noises, 1 seed; 2 noises, 2 more
+    returns |= {(*a, 1): 0.0, (*b, 1): 5.0}
+    assert due() == [(*c, 1)]
+    returns[*c, 1] = 4.0
+    assert due() == [(*b, 2), (*c, 2), (*b, 3), (*c, 3)]
+    returns |= {(*b, 2): 1.0, (*b, 3): 3.0, (*c, 2): 2.0, (*c, 3): 2.0}
+    # Of seeds 2 and 3 alone, both means are 2; of all seeds, b has 3 and c has 2.67.
+    state = advance(noises, 9, 4, returns)
+    assert state.noises == [b]
+    assert [done.survivors for done in state.rounds] == [[b, c], [b]]
+    assert state.rounds[1].scores == {b: 3.0, c: pytest.approx(8 / 3)}
+    assert state.seeds == range(1001, 1005)
+    assert state.due == [(*noise, seed) for seed in range(1001, 1005) for noise in (b, BASELINE)]
+    del returns[*a, 1]  # a run folder is gone: its run comes first
+    assert due() == [(*a, 1)]
+
+
+def test_equal_scores_are_decided_by_the_order_given():
+    noises = named(5)
+    state, _ = play(noises, 15, np.ones((6, SEARCH_SEEDS + CONFIRM)))
+    assert [len(done.survivors) for done in state.rounds] == [3, 2, 1]
+    assert [done.survivors for done in state.rounds] == [noises[:3], noises[:2], noises[:1]]
+    # The third is best in round 1, all are equal over rounds 1 and 2.
+    table = np.ones((6, SEARCH_SEEDS + CONFIRM))
+    table[2, :2] = 2, 0
+    assert play(noises, 15, table)[0].rounds[1].survivors == noises[:2]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 90])
+def test_every_choice_takes_the_announced_number_of_runs(count):
+    rng = np.random.default_rng(count)
+    state, returns = play(named(count), 3 * count, draw(rng, rng.normal(0, 0.1, count)))
+    assert len(returns) == number_of_runs(count, 3 * count, CONFIRM)
+    assert len(state.noises) == 1 and len(state.rounds) == math.ceil(math.log2(count))
+
+
+def test_a_planted_noise_is_found_and_confirmed():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        effects = np.zeros(90)
+        best = rng.integers(90)
+        effects[best] = 1.5  # five standard deviations of a seed
+        state, returns = play(named(90), 270, draw(rng, effects))
+        assert state.noises == [named(90)[best]]
+        comparison = compare(state.noises[0], state.seeds, returns)
+        assert helps(comparison, comparison.p)
+
+
+def test_useless_noises_are_rarely_taken_for_better():
+    rng = np.random.default_rng(0)
+    claims = 0
+    for _ in range(400):
+        state, returns = play(named(90), 270, draw(rng, np.zeros(90)))
+        comparison = compare(state.noises[0], state.seeds, returns)
+        claims += helps(comparison, comparison.p)
+    assert 1 <= claims <= 18  # 2.5 % of 400 are 10; 4.5 % are 18
+
+
+def test_the_choice_is_as_good_as_a_grid_of_ten_seeds():
+    rng = np.random.default_rng(0)
+    chosen, grid = [], []
+    for _ in range(2000):
+        effects = rng.normal(0, 0.1, 90)
+        table = draw(rng, effects)
+        state, _ = play(named(90), 270, table)
+        chosen.append(effects[named(90).index(state.noises[0])])
+        grid.append(effects[table[:90, :10].mean(axis=1).argmax()])
+    assert fmean(chosen) >= fmean(grid)
+
+
+# THE VERDICT
+
+
+def test_fewest_seeds():
+    # 2 / C(2n, n): 0.029 for 4, 0.0079 for 5, 0.0022 for 6
+    assert [fewest_seeds(verdicts) for verdicts in (1, 2, 6, 7)] == [4, 5, 5, 6]
+
+
+def test_verdicts_in_words():
+    noise = ("RandomEarlyTermination(50)", "1.0")
+    good = Comparison(noise, 10, 15.2, 3.9, 26.6, 0.83, 0.011, 20.0)
+    assert verdict("PPO on Pusher-v5", 90, good, 0.011, 1) == (
+        "PPO on Pusher-v5: RandomEarlyTermination(50) at 1.0 beats no noise: 10 fresh seeds, "
+        "+15 % [4, 27], p = 0.011; a run with it beats one without with probability 0.83."
+    )
+    assert not helps(good, 0.06)
+    corrected = verdict("PPO on Pusher-v5", 90, good, 0.055, 5)
+    assert "none of 90 noises could be shown to help; the best of them, Random" in corrected
+    assert "p = 0.011, corrected for 5 verdicts 0.055; " in corrected
+    seen = "; with 10 seeds a difference of 20 % would have been seen (80 % power)."
+    assert corrected.endswith(seen)
+    falling = good._replace(winner=("RandomNormalNoisyReward(1.0)", "1.0:0.0"))
+    assert "RandomNormalNoisyReward(1.0) at 1.0 to 0.0 beats" in verdict("", 2, falling, 0.011, 1)
+    assert verdict("PPO on X", 1, good._replace(p=0.3), 0.3, 1).startswith(
+        "PPO on X: RandomEarlyTermination(50) at 1.0 could not be shown to help: 10 fresh seeds, "
+    )
+    bad = good._replace(probability=0.17)
+    assert not helps(bad, bad.p) and "is worse than no noise: 10 fresh" in verdict("", 9, bad, 0, 1)
+
+
+def test_a_comparison_by_hand():
+    noise = ("A", "0.1")
+    returns = {(*noise, 1001 + i): value for i, value in enumerate([12.0, 13.0, 14.0, 15.0])}
+    returns |= {(*BASELINE, 1001 + i): value for i, value in enumerate([8.0, 9.0, 11.0, 12.0])}
+    found = compare(noise, range(1001, 1005), returns)
+    # 15 of 16 pairs and a tie are won. U >= 15.5: of 70 orders, 1 has U = 16, 1 has U = 15.
+    assert found.probability == 15.5 / 16 and found.p == pytest.approx(2 * 2 / 70)
+    assert found.improvement == pytest.approx(35) and found.low < 35 < found.high
+    zero = compare(noise, range(1001, 1005), returns | {(*BASELINE, 1001 + i): 0 for i in range(4)})
+    sentence = verdict("PPO on X", 2, zero, zero.p, 1)
+    assert "nan" not in sentence and "4 fresh seeds, p = 0.029; a run" in sentence
+
+
+def test_rows_of_choice_csv():
+    table = np.arange(4.0)[:, None] + np.zeros(SEARCH_SEEDS + CONFIRM)
+    state, returns = play(named(3), 3, table)
+    lines = rows("PPO", "X", state, returns, helped=False)
+    assert [list(line) for line in lines] == [CHOICE_COLUMNS] * len(lines)
+    search = "PPO X search"
+    assert [" ".join(str(value) for value in line.values()) for line in lines] == [
+        f"{search} 1 noise 0 1 0.0 no",
+        f"{search} 1 noise 1 1 1.0 yes",
+        f"{search} 1 noise 2 1 2.0 yes",
+        f"{search} 2 noise 1 2 1.0 no",
+        f"{search} 2 noise 2 2 2.0 yes",
+        "PPO X confirmation   0.0 10 3.0 ",
+        "PPO X confirmation  noise 2 10 2.0 no",
+    ]
+
+
+# THE RUN FOLDERS
+
+
+def arguments(text, tmp_path):
+    words = [*text.split(" | "), "--total-timesteps", "1000", "--runs-dir", str(tmp_path)]
+    args = parse_args("list", "/", ["choose", *words])
+    check(args)
+    return args
+
+
+def batches(args):
+    """Run a choice to its end in this process; returns the names of its folders, batch by batch."""
+    found = []
+    while True:
+        choices = choose.choices(args)
+        due = [choice.runs[run] for choice in choices for run in choice.state.due]
+        if not due:
+            return found
+        found.append({run.folder.name for run in due})
+        for run in due:
+            stub_run.train([run.script, *run.arguments])
+
+
+def read(path):
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_two_algorithms_and_environments_at_once(tmp_path):
+    spellings = "RandomNormalNoisyReward(.1) | RandomNormalNoisyReward(0.10)"
+    both = "RandomEarlyTermination(9)@0.3+RandomNormalNoisyReward(1)@1:0"
+    args = arguments(
+        "--algos | ppo | sac | --envs | Pendulum | MountainCarContinuous-v0 | --noises | "
+        f"{spellings} | RandomDropoutObservation(0.9) | {both} | --noise-rates | 0 | 1 | "
+        "--confirm | 5 | --budget | 3",
+        tmp_path,
+    )
+    # Three noises, one of them in two spellings: rounds of 3 and 2 runs, then 5 fresh seeds
+    found = batches(args)
+    assert [len(batch) for batch in found] == [4 * 3, 4 * 2, 4 * 10]
+    assert set().union(*found) == {path.name for path in tmp_path.glob("*__*")}
+    assert all(name.endswith("__1") for name in found[0])
+    assert all(name.endswith("__2") for name in found[1])
+    sentences = list(choose.conclusion(choose.choices(args), tmp_path))
+    assert [sentence.partition(":")[0] for sentence in sentences] == [
+        f"{algorithm} on {env}"
+        for algorithm in ("PPO", "SAC")
+        for env in ("Pendulum-v1", "MountainCarContinuous-v0")
+    ]
+    shown = [re.search(r"p = ([.\d]+), corrected for 4 verdicts ([.\d]+)", s) for s in sentences]
+    p_values = [float(match[1]) for match in shown]
+    assert [float(match[2].rstrip(".")) for match in shown] == pytest.approx(
+        holm(p_values), rel=0.1
+    )
+    lines = read(tmp_path / "choice.csv")
+    assert len(lines) == 4 * (3 + 2 + 2)
+    assert {line["noise_rate"] for line in lines} == {"0.0", "1.0", "0.3 + 1.0:0.0"}
+    for line in lines:  # a search counts a run's last three tests, the confirmation the last one
+        noise = line["noise"].split(" + ") if line["noise"] else []
+        rates = [r if ":" in r else float(r) for r in line["noise_rate"].split(" + ") if noise]
+        run = line["algorithm"].lower(), line["environment"], noise, rates
+        if line["round"]:
+            last = range(1, int(line["seeds"]) + 1)
+            wanted = [fmean(stub_run.tests_of(*run, seed)[-3:]) for seed in last]
+        else:
+            wanted = [stub_run.tests_of(*run, seed)[-1] for seed in range(1001, 1006)]
+        assert float(line["score"]) == pytest.approx(fmean(wanted))
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "env", "seconds"),
+    [  # eight runs of 1,000 steps, each with ten seconds to start
+        ("sac", "Hopper-v5", 8 * (10 + 1000 / 150)),
+        ("sac", "Humanoid-v5", 8 * (10 + 1000 / 90)),
+        ("td3", "HumanoidStandup-v5", 8 * (10 + 1000 / 130)),
+        ("ppo", "Humanoid-v5", 8 * (10 + 1000 / 2900)),
+    ],
+)
+def test_the_core_hours_announced(algorithm, env, seconds, tmp_path):
+    args = arguments(
+        f"--algos | {algorithm} | --envs | {env} | --noises | {A}@1 | --confirm | 4", tmp_path
+    )
+    [choice] = choose.choices(args)
+    assert choice.core_hours == pytest.approx(seconds / 3600)
+
+
+def test_the_readme_says_what_it_takes_by_default():
+    text = " ".join((Path(__file__).parents[2] / "README.md").read_text().split())
+    pattern = r"takes (\d+) runs .* about (\d+) hours for PPO and (\d+) for SAC in a small env"
+    runs, *hours = map(int, re.search(pattern, text).groups())
+    for algorithm, announced in zip(("ppo", "sac"), hours, strict=True):
+        args = parse_args("list", "/", ["choose", "--algos", algorithm, "--envs", "Hopper-v5"])
+        choices = choose.choices(args)
+        assert choose.total(choices).startswith(f"{runs} runs in all")
+        assert choices[0].core_hours == pytest.approx(announced, rel=0.03)
+
+
+def test_a_second_choice_takes_the_same_fresh_seeds(tmp_path):
+    words = f"--algos | ppo | --envs | Pendulum-v1 | --noises | {A}@1 | --confirm | "
+    assert [len(batch) for batch in batches(arguments(words + "4", tmp_path))] == [8]
+    [more] = batches(arguments(words + "6", tmp_path))
+    assert {name.rpartition("__")[2] for name in more} == {"1005", "1006"}
+
+
+def test_another_choice_keeps_the_lines_of_the_first(tmp_path):
+    first = arguments(
+        "--algos | ppo | --envs | Pendulum-v1 | --noise-rates | 1 | --noises | "
+        f"{A} | RandomMixupObservation(0.5) | --confirm | 4",
+        tmp_path,
+    )
+    batches(first)
+    list(choose.conclusion(choose.choices(first), tmp_path))
+    before = read(tmp_path / "choice.csv")
+    second = arguments(
+        f"--algos | sac | --envs | Pendulum-v1 | --noises | {A}@1 | --confirm | 4", tmp_path
+    )
+    assert [len(batch) for batch in batches(second)] == [8]  # one noise needs no search
+    for _ in range(2):
+        [sentence] = choose.conclusion(choose.choices(second), tmp_path)
+        assert sentence.startswith(f"SAC on Pendulum-v1: {A} at 1.0 ")
+        lines = read(tmp_path / "choice.csv")
+        assert lines[:-2] == before
+        assert [line["phase"] for line in lines[-2:]] == ["confirmation"] * 2
+
+
+def test_two_commands_that_end_side_by_side_keep_each_others_lines(tmp_path, monkeypatch):
+    path = tmp_path / "choice.csv"
+    line = dict.fromkeys(CHOICE_COLUMNS, "x")
+    replace = os.replace
+    fork = multiprocessing.get_context("fork")
+    second = fork.Process(target=choose.write_choice, args=(path, [line]))
+
+    def replace_late(temporary, path):
+        monkeypatch.undo()
+        second.start()
+        second.join(timeout=1)  # the second has written by now, or waits for the first
+        replace(temporary, path)
+
+    monkeypatch.setattr(os, "replace", replace_late)
+    choose.write_choice(path, [line | {"algorithm": "first"}])
+    second.join()
+    assert second.exitcode == 0
+    assert [found["algorithm"] for found in read(path)] == ["first", "x"]
+
+
+def test_status_says_who_survives(tmp_path):
+    scores = {}
+    for noise in (A, "RandomMixupObservation(0.5)", "RandomDropoutObservation(0.9)"):
+        tests = stub_run.tests_of("ppo", "Pendulum-v1", [noise], [1.0], 1)
+        scores[noise] = fmean(tests[-3:])
+    noises = sorted(scores, key=scores.get)  # the best is given last, and named first
+    _, second, best = noises
+    args = arguments(
+        f"--algos | ppo | --envs | Pendulum-v1 | --noise-rates | 1 | --confirm | 4 | "
+        f"--noises | {' | '.join(noises)}",
+        tmp_path,
+    )
+    line, total = choose.standing(choose.choices(args))
+    assert total.startswith("15 runs in all, 7 to search and 8 to confirm; 0 are done, about ")
+    assert line == "PPO on Pendulum-v1, round 1 of 2: 3 of 3 noises, seed 1; runs to do: 3"
+    for choice in choose.choices(args):
+        for run in choice.state.due:
+            stub_run.train([choice.runs[run].script, *choice.runs[run].arguments])
+    assert list(choose.standing(choose.choices(args))) == [
+        "PPO on Pendulum-v1, round 2 of 2: 2 of 3 noises, seeds 1 to 3; runs to do: 4",
+        f"  {scores[best]:10.2f}  {best} at 1.0",
+        f"  {scores[second]:10.2f}  {second} at 1.0",
+        # Twelve runs are left; each of the three has taken 36 seconds
+        "15 runs in all, 7 to search and 8 to confirm; 3 are done, about 0.1 core-hours are left",
+    ]

@@ -1,0 +1,397 @@
+"""How fast the three scripts are on one CPU core, and how others compare.
+
+    python tools/bench.py                              # the scripts on HalfCheetah and Humanoid
+    python tools/bench.py --algos sac --envs Hopper-v5 -- --no-compile    # after --: scripts' flags
+    python tools/bench.py --against-checkout ../before --clock cpu
+    python tools/bench.py --against-cleanrl ../cleanrl --cleanrl-python ../cleanrl/.venv/bin/python
+    python tools/bench.py --against-sbx ../sbx/bin/python
+
+Every program is a process with one thread on one core (the last; `taskset` chooses another). It has
+its defaults, but neither tests its policy nor saves. Whenever it logs losses to TensorBoard (every
+100 steps; PPO: after every rollout) it reports the time and waits to be told to go on. So each
+program starts once, reports three times to warm up, and then runs in blocks of --seconds, of which
+--pairs are measured. A speed is the median of its blocks.
+
+    core %       the share of the core that the process got; below 97 the machine was not quiet
+    memory MB    the most that the process held; --stored 1000000 fills the replay buffer first
+
+With --clock cpu only time on the core counts, which depends less on other processes.
+--against-... runs others alternately with ours, a block each. "ours / its" is the median of the
+ratios of neighbouring blocks, and "from", "to" the 95 % interval of this median (with fewer than
+six pairs: the smallest and the largest ratio). CleanRL's pinned Gymnasium has -v4 environments
+(Humanoid-v4: 376 observations, -v5: 348). SBX gets the sizes of our networks, batches and updates;
+it logs nothing, and in PPO it normalizes neither observations nor rewards.
+--jobs N compares N runs side by side, on a core each, with one alone.
+--checkpoint measures one checkpoint, after --stored steps (at least one rollout). SAC and TD3 keep
+all of them in the replay buffer.
+"""
+
+import argparse
+import contextlib
+import json
+import math
+import os
+import resource
+import runpy
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from statistics import median
+
+PROJECT = Path(__file__).resolve().parent.parent
+ALGOS = ("sac", "td3", "ppo")
+ROLLOUT = 2048  # the steps of PPO's rollout, the default of all programs here
+TOTAL_TIMESTEPS = 2_000_000  # more than any program takes before it is ended
+
+
+def fail(message, code=2):
+    """Exit with one line."""
+    print("error:", " ".join(str(message).split()), file=sys.stderr)
+    raise SystemExit(code)
+
+
+# CHILDREN: what runs on the measured core, in the interpreter of the measured program. They rely on
+# nothing but its command line and the tags of its TensorBoard curves.
+
+
+class Marks:
+    """Tells the parent how far the program is, and lets it go on only when the parent says so."""
+
+    def __init__(self):
+        self.wall = self.cpu = 0.0  # seconds, without those of waiting
+        self.wait()
+
+    def wait(self):
+        """Wait for the parent."""
+        if not sys.stdin.readline():  # the parent is gone
+            os._exit(1)
+        self.resumed = time.perf_counter(), time.process_time()
+
+    def mark(self, step):
+        """Report that the program has reached a step, and wait."""
+        self.wall += time.perf_counter() - self.resumed[0]
+        self.cpu += time.process_time() - self.resumed[1]
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        print("mark", json.dumps([step, self.wall, self.cpu, memory]), flush=True)
+        self.wait()
+
+
+def child_script(script, marked_tag, *flags):
+    """Run a script as the command line does, with a mark at every step that logs such a tag."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    marks, last_step = Marks(), 0
+    add_scalar = SummaryWriter.add_scalar
+
+    def watched(self, tag, scalar_value, global_step=None, *args, **kwargs):
+        nonlocal last_step
+        if tag.startswith(marked_tag) and global_step != last_step:
+            last_step = global_step
+            marks.mark(global_step)
+        add_scalar(self, tag, scalar_value, global_step, *args, **kwargs)
+
+    SummaryWriter.add_scalar = watched
+    sys.argv = [script, *flags]
+    try:
+        runpy.run_path(script, run_name="__main__")
+    except SystemExit as end:
+        if end.code == 128 + signal.SIGTERM:  # asked to stop, it has saved a checkpoint
+            marks.mark(last_step)
+        raise
+
+
+def child_sbx(algo, env_id, learning_starts):
+    """Run SBX with our sizes; those of batches and buffer, and activations, are its defaults."""
+    import gymnasium
+    import numpy as np
+    import sbx
+    from stable_baselines3.common.noise import NormalActionNoise
+
+    marks = Marks()
+
+    def callback(*_):
+        if model.num_timesteps % (ROLLOUT if algo == "ppo" else 100) == 0:
+            marks.mark(model.num_timesteps)
+        return True
+
+    env = gymnasium.make(env_id)
+    width = 64 if algo == "ppo" else 256
+    options = {"policy_kwargs": {"net_arch": [width, width]}, "learning_rate": 3e-4, "seed": 1}
+    if algo != "ppo":
+        options["learning_starts"] = int(learning_starts)
+    if algo == "sac":
+        options["qf_learning_rate"] = 1e-3
+    if algo == "td3":
+        mean = np.zeros(env.action_space.shape)
+        options["action_noise"] = NormalActionNoise(mean, mean + 0.1)
+    model = getattr(sbx, algo.upper())("MlpPolicy", env, **options)
+    model.learn(TOTAL_TIMESTEPS, callback)
+
+
+def start_child(core, child, *arguments):
+    """Prepare this process before it imports any library, and become a child."""
+    os.sched_setaffinity(0, {int(core)})
+    os.environ.update(OMP_NUM_THREADS="1", CUDA_VISIBLE_DEVICES="", JAX_PLATFORMS="cpu")
+    folder = os.path.dirname(arguments[0])
+    sys.path[:1] = [folder, os.path.dirname(folder)]  # CleanRL's scripts import from its root
+    child(*arguments)
+
+
+# MEASURING
+
+
+class Program(contextlib.AbstractContextManager):
+    """A child in a process and a folder of its own."""
+
+    def __init__(self, name, core, *arguments, python=sys.executable):
+        self.name, self.speeds, self.shares = name, [], []
+        self.step = self.wall = self.cpu = self.memory = 0
+        self.folder = tempfile.TemporaryDirectory()
+        command = [str(word) for word in (python, __file__, core, *arguments)]
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        self.process = subprocess.Popen(
+            command, cwd=self.folder.name, text=True, start_new_session=True, **pipes
+        )
+
+    def __exit__(self, *_):
+        """End it, wherever it is."""
+        with self.process, contextlib.suppress(ProcessLookupError):
+            os.killpg(self.process.pid, signal.SIGKILL)
+        self.folder.cleanup()
+
+    def read_mark(self):
+        """Wait for the next mark, or fail if the program ends before."""
+        printed = []
+        for line in self.process.stdout:
+            word, _, value = line.partition(" ")
+            if word == "mark":
+                self.step, self.wall, self.cpu, self.memory = json.loads(value)
+                return
+            printed += [word for word in line.split() if word.strip("─│╭╮╰╯")]  # without boxes
+        code = 2 if self.process.wait() == 2 else 1  # 2: bad arguments
+        fail(f"{self.name}: {' '.join(printed[-60:]).removeprefix('error: ')}", code)
+
+
+def advance(*programs):
+    """Let programs run at the same time, each to its next mark."""
+    for program in programs:
+        with contextlib.suppress(BrokenPipeError):  # it has ended, and read_mark says why
+            os.write(program.process.stdin.fileno(), b"go on\n")
+    for program in programs:
+        program.read_mark()
+
+
+def warm_up(program):
+    """Run until the speed is steady: what is compiled is compiled."""
+    for _ in range(3):
+        advance(program)
+
+
+def measure(options, *programs):
+    """Run programs at the same time for a block, and add to the speeds of each."""
+    before = [(program.step, program.wall, program.cpu) for program in programs]
+    while programs[0].wall - before[0][1] < options.seconds:
+        advance(*programs)
+    for program, (step, wall, cpu) in zip(programs, before, strict=True):
+        seconds = program.cpu - cpu if options.clock == "cpu" else program.wall - wall
+        program.speeds.append((program.step - step) / seconds)
+        program.shares.append((program.cpu - cpu) / (program.wall - wall))
+
+
+def flags(algo, env_id, options):
+    """Return the flags that our scripts and CleanRL's share."""
+    shared = ["--env-id", env_id, "--total-timesteps", TOTAL_TIMESTEPS]
+    return shared if algo == "ppo" else [*shared, "--learning-starts", options.stored]
+
+
+def ours(algo, env_id, options, name="ours", folder=None, job=0, tag="losses/"):
+    """Start one of this project's scripts, without tests and checkpoints."""
+    core = options.cores[job % len(options.cores)]
+    script = (folder or PROJECT).resolve() / f"{algo}_continuous_noisy.py"
+    never_save = ["--eval-frequency", 0, "--checkpoint-frequency", TOTAL_TIMESTEPS]
+    arguments = [*flags(algo, env_id, options), *never_save, *options.flags]
+    return Program(name, core, "_script", script, tag, *arguments)
+
+
+def ours_and_others(algo, env_id, options):
+    """Start one program after another."""
+    core = options.cores[0]
+    yield ours(algo, env_id, options)
+    if options.against_checkout:
+        yield ours(algo, env_id, options, "checkout", options.against_checkout)
+    if options.against_cleanrl:
+        script = options.against_cleanrl.resolve() / "cleanrl" / f"{algo}_continuous_action.py"
+        arguments = [script, "losses/", *flags(algo, env_id.replace("-v5", "-v4"), options)]
+        python = options.cleanrl_python
+        yield Program("CleanRL", core, "_script", *arguments, "--no-cuda", python=python)
+    if options.against_sbx:
+        python = options.against_sbx
+        yield Program("SBX", core, "_sbx", algo, env_id, options.stored, python=python)
+
+
+def interval_of_median(values):
+    """Return a 95 % confidence interval of the median: two of the sorted values."""
+    ordered = sorted(values)  # the number below the true median is binomial, nearly normal
+    rank = max(0, math.floor((len(ordered) - 1.96 * math.sqrt(len(ordered))) / 2))
+    return ordered[rank], ordered[-1 - rank]
+
+
+def compare(algo, env_id, options):
+    """Run ours and the others, if there are any, alternately."""
+    programs, rows = [], []
+    with contextlib.ExitStack() as stack:
+        for program in ours_and_others(algo, env_id, options):
+            programs.append(stack.enter_context(program))
+            warm_up(program)
+        for pair in range(options.pairs):
+            in_turn = programs if pair % 2 == 0 else programs[::-1]  # each is first as often
+            for program in in_turn:
+                measure(options, program)
+    for program in programs:
+        ratios = [a / b for a, b in zip(programs[0].speeds, program.speeds, strict=True)]
+        low, high = interval_of_median(ratios)
+        row = {
+            "program": program.name,
+            "steps/s": median(program.speeds),
+            "core %": 100 * median(program.shares),
+            "memory MB": program.memory,
+            "ours / its": median(ratios),
+            "from": low,
+            "to": high,
+            "speeds": program.speeds,
+            "ratios": ratios,
+        }
+        rows.append(row)
+    return rows
+
+
+def side_by_side(algo, env_id, options):
+    """Run one alone and several together, alternately."""
+    programs, alone, together = [], [], []
+    with contextlib.ExitStack() as stack:
+        for job in range(options.jobs):
+            programs.append(stack.enter_context(ours(algo, env_id, options, job=job)))
+            warm_up(programs[job])
+        for _ in range(options.pairs):
+            measure(options, programs[0])
+            alone.append(programs[0].speeds[-1])
+            measure(options, *programs)
+            together.append(sum(program.speeds[-1] for program in programs))
+    efficiencies = [b / (a * options.jobs) for a, b in zip(alone, together, strict=True)]
+    row = {
+        "alone": median(alone),
+        f"{options.jobs} jobs": median(together),
+        "efficiency": median(efficiencies),
+        "efficiencies": efficiencies,
+    }
+    return [row]
+
+
+def checkpoint(algo, env_id, options):
+    """Let a run save a checkpoint when an episode has ended and its return is logged."""
+    with ours(algo, env_id, options, tag="charts/episodic_return") as program:
+        while program.step <= max(options.stored, ROLLOUT):
+            advance(program)
+        memory, wall = program.memory, program.wall
+        program.process.terminate()
+        advance(program)
+        [file] = Path(program.folder.name).glob("runs/*/checkpoint.pt")
+        row = {
+            "step": program.step,
+            "MB": file.stat().st_size / 2**20,
+            "seconds": program.wall - wall,
+            "extra memory MB": program.memory - memory,
+        }
+    return [row]
+
+
+def table(rows):
+    """Return the rows as text; the lists in them are for --json only."""
+    from tabulate import tabulate  # here, since the children's interpreters may not have it
+
+    shown = [{k: v for k, v in row.items() if not isinstance(v, list)} for row in rows]
+    return tabulate(shown, headers="keys", floatfmt=".4g")
+
+
+def interpreter(name):
+    """Return the full path of a program, since the runs have folders of their own."""
+    found = shutil.which(name)
+    if not found:
+        raise argparse.ArgumentTypeError(f"{name} is not a program")
+    return os.path.abspath(found)
+
+
+def parse(argv):
+    """Return the options; what follows -- is for the scripts."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.error = fail
+    add = parser.add_argument
+    add("--algos", nargs="+", choices=ALGOS, default=ALGOS)
+    add("--envs", nargs="+", default=["HalfCheetah-v5", "Humanoid-v5"], metavar="ENV_ID")
+    add("--pairs", type=int, default=20, help="blocks of each program (default: 20)")
+    add("--seconds", type=float, default=2.0, help="the least length of a block (default: 2)")
+    add("--stored", type=int, default=1000, help="random steps before learning (default: 1000)")
+    add("--clock", choices=("wall", "cpu"), default="wall")
+    add("--against-cleanrl", type=Path, metavar="PATH", help="a checkout of CleanRL")
+    add("--cleanrl-python", type=interpreter, metavar="PYTHON", help="one with its requirements")
+    add("--against-sbx", type=interpreter, metavar="PYTHON", help="one with sbx-rl")
+    add("--against-checkout", type=Path, metavar="PATH", help="another version of this project")
+    add("--jobs", type=int, metavar="N", help="runs side by side")
+    add("--checkpoint", action="store_true", help="size and time of checkpoints")
+    add("--json", type=Path, metavar="FILE", help="write all figures, block by block, to a file")
+    end = argv.index("--") if "--" in argv else len(argv)
+    options = parser.parse_args(argv[:end])
+    options.flags = argv[end + 1 :]
+    options.cores = sorted(os.sched_getaffinity(0), reverse=True)
+
+    for name, low in (("pairs", 1), ("seconds", 0.1), ("stored", 1), ("jobs", 2)):
+        value = getattr(options, name)
+        if value is not None and not value >= low:
+            fail(f"--{name} must be at least {low}, not {value}")
+    if bool(options.against_cleanrl) != bool(options.cleanrl_python):
+        fail("--against-cleanrl and --cleanrl-python go together")
+    if options.json and not options.json.parent.is_dir():
+        fail(f"--json: there is no folder {options.json.parent}")
+    files = {"cleanrl": "cleanrl/sac_continuous_action.py", "checkout": "sac_continuous_noisy.py"}
+    for name, file in files.items():
+        folder = getattr(options, f"against_{name}")
+        if folder and not (folder / file).is_file():
+            fail(f"--against-{name}: there is no {folder / file}")
+    return options
+
+
+def main(argv):
+    """Measure and print."""
+    options = parse(argv)
+    modes, figures = [], {}
+    if options.jobs:
+        modes.append(side_by_side)
+    if options.checkpoint:
+        modes.append(checkpoint)
+    if not modes or options.against_cleanrl or options.against_sbx or options.against_checkout:
+        modes.append(compare)
+    for mode in modes:
+        rows = []
+        for algo in options.algos:
+            for env_id in options.envs:
+                print(f"{mode.__name__} {algo} {env_id}", file=sys.stderr)
+                for row in mode(algo, env_id, options):
+                    rows.append({"script": algo, "env_id": env_id, **row})
+        print(table(rows), flush=True)
+        figures[mode.__name__] = rows
+    if options.json:
+        options.json.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    children = {"_script": child_script, "_sbx": child_sbx}
+    if len(sys.argv) > 2 and sys.argv[2] in children:
+        start_child(sys.argv[1], children[sys.argv[2]], *sys.argv[3:])
+    else:
+        main(sys.argv[1:])
