@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint results clean
 
 demo: $(BIN)/.run
 	PYTHON=$(BIN)/python ./benchmark.sh demo
@@ -22,8 +22,19 @@ lint: $(BIN)/.dev
 	bash -n benchmark.sh .ci/run
 	$(BIN)/shellcheck benchmark.sh .ci/run
 
+# What one command can make again, from the runs in results/data. Only what the pages show is kept
+# in git; results/report has everything.
+results: $(BIN)/.run
+	$(BIN)/python analyze.py --runs-dir results/data/runs --out results/report --compare results/paper
+	cp results/report/*.csv results/tables
+	cp results/report/curves_PPO_RandomEarlyTermination_50.svg results/figures
+	$(BIN)/python results/pages/claims.py
+	$(BIN)/python results/pages/future_work.py
+	$(BIN)/python results/pages/robustness.py
+	$(BIN)/python results/pages/precision.py
+
 clean:
-	rm -rf .venv runs/demo
+	rm -rf .venv runs/demo results/report
 
 $(BIN)/python:
 	$(PYTHON) -m venv .venv

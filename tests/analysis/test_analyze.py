@@ -27,6 +27,7 @@ import analysis.runs
 import analysis.statistics
 import analyze
 
+RESULTS = Path(analyze.__file__).parent / "results"
 NAN = float("nan")
 SCALE = "RandomUniformScaleReward(0.5, 1.5)"
 ENDING = "RandomEarlyTermination(50)"
@@ -126,6 +127,14 @@ def sweep(tmp_path_factory):
     path = tmp_path_factory.mktemp("sweep")
     small_sweep(path / "runs")
     return SimpleNamespace(path=path, tables=run(path))
+
+
+@pytest.fixture(scope="module")
+def committed(tmp_path_factory):
+    """What analyze.py writes for the runs of the repository."""
+    out = tmp_path_factory.mktemp("committed")
+    analyze.main(analyze.Args(RESULTS / "data/runs", out, RESULTS / "paper"))
+    return out
 
 
 # ------------------------------------------------------------------------ tables computed by hand
@@ -334,7 +343,7 @@ def test_seeds_are_replicates_and_episodes_are_not(tmp_path):
 
 
 def test_papers_sign_convention_and_data():
-    paper = Path(analyze.__file__).parent / "results/paper"
+    paper = RESULTS / "paper"
     best = pd.read_csv(paper / "best.csv")
     ours = analysis.statistics.improvement_percent(best["noisy_mean"], best["baseline_mean"])
     np.testing.assert_allclose(
@@ -735,7 +744,7 @@ def test_what_an_earlier_analysis_left_is_said(tmp_path, capsys):
 
 def test_baselines_alone_stand_beside_the_papers(tmp_path):
     write_run(tmp_path / "runs", [10])
-    tables = run(tmp_path, compare=Path(analyze.__file__).parent / "results/paper")
+    tables = run(tmp_path, compare=RESULTS / "paper")
     base = row(tables["compare_best"], algorithm="SAC", environment="Hopper-v5", noise="")
     assert base["mean"] == 10 and base["paper_mean"] == 2928 and base["listed_by"] == "both"
     assert len(tables["compare_consistent"]) == 29
@@ -748,7 +757,7 @@ def test_compare_sets_the_paper_beside_ours(tmp_path):
         for config in ({}, {"noise": mixup, "rate": 0.05}, {"noise": SCALE, "rate": 0.05}):
             curve = 3000 + 500 * rng.normal(size=100)
             write_run(tmp_path / "runs", curve, env="Hopper-v5", seed=seed, **config)
-    tables = run(tmp_path, compare=Path(analyze.__file__).parent / "results/paper")
+    tables = run(tmp_path, compare=RESULTS / "paper")
     summary, table = tables["summary_SAC"], tables["compare_best"]
     ours = row(summary, noise=mixup)
     both = row(table, environment="Hopper-v5", noise=mixup)
@@ -788,7 +797,7 @@ def test_a_difference_needs_equal_steps_and_a_listing_one_version(tmp_path):
                 write_run(tmp_path / "runs", 5 * [final], env=f"{env}-v5", **more)
                 write_run(tmp_path / "runs", 5 * [12 + seed], env=f"{env}-v4", **more)
             write_run(tmp_path / "runs", [final], env="Walker2d-v5", **more)
-    tables = run(tmp_path, compare=Path(analyze.__file__).parent / "results/paper")
+    tables = run(tmp_path, compare=RESULTS / "paper")
     best = tables["compare_best"].set_index(["algorithm", "environment", "noise"]).sort_index()
     whole, short = "SAC [total_timesteps=1000000]", "SAC [total_timesteps=200000]"
     assert np.isfinite(best.loc[(whole, "Hopper-v5", ""), "difference_se"])
@@ -968,7 +977,7 @@ def test_report_has_no_horizontal_overflow(width, sweep, tmp_path):
     assert images == 4 and broken == 0 and external == 0
 
 
-def test_no_table_of_the_committed_report_scrolls_or_cuts_a_number(tmp_path):
+def test_no_table_of_a_large_report_scrolls_or_cuts_a_number(committed, tmp_path):
     script = """
         document.querySelectorAll("details").forEach(details => details.open = true);
         const cells = [...document.querySelectorAll("td")];
@@ -982,8 +991,8 @@ def test_no_table_of_the_committed_report_scrolls_or_cuts_a_number(tmp_path):
           cells.filter(cell => box(cell).right > 1280).length,
           cells.filter(cell => /^-?[0-9,.]+$/.test(cell.textContent) && lines(cell) > 1).length,
           cells.length];"""
-    page = Path(analyze.__file__).parent / "results/report.html"
-    width, scrolling, outside, broken, cells = in_browser(page, script, 1280, tmp_path)
+    page = in_browser(committed / "report.html", script, 1280, tmp_path)
+    width, scrolling, outside, broken, cells = page
     assert width <= 1280 and scrolling == outside == broken == 0 and cells > 500
 
 
@@ -1094,21 +1103,23 @@ def test_one_baseline_run_is_enough_for_a_report(tmp_path, capsys):
     assert "Finished runs: 1." in capsys.readouterr().out
 
 
-def test_committed_results_are_those_of_the_committed_runs(tmp_path):
-    results = Path(analyze.__file__).parent / "results"
-    analyze.main(analyze.Args(results / "data/runs", tmp_path, results / "paper"))
-    tables, figures = results / "tables", results / "figures"
-    committed = {path.name for folder in (tables, figures) for path in folder.iterdir()}
-    pages = {"robustness.svg", "precision.png"}
-    assert committed - pages | {"report.html"} == {path.name for path in tmp_path.iterdir()}
-    for path in tables.glob("*.csv"):
-        both = [pd.read_csv(folder / path.name) for folder in (tables, tmp_path)]
+def test_committed_tables_are_those_of_the_committed_runs(committed):
+    tables = RESULTS / "tables"
+    assert {path.name for path in tables.iterdir()} == {p.name for p in committed.glob("*.csv")}
+    for path in tables.iterdir():
+        both = [pd.read_csv(folder / path.name) for folder in (tables, committed)]
         pd.testing.assert_frame_equal(*both, rtol=1e-6)
+
+
+def test_committed_figures_are_those_that_a_page_shows():
+    pages = [RESULTS.parent / "README.md", *RESULTS.glob("*.md"), *RESULTS.parent.glob("docs/*.md")]
+    shown = re.findall(r"!\[[^]]*\]\([^)]*figures/([^)]*)\)", "".join(p.read_text() for p in pages))
+    assert {path.name for path in (RESULTS / "figures").iterdir()} == set(shown)
 
 
 def test_committed_runs_had_the_noise_that_their_names_say():
     """Each wrapper acted as often as a binomial sample at its rate would, up to 4 deviations."""
-    folders = sorted((Path(analyze.__file__).parent / "results/data/runs").iterdir())
+    folders = sorted((RESULTS / "data/runs").iterdir())
     assert folders
     for folder in folders:
         args = json.loads((folder / "config.json").read_text())["args"]
