@@ -84,7 +84,8 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     Attributes:
         schedule: the rates at the beginning and at the end of training, both in [0, 1].
-        progress: the fraction of training done; see :func:`set_progress`.
+        training_progress: the fraction of training done; see :func:`set_progress`. Assigning it
+            assigns that of the noise wrappers inside, too.
         parameters: the wrapper's own arguments by name, as its spec records them.
         opportunities: how often the noise might have acted (episodes for early termination).
         times_applied: how often it did.
@@ -94,7 +95,7 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """Raise ValueError unless noise_rate is in [0, 1] or "start:end" of two such rates."""
         gym.Wrapper.__init__(self, env)
         self.schedule = _schedule(noise_rate)
-        self.progress = 0.0
+        self._training_progress = 0.0
         self._noise_rate = self.schedule[0]
         RecordConstructorArgs.__init__(self, noise_rate=_spelled(self.schedule), **parameters)
         self.parameters = parameters
@@ -118,6 +119,27 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.schedule = (rate, rate)
         self._noise_rate = rate
 
+    # A vector environment reaches the attributes of the outermost noise wrapper only, perhaps in
+    # another process: so the next two speak for the wrappers inside as well.
+
+    @property
+    def training_progress(self) -> float:
+        """The fraction of training done, for rates that change."""
+        return self._training_progress
+
+    @training_progress.setter
+    def training_progress(self, fraction: float) -> None:
+        for layer in _noise_layers(self):
+            layer._training_progress = fraction
+
+    def noise_statistics(self) -> dict[str, float]:
+        """Return :func:`noise_statistics` of this wrapper and of those inside."""
+        statistics = {}
+        for name, wrapper in noise_wrappers(self).items():
+            statistics[f"{name}/rate"] = wrapper.noise_rate
+            statistics[f"{name}/applied_fraction"] = wrapper.applied_fraction
+        return statistics
+
     @property
     def applied_fraction(self) -> float:
         """The realised rate, times_applied / opportunities; nan before the first opportunity."""
@@ -125,7 +147,7 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment; a seed also reseeds the noise. The rate follows its schedule."""
-        self._noise_rate = float(np.interp(self.progress, (0.0, 1.0), self.schedule))
+        self._noise_rate = float(np.interp(self._training_progress, (0.0, 1.0), self.schedule))
         result = self.env.reset(seed=seed, options=options)
         if seed is not None:
             self._seed(seed)
@@ -620,6 +642,11 @@ _RECORDED = (
     "this environment records its episodes already (in info['episode'], as RecordEpisodeStatistics "
     "and Monitor do): take that off, or use make_noisy(..., record_statistics=False)"
 )
+_RECORDED_BENEATH_EARLY_TERMINATION = (
+    "this environment records its episodes already, and the record would miss those that "
+    "RandomEarlyTermination ends: apply that first, as in Monitor(make_noisy(env, "
+    "['RandomEarlyTermination(50)'], [0.5], record_statistics=False)), and the other noises after"
+)
 
 
 class RecordEpisodeStatistics(gym.wrappers.RecordEpisodeStatistics[Any, Any]):
@@ -734,7 +761,7 @@ def parse_noise(text: str) -> Noise:
     """
     try:
         name, args, kwargs = _read_call(text)
-    except (MemoryError, RecursionError, SyntaxError, TypeError, ValueError):
+    except (AttributeError, MemoryError, RecursionError, SyntaxError, TypeError, ValueError):
         raise _bad_noise(text, "expected Name(number, ..., keyword=value)") from None
     if name not in WRAPPERS:
         raise _bad_noise(text, "unknown name")
@@ -772,6 +799,8 @@ def _bad_noise(text: str, reason: str) -> ValueError:
 
 def _pair(noises: Sequence[str], rates: Sequence[float | str]) -> list[tuple[Noise, float | str]]:
     """Parse noises with their rates: without those of rate 0, dynamics noise first."""
+    noises = _listed("noises", noises, '["RandomNormalNoisyReward(0.1)"]')
+    rates = _listed("rates", rates, "[0.5]")
     if noises and not rates:
         raise ValueError("noise without a noise rate: give one for all noises, or one for each")
     if rates and not noises:
@@ -787,6 +816,13 @@ def _pair(noises: Sequence[str], rates: Sequence[float | str]) -> list[tuple[Noi
     parsed = [parse_noise(noise) for noise in noises]
     pairs = [(noise, rate) for noise, rate in zip(parsed, canonical, strict=True) if rate != 0]
     return sorted(pairs, key=_place)
+
+
+def _listed(name: str, values: Any, example: str) -> list[Any]:
+    """Return a sequence or an array of one dimension as a list."""
+    if isinstance(values, str) or not np.iterable(values):
+        raise ValueError(f"{name} must be a list, for example {example}, got {values!r}")
+    return list(values)
 
 
 def _place(pair: tuple[Noise, float | str]) -> int:
@@ -828,8 +864,8 @@ def make_noisy(
     Early termination is innermost, then action noise, then
     ``gymnasium.wrappers.RecordEpisodeStatistics``, then the other noises in the order given, so
     ``info["episode"]`` has the return before reward noise. ``record_statistics=False`` leaves the
-    record out, for an environment that keeps one itself, such as Stable-Baselines3's Monitor. (A
-    record beneath early termination misses the episodes that are ended.)
+    record out, for an environment that keeps one itself, such as Stable-Baselines3's Monitor.
+    Early termination must then be inside that record, which would miss the episodes that it ends.
 
     >>> make_noisy(gym.make("CartPole-v1").unwrapped, ["RandomNormalNoisyReward(1)"], [0.1])
     <RandomNormalNoisyReward<RecordEpisodeStatistics<CartPoleEnv<CartPole-v1>>>>
@@ -838,10 +874,16 @@ def make_noisy(
         ValueError: as :func:`canonical_noises`, a space that a noise cannot work on, or an
             environment that records its episodes already; if it shows this only when an episode
             ends, by an "episode" in its info, the error comes then.
+        TypeError: what is no single environment, such as a vector environment.
     """
-    if record_statistics and any(env.has_wrapper_attr(name) for name in _OF_RECORDERS):
-        raise ValueError(_RECORDED)
+    if not isinstance(env, gym.Env):
+        raise TypeError(f"make_noisy takes a single gymnasium.Env, not a {type(env).__name__}")
     pairs = _pair(noises, rates)
+    recorded = any(env.has_wrapper_attr(name) for name in _OF_RECORDERS)
+    if recorded and record_statistics:
+        raise ValueError(_RECORDED)
+    if recorded and any(noise.wrapper is RandomEarlyTermination for noise, _ in pairs):
+        raise ValueError(_RECORDED_BENEATH_EARLY_TERMINATION)
     for noise, rate in pairs:
         if noise.wrapper in _DYNAMICS:
             env = noise(env, rate)
@@ -886,10 +928,12 @@ def make_flat(env: Env) -> Env:
     return FiniteNumbers(env)
 
 
-def set_progress(env: Env, fraction: float) -> None:
+def set_progress(env: Any, fraction: float) -> None:
     """Say what fraction of training is done, for rates that change; call it before a ``reset()``.
 
-    The rates follow when the next episode begins and never within one; constant rates stay.
+    The rates follow when the next episode begins and never within one; constant rates stay. ``env``
+    is an environment, a vector environment of Gymnasium, or a VecEnv of Stable-Baselines3, whose
+    environments may run in processes of their own. Without noise nothing happens.
 
     >>> env = RandomNormalNoisyReward(gym.make("CartPole-v1"), "1.0:0.0", 0.1)
     >>> set_progress(env, 0.25)
@@ -901,17 +945,27 @@ def set_progress(env: Env, fraction: float) -> None:
 
     Raises:
         ValueError: a fraction that is not in [0, 1].
+        TypeError: what is no environment.
     """
     progress = _number("fraction", fraction, low=0, high=1)
-    for layer in _noise_layers(env):
-        layer.progress = progress
+    if isinstance(env, gym.Env):
+        outermost = next(_noise_layers(env), None)
+        if outermost:
+            outermost.training_progress = progress
+    else:
+        _call_each(env, "set_wrapper_attr", "training_progress", progress, force=False)
 
 
 def noise_wrappers(env: Env) -> dict[str, NoiseWrapper]:
     """Return an environment's noise wrappers by class name, innermost first.
 
     The second of a class is "ClassName_2", and so on.
+
+    Raises:
+        TypeError: what is no single environment.
     """
+    if not isinstance(env, gym.Env):
+        raise TypeError(f"noise_wrappers takes a gymnasium.Env, not a {type(env).__name__}")
     found: dict[str, NoiseWrapper] = {}
     count: Counter[str] = Counter()
     for layer in reversed(list(_noise_layers(env))):
@@ -921,19 +975,41 @@ def noise_wrappers(env: Env) -> dict[str, NoiseWrapper]:
     return found
 
 
-def noise_statistics(env: Env) -> dict[str, float]:
+def noise_statistics(env: Any) -> dict[str, float]:
     """Return the rate and the realised rate of an environment's noise wrappers, for a log.
+
+    Of a vector of environments, as :func:`set_progress` takes one, these are the means.
 
     >>> env = make_noisy(gym.make("CartPole-v1"), ["RandomNormalNoisyReward(1)"], [1.0])
     >>> _ = env.reset(), env.step(0)
     >>> noise_statistics(env)
     {'RandomNormalNoisyReward/rate': 1.0, 'RandomNormalNoisyReward/applied_fraction': 1.0}
+
+    Raises:
+        ValueError: a vector of environments whose noises differ.
+        TypeError: what is no environment.
     """
-    statistics = {}
-    for name, wrapper in noise_wrappers(env).items():
-        statistics[f"{name}/rate"] = wrapper.noise_rate
-        statistics[f"{name}/applied_fraction"] = wrapper.applied_fraction
-    return statistics
+    if isinstance(env, gym.Env):
+        outermost = next(_noise_layers(env), None)
+        return outermost.noise_statistics() if outermost else {}
+    noisy = _call_each(env, "has_wrapper_attr", "noise_statistics")
+    if not any(noisy):
+        return {}
+    each = _call_each(env, "noise_statistics") if all(noisy) else []
+    if len({tuple(statistics) for statistics in each}) != 1:
+        raise ValueError("these environments have different noises, so there are no means to give")
+    return {name: float(np.mean([one[name] for one in each])) for name in each[0]}
+
+
+def _call_each(env: Any, method: str, *args: Any, **kwargs: Any) -> Sequence[Any]:
+    """Call a method of each environment of a vector, in the process in which it runs."""
+    if isinstance(env, gym.vector.VectorEnv):
+        env = env.unwrapped
+        # One that is not made of single environments, such as CartPole's own, holds no noise.
+        return env.call(method, *args, **kwargs) if hasattr(env, "call") else ()
+    if hasattr(env, "env_method"):  # of Stable-Baselines3
+        return env.env_method(method, *args, **kwargs)
+    raise TypeError(f"needs an environment or a vector of environments, not {type(env).__name__}")
 
 
 class EnvState:
@@ -1001,7 +1077,7 @@ def _stream(generator: Any) -> Any:
 
 
 def _without_arrays(value: Any) -> Any:
-    """Turn the arrays in nested dicts into lists, which any reader of a checkpoint accepts."""
+    """Turn an array, also in nested dicts, into lists or a number of Python's own types."""
     if isinstance(value, dict):
         return {name: _without_arrays(part) for name, part in value.items()}
     return value.tolist() if isinstance(value, np.ndarray) else value
@@ -1120,9 +1196,10 @@ def _cast(values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
 
 def _number(name: str, value: float, low: float = -math.inf, high: float = math.inf) -> float:
     number = math.nan
-    if isinstance(value, numbers.Real) and not isinstance(value, bool):
+    plain = _without_arrays(value)
+    if isinstance(plain, numbers.Real) and not isinstance(plain, bool):
         with contextlib.suppress(OverflowError):  # an integer beyond the range of floats
-            number = float(value)
+            number = float(plain)
     if not (math.isfinite(number) and low <= number <= high):
         raise ValueError(f"{name} must be a finite number in [{low}, {high}], got {value!r}")
     return number + 0.0  # -0.0 becomes 0.0
@@ -1161,16 +1238,18 @@ def _interval(low: float, high: float) -> tuple[float, float]:
 
 def _scale_or_scales(value: float | tuple[float, ...] | list[float]) -> float | tuple[float, ...]:
     """Check one standard deviation for all dimensions, or a tuple (in JSON a list) of them."""
-    if not isinstance(value, tuple | list):
-        return _number("scale", value, low=0)
-    if len(value) < 2:
+    scales = _without_arrays(value)
+    if not isinstance(scales, tuple | list):
+        return _number("scale", scales, low=0)
+    if len(scales) < 2:
         raise ValueError(f"scale must be one number, or a tuple of two or more, got {value!r}")
-    return tuple(_number("every scale", number, low=0) for number in value)
+    return tuple(_number("every scale", number, low=0) for number in scales)
 
 
 def _step_number(name: str, value: int | None) -> int:
-    if isinstance(value, numbers.Integral) and not isinstance(value, bool):
-        number = int(value)
+    plain = _without_arrays(value)
+    if isinstance(plain, numbers.Integral) and not isinstance(plain, bool):
+        number = int(plain)
         if 1 <= number < 2**63:  # Generator.integers draws 64-bit integers
             return number
     raise ValueError(f"{name} must be an integer in [1, 2**63), got {value!r}")

@@ -40,6 +40,7 @@ from noisy_wrappers import (
     canonical_noises,
     make_flat,
     make_noisy,
+    noise_slug,
     noise_statistics,
     noise_wrappers,
     parse_noise,
@@ -629,12 +630,71 @@ def test_resuming_a_schedule_needs_the_progress_and_the_streams():
     assert rates == {"RandomNormalNoisyReward": 0.5, "RandomDropoutObservation": 0.4}
 
 
+def noisy_pendulum():
+    return make_noisy(gym.make("Pendulum-v1"), [A, B], ["1:0", "0:1"])
+
+
+RATES_OF_A_PENDULUM = {"RandomNormalNoisyReward/rate": 0.25, "RandomDropoutObservation/rate": 0.75}
+
+
+@pytest.mark.parametrize("vector", [gym.vector.SyncVectorEnv, gym.vector.AsyncVectorEnv])
+@pytest.mark.parametrize("wrap", [lambda env: env, gym.wrappers.vector.RecordEpisodeStatistics])
+def test_progress_reaches_the_environments_of_a_vector(vector, wrap):
+    env = wrap(vector([noisy_pendulum, noisy_pendulum]))
+    try:
+        set_progress(env, 0.75)
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        each = env.unwrapped.call("noise_statistics")
+        means = noise_statistics(env)
+    finally:
+        env.close()
+    for statistics in (*each, means):
+        assert RATES_OF_A_PENDULUM.items() <= statistics.items()
+    for name in each[0]:
+        assert means[name] == (each[0][name] + each[1][name]) / 2
+    assert means["RandomNormalNoisyReward/applied_fraction"] in (0, 0.5, 1)
+
+
+def test_vectors_with_and_without_noise():
+    def bare():
+        return gym.make("Pendulum-v1")
+
+    mixed = gym.vector.SyncVectorEnv([noisy_pendulum, bare])
+    names = set(vars(mixed.envs[1]))
+    set_progress(mixed, 0.75)
+    mixed.reset(seed=0)
+    assert RATES_OF_A_PENDULUM.items() <= noise_statistics(mixed.envs[0]).items()
+    assert set(vars(mixed.envs[1])) == names  # nothing was left in the other
+    with pytest.raises(ValueError, match="different noises"):
+        noise_statistics(mixed)
+    without = [gym.vector.SyncVectorEnv([bare]), gym.make_vec("CartPole-v1", num_envs=2), bare()]
+    assert not hasattr(without[1].unwrapped, "call")  # it is one program, not two environments
+    for env in without:
+        set_progress(env, 0.75)
+        assert noise_statistics(env) == {}
+
+
+@pytest.mark.parametrize("function", [lambda env: set_progress(env, 0.5), noise_statistics])
+def test_progress_and_statistics_of_what_is_no_environment(function):
+    for no_env in (None, "Pendulum-v1", [noisy_pendulum()]):
+        with pytest.raises(TypeError, match=f"needs an environment.* {type(no_env).__name__}"):
+            function(no_env)
+
+
+def test_what_takes_a_single_environment_refuses_a_vector():
+    vector = gym.vector.SyncVectorEnv([noisy_pendulum])
+    for function in (noise_wrappers, lambda env: make_noisy(env, [A], [0.5])):
+        with pytest.raises(TypeError, match="SyncVectorEnv"):
+            function(vector)
+
+
 @pytest.mark.parametrize("fraction", [-0.1, 1.1, math.nan, "0.5", None, True])
 def test_bad_progress(fraction):
     env = RandomNormalNoisyReward(constant_env(), "1:0", 1.0)
     with pytest.raises(ValueError, match="fraction"):
         set_progress(env, fraction)
-    assert env.progress == 0
+    assert env.training_progress == 0
 
 
 @pytest.mark.parametrize("text", NOISES)
@@ -647,7 +707,7 @@ def test_spec_and_copies_of_a_schedule(text):
     set_progress(env, 1.0)
     env.reset(seed=2)
     for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
-        assert (twin.schedule, twin.progress, twin.noise_rate) == ((1.0, 0.25), 1.0, 0.25)
+        assert (twin.schedule, twin.training_progress, twin.noise_rate) == ((1.0, 0.25), 1.0, 0.25)
         assert twin.reset()[0] in twin.observation_space
         assert twin.noise_rate == 0.25
 
@@ -1122,6 +1182,19 @@ def test_the_record_of_the_environment_is_kept(recorder):
     assert sum(step[1] for step in steps) != 10.0
 
 
+@pytest.mark.parametrize("recorder", [RecordEpisodeStatistics, Monitor])
+def test_a_record_would_miss_the_episodes_that_are_ended_above_it(recorder):
+    env = recorder(gym.make("CartPole-v1"))
+    for recorded in (env, RandomNormalNoisyReward(env, 0.1, 1.0)):
+        with pytest.raises(ValueError, match=r"Monitor\(make_noisy\(env") as error:
+            make_noisy(recorded, [A, C], [0.5], record_statistics=False)
+        assert "\n" not in str(error.value)
+    make_noisy(env, [C], [0], record_statistics=False)  # no noise
+    # What the agent meets and what is recorded agree about noisy actions.
+    env = recorder(gym.make("Pendulum-v1"))
+    make_noisy(env, ["RandomNormalNoisyAction(1)"], [1.0], record_statistics=False)
+
+
 def test_no_record_where_none_is_wanted():
     env = make_noisy(constant_env(), [A, C], [0.5], record_statistics=False)
     assert layers(env) == ["RandomEarlyTermination", "RandomNormalNoisyReward"]
@@ -1567,6 +1640,39 @@ def test_bad_noises_and_rates(noises, rates):
         lines = str(error.value).split("\n  ")
         assert "\n" not in lines[0]
         assert lines[1:] == (signatures() if "Nothing" in str(noises) else [])
+
+
+@pytest.mark.parametrize("function", [canonical_noises, noise_slug, make_noisy])
+def test_noises_and_rates_are_lists(function):
+    first = [constant_env()] if function is make_noisy else []
+    for noises, rates, name in [(A, [0.5], "noises"), ([A], 0.5, "rates"), ([A], "1:0", "rates")]:
+        with pytest.raises(ValueError, match=rf"^{name} must be a list, for example \[.*\], got "):
+            function(*first, noises, rates)
+    with pytest.raises(ValueError, match="bad noise <class"):
+        function(*first, [RandomNormalNoisyReward], [0.5])
+
+
+def test_numbers_and_arrays_of_numpy():
+    rates = np.array([0.5, 0.0])
+    assert canonical_noises(np.array([A, B]), rates) == canonical_noises([A, B], [0.5, 0.0])
+    assert canonical_noises(np.array([A]), np.array([0.0])) == ([], [])
+    for half in (np.float64(0.5), np.float32(0.5), np.array(0.5)):
+        env = RandomNormalNoisyReward(constant_env(), half, half, loc=half)
+        assert (env.noise_rate, env.scale, env.loc) == (0.5, 0.5, 0.5)
+        assert {type(env.noise_rate), type(env.scale), type(env.loc)} == {float}
+        set_progress(env, half)
+    for nine in (np.int64(9), np.uint8(9), np.array(9)):
+        assert type(RandomEarlyTermination(constant_env(), 0.5, nine).low) is int
+    env = GenericEnv(gym.spaces.Box(-1, 1, (3,)))
+    scales = RandomNormalNoisyObservation(env, 0.5, np.array([1, 2, 3])).scale
+    assert scales == (1.0, 2.0, 3.0)
+    assert {type(scale) for scale in scales} == {float}
+    for bad in (np.array([[1.0, 2.0]]), np.array([0.1, np.nan]), np.array([0.1])):
+        with pytest.raises(ValueError, match="scale"):
+            RandomNormalNoisyObservation(env, 0.5, bad)
+    for bad in (np.array([0.5, 0.5]), np.array(True), np.array(2.0)):
+        with pytest.raises(ValueError, match="noise_rate"):
+            RandomNormalNoisyReward(constant_env(), bad, 0.1)
 
 
 def layers(env):
