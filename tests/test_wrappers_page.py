@@ -1,0 +1,81 @@
+"""docs/wrappers.md is right: its code runs, with Stable-Baselines3 itself."""
+
+import re
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+
+from noisy_wrappers import make_noisy, noise_statistics, set_progress
+
+PAGE = Path(__file__).parents[1] / "docs" / "wrappers.md"
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # a small network is slower with more
+    yield
+    torch.set_num_threads(threads)
+
+
+def test_the_code_of_the_page():
+    code = "\n".join(re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL))
+    assert "model.learn(10_000," in code
+    code = code.replace("model.learn(10_000,", "model.learn(4096,")
+    names = {"__name__": "page"}
+    exec(compile(code, str(PAGE), "exec"), names)
+
+    recorded = names["model"].ep_info_buffer
+    lengths = {episode["l"] for episode in recorded}
+    assert lengths == {50, 200}  # those that end early are seen, and half of them do
+    rates = noise_statistics(names["model"].get_env())
+    assert rates["RandomEarlyTermination/rate"] == 0.5
+    assert 0 < rates["RandomNormalNoisyReward/rate"] <= 0.5  # the last rollout began at half time
+    assert names["mean"] < -100
+
+
+def noisy_pendulum():
+    env = make_noisy(
+        gym.make("Pendulum-v1"), ["RandomEarlyTermination(50)"], [1.0], record_statistics=False
+    )
+    env = Monitor(env, allow_early_resets=False)
+    return make_noisy(env, ["RandomNormalNoisyReward(100.0)"], ["1:0"], record_statistics=False)
+
+
+class StandStill:
+    def predict(self, observations, **kwargs):
+        return np.zeros((len(observations), 1), np.float32), None
+
+
+def test_monitor_records_true_returns_and_evaluation_ends():
+    returns, lengths = evaluate_policy(
+        StandStill(), noisy_pendulum(), n_eval_episodes=5, return_episode_rewards=True
+    )
+    assert lengths == [50] * 5
+    assert all(-50 * 16.3 < value < 0 for value in returns)  # noise of 100 would leave this range
+
+
+@pytest.mark.parametrize("vector", [DummyVecEnv, SubprocVecEnv])
+def test_progress_reaches_the_environments_of_a_vec_env(vector):
+    env = VecNormalize(vector([noisy_pendulum, noisy_pendulum]))
+    try:
+        set_progress(env, 0.75)
+        env.reset()
+        env.step(np.zeros((2, 1)))
+        statistics = noise_statistics(env)
+    finally:
+        env.close()
+    assert statistics["RandomNormalNoisyReward/rate"] == 0.25
+    assert statistics["RandomNormalNoisyReward/applied_fraction"] in (0, 0.5, 1)
+
+
+def test_a_vec_env_without_noise():
+    env = DummyVecEnv([lambda: Monitor(gym.make("Pendulum-v1"))])
+    set_progress(env, 0.5)
+    assert noise_statistics(env) == {}
