@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 
 from noisy_wrappers import make_noisy, noise_statistics, set_progress
 
-PAGE = Path(__file__).parents[1] / "docs" / "wrappers.md"
+PAGE = Path(__file__).parents[2] / "docs" / "wrappers.md"
 
 
 @pytest.fixture(autouse=True)
