@@ -1,22 +1,15 @@
-"""How analyze.py's results look: numbers as text, tables as files, figures, and report.html."""
+"""The figures of analyze.py."""
 
-import base64
-import re
-import zlib
 from itertools import product
-from pathlib import Path
 
-import jinja2
 import matplotlib
 import numpy as np
 import pandas as pd
-from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from tabulate import tabulate
 
+from analysis.formatting import MERGED, slug
 from analysis.runs import BASELINE, rate_order
-from analysis.verdicts import tally
 
 matplotlib.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
 matplotlib.rcParams["svg.hashsalt"] = "noisy"  # equal figures are equal files
@@ -25,118 +18,12 @@ viridis = matplotlib.colormaps["viridis"]  # ordered by lightness, so it reads i
 TOP = 10  # configurations in the interval plot
 
 
-def slug(text):
-    """Turn a label or a noise into a part of a file name; a long one is cut and keeps a hash."""
-    name = re.sub(r"[^A-Za-z0-9._=+-]+", "_", text).strip("_")
-    return name if len(name) <= 150 else f"{name[:140]}_{zlib.crc32(name.encode()):08x}"
-
-
-# ------------------------------------------------------------------------------------------- tables
-
-# Columns that are shown as one: "mean ± std", "estimate [low, high]" or "ours (the baseline's)".
-MERGED = {
-    "baseline": ("baseline_mean", "baseline_std"),
-    "noisy": ("noisy_mean", "noisy_std"),
-    "mean": ("mean", "std"),
-    "average improvement %": ("average_improvement_percent", "std_improvement_percent"),
-    "IQM": ("iqm", "iqm_low", "iqm_high"),
-    "improvement (IQM) %": ("improvement_iqm_percent", "improvement_low", "improvement_high"),
-    "interaction": ("interaction", "interaction_low", "interaction_high"),
-    "interaction %": ("interaction_percent", "percent_low", "percent_high"),
-    "difference": ("difference", "difference_low", "difference_high"),
-    "P(improvement)": ("probability_of_improvement", "probability_low", "probability_high"),
-}
-for _name in ("score", "worst_score", "cvar_score"):
-    MERGED[f"{_name} (baseline)"] = (_name, f"baseline_{_name}")
-WHOLE = ["n", "n_baseline", "conditions", "environments", "chosen_from", "steps_to_baseline"]
-WHOLE += ["seeds_needed", "percent_of_environments", "configurations"]
-WHOLE += ["consistent", "consistently_worse"]
-# Columns that would make a table wider than a page; {name}.csv has them.
-ONLY_CSV = {
-    "best": ["leave_one_seed_out_mean"],
-    "luck": ["consistent_by_luck_95", "consistently_worse_by_luck_95"],
-    "compare_luck": ["consistent_by_luck_95", "consistently_worse_by_luck_95"],
-    "statistics": ["environments", "comparisons", "smallest_p", "smallest_p_adjusted"],
-    "robustness_score": ["smallest_p"],
-}
-for _name in ("mean", "average improvement %"):
-    MERGED[f"paper: {_name}"] = tuple(f"paper_{column}" for column in MERGED[_name])
-
-
-def cell(name, value):
-    """Spell one value of the column `name`; a value that does not exist is a dash."""
-    if pd.isna(value):
-        return "\u2013"
-    if isinstance(value, str):
-        return value or ("baseline" if name == "noise" else "\u2013")
-    if name.startswith(("p_", "paper_p_")) or name in ("p", "smallest_p", "smallest_p_adjusted"):
-        return f"{value:.2g}"
-    if name.startswith("probability"):
-        return f"{value:.2f}"
-    if name == "steps_millions":
-        return f"{value:g}"
-    whole = name in WHOLE or name.endswith("_beyond_luck")
-    return f"{value:z,.0f}" if whole else f"{value:z,.1f}"  # z: no "-0"
-
-
-def merged(title, parts, table, text):
-    """Return one column of text for the columns `parts`; a value that does not exist is a dash."""
-    columns = [text[name] for name in parts]
-    if len(parts) == 3:
-        interval = columns[0] + " [" + columns[1] + ", " + columns[2] + "]"
-        result = interval.where(table[parts[1]].notna(), columns[0])
-    elif title.endswith("(baseline)"):
-        result = columns[0] + " (" + columns[1] + ")"
-    else:
-        result = columns[0] + " \u00b1 " + columns[1]
-    return result.where(table[parts[0]].notna(), "\u2013")
-
-
-def shown(name, table):
-    """Return `table` as a person reads it: all text, related columns in one, rates side by side."""
-    table = table.reset_index(drop=True).drop(columns=ONLY_CSV.get(name, []))
-    text = pd.DataFrame({c: [cell(c, v) for v in table[c]] for c in table}, dtype=object)
-    for title, parts in MERGED.items():
-        if parts[-1] in text:
-            text[parts[0]] = merged(title, parts, table, text)
-            text = text.drop(columns=list(parts[1:])).rename(columns={parts[0]: title})
-    if name == "early_performance" and len(text):
-        text["mean"] += " (" + text.pop("n") + ")"
-        keys = ["algorithm", "environment", "noise", "steps_millions"]
-        text = text.pivot(index=keys, columns="noise_rate", values="mean").fillna("\u2013")
-        text = text[sorted(text.columns, key=rate_order)].reset_index()
-    return text.rename(columns=lambda column: column.replace("_", " ").replace("percent", "%"))
-
-
-def text_table(name, table):
-    """Format a table for the terminal."""
-    text = shown(name, table)
-    return tabulate(text.values, text.columns, disable_numparse=True) if len(text) else "(empty)"
-
-
-def write_table(out, name, table, caption):
-    """Write {name}.csv (all digits), .md and .tex (longtable, as people read them)."""
-    table.to_csv(out / f"{name}.csv", index=False, float_format="%.10g", lineterminator="\n")
-    text = shown(name, table)
-    markdown = tabulate(text.values, text.columns, tablefmt="pipe", disable_numparse=True)
-    (out / f"{name}.md").write_text(f"{caption}\n\n{markdown}\n")
-    latex = tabulate(text.values, text.columns, tablefmt="latex_longtable", disable_numparse=True)
-    escaped = re.sub(r"([%&_#])", r"\\\1", caption).replace("|", r"\textbar{}").replace("\n", " ")
-    latex = latex.replace("\n", f"\n\\caption{{{escaped}}}\\\\\n", 1)
-    for sign, command in (("\u00b1", r"$\pm$"), ("\u2013", "--"), (" < ", " $<$ ")):
-        latex = latex.replace(sign, command)
-    (out / f"{name}.tex").write_text(latex + "\n")
-
-
-# ------------------------------------------------------------------------------------------ figures
-
-
 def figures(studies, tables):
     """Yield (name, figure, caption) for every figure, in the order of the report."""
-    statistics = tables["statistics"][0]
+    statistics = tables["statistics"].frame
     for study in studies:
         tested = statistics[(statistics["algorithm"] == study.algorithm) & statistics["p"].notna()]
-        summary = tables[f"summary_{study.base}"][0]
+        summary = tables[f"summary_{study.base}"].frame
         summary = summary[summary["algorithm"] == study.algorithm]
         if tested["improvement_iqm_percent"].notna().any():
             yield interval_figure(study, tested)
@@ -150,7 +37,7 @@ def figures(studies, tables):
             if len(variants) > 1:
                 yield ablation_figure(study, summary, variants)
     if "robustness" in tables:
-        yield from robustness_figures(tables["robustness"][0])
+        yield from robustness_figures(tables["robustness"].frame)
 
 
 def span(numbers):
@@ -426,67 +313,3 @@ def write_figure(out, name, fig):
     fig.savefig(out / f"{name}.svg", metadata={"Date": None})
     fig.set_layout_engine("none")  # the layout is done
     fig.savefig(out / f"{name}.pdf", metadata={"CreationDate": None})
-
-
-# ------------------------------------------------------------------------------------------- report
-
-SECTIONS = {
-    "choice": "Choice of a noise",
-    "best": "Best noise tried (may be worse than none)",
-    "consistent": "Consistent noise",
-    "consistently_worse": "Consistently worse",
-    "luck": "Luck",
-    "statistics": "Statistics",
-    "early_performance": "Learning curves",
-    "ablation": "Parameters",
-    "interactions": "Two noises together",
-    "robustness": "Robustness",
-    "summary": "All results",
-    "missing": "Runs left out",
-}
-FIGURES_OF = {"intervals": "best", "heatmap": "consistent", "curves": "early_performance"}
-
-
-def breakable(text):
-    """Mark where a browser may break a cell: a noise between its words, but never a number."""
-    if re.match("-?[0-9]", text):
-        text = text.replace(" \u00b1 ", "\u00a0\u00b1\u00a0").replace(", ", ",\u00a0")
-        parts = [Markup('<span class="number">{}</span>').format(part) for part in text.split(" ")]
-        return Markup(" ").join(parts)
-    return Markup(re.sub("(?<=[a-z0-9])(?=[A-Z(])", "<wbr>", str(escape(text))))
-
-
-def write_report(out, verdicts, tables, drawn, overview, problems, notes):
-    """Write report.html: one self-contained page with all verdicts, tables and figures."""
-    sections = {key: {"id": key, "title": title} for key, title in SECTIONS.items()}
-    for section in sections.values():
-        section |= {"tables": [], "figures": []}
-    for name, (table, caption) in tables.items():
-        text = shown(name, table)
-        key = name.removeprefix("compare_").removesuffix("_score")
-        entry = {
-            "name": name,
-            "caption": caption,
-            "columns": text.columns,
-            "rows": text.values.tolist(),
-        }
-        sections["summary" if key.startswith("summary") else key]["tables"].append(entry)
-    for name, caption in drawn:
-        kind = name.split("_")[0]
-        svg = base64.b64encode((out / f"{name}.svg").read_bytes()).decode()
-        entry = {"svg": svg, "caption": caption}
-        sections[FIGURES_OF.get(kind, kind)]["figures"].append(entry)
-    here = jinja2.FileSystemLoader(Path(__file__).parent)
-    pages = jinja2.Environment(loader=here, autoescape=True, trim_blocks=True)
-    full = [s for s in sections.values() if s["tables"] or s["figures"]]
-    pages.filters["breakable"] = breakable
-    page = pages.get_template("report.html.jinja")
-    groups = verdicts.groupby(["algorithm", "environment"], sort=False)
-    verdicts = []
-    for _, group in groups:
-        lines = group[["verdict", "sentence"]].to_dict("records")
-        verdicts.append({"lines": lines, "tally": tally(group["verdict"])})
-    html = page.render(
-        verdicts=verdicts, sections=full, overview=overview, problems=problems, notes=notes
-    )
-    (out / "report.html").write_text(html)

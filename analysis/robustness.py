@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from analysis.formatting import P_VALUE, WHOLE, Table
 from analysis.runs import BASELINE, KEYS, order, rate_text
 from analysis.statistics import contrast, holm, improvement_percent, mann_whitney, mean_std
 from analysis.verdicts import DETECTABLE, LEVEL, p_value
@@ -32,6 +33,8 @@ SCORE_COLUMNS += ["difference", "difference_low", "difference_high", "p", "p_hol
 SCORE_COLUMNS += ["smallest_p", "detectable"]
 SCORE_COLUMNS += ["clean_change_percent", "cvar_score", "baseline_cvar_score"]
 SCORE_COLUMNS += ["worst_score", "baseline_worst_score", "worst_condition"]
+FORMATS = dict.fromkeys(("n", "n_baseline", "conditions"), WHOLE)
+FORMATS |= dict.fromkeys(("p", "p_holm", "smallest_p"), P_VALUE)
 
 CAPTIONS = {
     "robustness_score": """Primary figure of robustness: the score on noise that was not in
@@ -268,7 +271,7 @@ def primary(scores):
 
 
 def robustness_tables(runs):
-    """Compute the tables of robustness from read_robustness's frame: name -> (frame, caption)."""
+    """Compute the tables of robustness from read_robustness's frame: name -> Table."""
     if runs.empty:
         return {}
     table = pd.DataFrame(condition_rows(runs), columns=COLUMNS)
@@ -276,10 +279,11 @@ def robustness_tables(runs):
     for _, family in scores[primary(scores)].groupby("algorithm"):
         scores.loc[family.index, "p_holm"] = holm(family["p"].to_numpy(float))
     caption = "\n".join([CAPTIONS["robustness_score"], *robustness_sentences(scores)])
-    return {
-        "robustness_score": (scores, caption),
-        "robustness": (table, CAPTIONS["robustness"]),
-    }
+    tables = [
+        Table("robustness_score", scores, caption, "robustness", FORMATS, ("smallest_p",)),
+        Table("robustness", table, CAPTIONS["robustness"], "robustness", FORMATS),
+    ]
+    return {table.name: table for table in tables}
 
 
 def robustness_sentences(scores):

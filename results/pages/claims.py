@@ -27,8 +27,8 @@ from analysis.luck import (  # noqa: E402
 from analysis.paper import PAPER_CONFIGURATIONS, PAPER_SEEDS, read_paper, with_luck  # noqa: E402
 from analysis.runs import KEYS, make_studies, read_runs  # noqa: E402
 from analysis.statistics import contrast, holm, improvement_percent, mann_whitney, wins  # noqa: E402
+from analysis.tables import make_tables  # noqa: E402
 from analysis.verdicts import power as finds  # noqa: E402
-from analyze import make_tables  # noqa: E402
 
 FIXED_SEEDS = range(1, 11)
 FRESH_SEEDS = range(11, 31)
@@ -882,7 +882,9 @@ def numbers():
 
     runs = read_runs(DATA / "runs")
     tables = make_tables(make_studies(runs)[0], read_paper(RESULTS / "paper"))
-    statistics, early = (plain(tables[n][0]) for n in ("statistics", "compare_early_performance"))
+    statistics, early = (
+        plain(tables[n].frame) for n in ("statistics", "compare_early_performance")
+    )
 
     returns = read_returns(DATA / "runs")
     ppo = returns.query("algorithm == 'PPO'")
@@ -892,7 +894,7 @@ def numbers():
     five_runs = runs[runs["algorithm"] == "PPO"]
     five_runs = five_runs.loc[fixed_beforehand(plain(five_runs), chosen).index]
     five = make_tables(make_studies(five_runs)[0])
-    five_statistics, five_summary = (plain(five[n][0]) for n in ("statistics", "summary_PPO"))
+    five_statistics, five_summary = (plain(five[n].frame) for n in ("statistics", "summary_PPO"))
     five_statistics = five_statistics[five_statistics["p"].notna()]
     shares = variance_share(base), variance_share(noisy)
     counts = returns.groupby("algorithm").size()

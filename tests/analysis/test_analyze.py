@@ -23,8 +23,10 @@ import pytest
 from scipy import stats
 
 import analysis.figures
+import analysis.formatting
 import analysis.runs
 import analysis.statistics
+import analysis.tables
 import analyze
 
 RESULTS = Path(analyze.__file__).parent / "results"
@@ -142,7 +144,7 @@ def committed(tmp_path_factory):
 
 def test_summary_by_hand(sweep):
     table = sweep.tables["summary_SAC"]
-    assert list(table.columns) == analyze.COLUMNS["summary"].split()
+    assert list(table.columns) == analysis.tables.COLUMNS["summary"].split()
     assert len(table) == len(FINALS)
     base = row(table, environment="Hopper-v5", noise="")
     assert (base["algorithm"], base["noise_rate"], base["n"], base["mean"]) == (
@@ -180,7 +182,7 @@ def test_the_baseline_reaches_its_own_final_mean():
 
 def test_best_by_hand(sweep):
     table = sweep.tables["best"]
-    assert list(table.columns) == analyze.COLUMNS["best"].split()
+    assert list(table.columns) == analysis.tables.COLUMNS["best"].split()
     assert len(table) == 2
     pusher = row(table, environment="Pusher-v5")
     assert (pusher["noise"], pusher["noise_rate"]) == (SCALE, "0.05")
@@ -227,8 +229,8 @@ def test_consistent_is_80_percent_or_more_best_first():
     rows = [dict(zip(names, (noise, *v), strict=True)) for noise, v in shares.items()]
     rows = [{"algorithm": "SAC", "environments": 5} | row for row in rows]
     rows.append(rows[2] | {"noise": "in one environment only", "environments": 1})
-    table = analyze.frame("consistency", rows)
-    good, bad = analyze.split_consistency(table)
+    table = analysis.tables.frame("consistency", rows)
+    good, bad = analysis.tables.split_consistency(table)
     assert list(good["noise"]) == ["c", "e", "a"] and list(bad["noise"]) == ["f"]
 
 
@@ -247,7 +249,7 @@ def test_fails_at_every_rate_needs_every_rate(tmp_path):
 
 def test_early_performance_by_hand(sweep):
     table = sweep.tables["early_performance"]
-    assert list(table.columns) == analyze.COLUMNS["early_performance"].split()
+    assert list(table.columns) == analysis.tables.COLUMNS["early_performance"].split()
     assert set(table["steps_millions"]) == {0.01, 0.02, 0.03, 0.04, 0.05}  # fifths of a short run
     where = {"environment": "Pusher-v5", "noise": SCALE, "steps_millions": 0.03}
     assert set(table[(table[list(where)] == pd.Series(where)).all(axis=1)]["noise_rate"]) == {
@@ -281,7 +283,7 @@ def test_early_performance_needs_a_run_with_noise(tmp_path):
 
 def test_statistics_by_hand(sweep):
     table = sweep.tables["statistics"]
-    assert list(table.columns) == analyze.COLUMNS["statistics"].split()
+    assert list(table.columns) == analysis.tables.COLUMNS["statistics"].split()
     base = row(table, environment="Hopper-v5", noise="")
     assert (base["n"], base["iqm"]) == (4, 115) and np.isnan(base["p"])  # IQM: mean of 110 and 120
     even = row(table, environment="Hopper-v5", noise=SCALE, noise_rate="0.20")
@@ -352,10 +354,10 @@ def test_papers_sign_convention_and_data():
     assert len(best) == 15 and {"noise", "noise_as_run"} <= set(best)
     for name, ours in (("consistent", "consistency"), ("consistently_worse", "consistency")):
         columns = set(pd.read_csv(paper / f"{name}.csv")) - {"noise_as_run"}
-        assert columns <= set(analyze.COLUMNS[ours].split())
+        assert columns <= set(analysis.tables.COLUMNS[ours].split())
     columns = set(pd.read_csv(paper / "early_performance_sac.csv")) - {"noise_as_run"}
-    assert columns <= set(analyze.COLUMNS["early_performance"].split())
-    assert set(best) - {"noise_as_run"} <= set(analyze.COLUMNS["best"].split())
+    assert columns <= set(analysis.tables.COLUMNS["early_performance"].split())
+    assert set(best) - {"noise_as_run"} <= set(analysis.tables.COLUMNS["best"].split())
 
 
 # ------------------------------------------------------------------------------------- statistics
@@ -434,9 +436,9 @@ def test_mann_whitney_over_environments_by_enumeration():
 
 
 def test_benjamini_hochberg_by_hand_and_its_limit():
-    table = analyze.frame("statistics", [{"p": p} for p in (0.01, 0.04, 0.03, 0.2, NAN)])
+    table = analysis.tables.frame("statistics", [{"p": p} for p in (0.01, 0.04, 0.03, 0.2, NAN)])
     table[["algorithm", "environment", "smallest_p"]] = "SAC", "Hopper-v5", 0.01
-    table = analyze.adjust(table)
+    table = analysis.tables.adjust(table)
     expected = [0.04, 0.04 * 4 / 3, 0.04 * 4 / 3, 0.2]
     np.testing.assert_allclose(table["p_adjusted"][:4].astype(float), expected)
     assert np.isnan(table["p_adjusted"][4])
@@ -452,14 +454,16 @@ def test_five_against_five_cannot_reach_significance_alone_among_90(tmp_path):
     study = analysis.runs.Study(
         "SAC", "SAC", "", ["Hopper-v5"], [1, 2, 3, 4, 5], np.array([1]), returns
     )
-    table = analyze.adjust(analyze.frame("statistics", analyze.statistics_rows(study)))
+    table = analysis.tables.adjust(
+        analysis.tables.frame("statistics", analysis.tables.statistics_rows(study))
+    )
     assert table["p"].iloc[1] == pytest.approx(2 / 252)
     assert table["smallest_p_adjusted"].iloc[1] == pytest.approx(90 * 2 / 252)
-    (note,) = analyze.family_notes(table)
+    (note,) = analysis.tables.family_notes(table)
     assert "with 5 seeds and 90 comparisons" in note and "0.0079" in note
     assert "only if at least 15 of them are" in note  # 90 * 0.0079 / 0.05 = 14.3
     assert "for one alone 0.71" in note
-    _, caption = analyze.make_tables([study])["statistics"]
+    caption = analysis.tables.make_tables([study])["statistics"].caption
     assert note in caption and f"{analysis.statistics.COVERAGE[5]} % (n = 5)" in caption
 
 
@@ -818,7 +822,7 @@ def test_without_a_common_configuration_each_environment_has_its_interval(tmp_pa
             write_run(tmp_path, [seed], env=env, seed=seed)
             write_run(tmp_path, [seed + 1], env=env, seed=seed, noise=noise, rate=0.1)
     studies, _ = analysis.runs.make_studies(analysis.runs.read_runs(tmp_path))
-    drawn = list(analysis.figures.figures(studies, analyze.make_tables(studies)))
+    drawn = list(analysis.figures.figures(studies, analysis.tables.make_tables(studies)))
     captions = {name: (figure, caption) for name, figure, caption in drawn}
     figure, caption = captions["intervals_SAC"]
     labels = [text.get_text() for text in figure.axes[0].get_yticklabels()]
@@ -842,7 +846,7 @@ def test_odd_sweeps_are_analysed_too(tmp_path):
 
 def test_figures_have_labels_units_and_n(sweep):
     studies, _ = analysis.runs.make_studies(analysis.runs.read_runs(sweep.path / "runs"))
-    tables = analyze.make_tables(studies)
+    tables = analysis.tables.make_tables(studies)
     drawn = {name: figure for name, figure, _ in analysis.figures.figures(studies, tables)}
     assert set(drawn) == {
         "intervals_SAC",
@@ -887,7 +891,9 @@ def test_ablation_bars_stand_side_by_side(tmp_path):
         write_run(tmp_path, [30 * seed], seed=seed, noise=other, rate=0.05)
         write_run(tmp_path, [40 * seed], seed=seed, noise=other, rate=0.5)
     studies, _ = analysis.runs.make_studies(analysis.runs.read_runs(tmp_path))
-    drawn = {n: f for n, f, _ in analysis.figures.figures(studies, analyze.make_tables(studies))}
+    drawn = {
+        n: f for n, f, _ in analysis.figures.figures(studies, analysis.tables.make_tables(studies))
+    }
     figure = drawn["ablation_SAC_RandomUniformScaleReward"]
     (ax,) = figure.axes
     heights = [bar.get_height() for bar in ax.patches]
@@ -1010,7 +1016,7 @@ def test_heatmap_colours_fit_the_data(tmp_path):
     for factor, limit in ((1, 12), (100, 100)):  # 12 / 102 = 11.8 %; at most 100 %
         studies, _ = analysis.runs.make_studies(analysis.runs.read_runs(tmp_path))
         studies[0].returns[SCALE, "0.10"] += 12 * (factor - 1)
-        tables = analyze.make_tables(studies)
+        tables = analysis.tables.make_tables(studies)
         drawn = {name: figure for name, figure, _ in analysis.figures.figures(studies, tables)}
         image = drawn["heatmap_SAC"].axes[0].images[0]
         assert image.get_clim() == (-limit, limit)

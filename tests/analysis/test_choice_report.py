@@ -9,8 +9,9 @@ from scipy import stats
 from test_analyze import ENDING, SCALE, row, run, write_run
 
 import analysis.figures
+import analysis.formatting
 import analysis.runs
-import analyze
+import analysis.tables
 import evaluate
 
 PUSH = "RandomNormalNoisyAction(0.3)"
@@ -134,11 +135,11 @@ def test_rates_that_change_are_read_sorted_and_shown(tmp_path):
     combined = row(tables["summary_SAC"], noise=f"{SCALE} + {PUSH}")
     assert combined["noise_rate"] == "1.00 to 0.00 + 0.50"
     studies, _ = analysis.runs.make_studies(analysis.runs.read_runs(tmp_path / "runs"))
-    figures = analysis.figures.figures(studies, analyze.make_tables(studies))
+    figures = analysis.figures.figures(studies, analysis.tables.make_tables(studies))
     drawn = {name: figure for name, figure, _ in figures}
     ticks = [text.get_text() for text in drawn["heatmap_SAC"].axes[0].get_xticklabels()]
     assert ticks == ["0.00 to 1.00", "0.05", "1.00 to 0.00", "1.00 to 0.00 +\n0.50", "1.00"]
-    legend = drawn[f"curves_SAC_{analysis.figures.slug(PUSH)}"].legends[0].get_texts()
+    legend = drawn[f"curves_SAC_{analysis.formatting.slug(PUSH)}"].legends[0].get_texts()
     named = [text.get_text().partition(" (")[0] for text in legend]
     assert named == ["no noise", *(f"rate {rate}" for rate in rates)]
 

@@ -11,6 +11,7 @@ from test_analyze import FINALS, SCALE, row, run, small_sweep
 import analysis.luck
 import analysis.paper
 import analysis.runs
+import analysis.tables
 import analyze
 
 NAN = float("nan")
@@ -20,7 +21,7 @@ MANY = 10**9  # seeds or degrees of freedom: no uncertainty
 
 def make_study(baseline, noisy):
     """Make a Study of final returns: baseline (seeds x envs), noisy (configs x seeds x envs)."""
-    returns = {analyze.BASELINE: baseline[None]}
+    returns = {analysis.tables.BASELINE: baseline[None]}
     returns |= {(f"N({i})", "1.00"): values[None] for i, values in enumerate(noisy)}
     environments = [f"Env{e}-v0" for e in range(baseline.shape[1])]
     seeds = list(range(len(baseline)))

@@ -11,9 +11,11 @@ from scipy import stats
 from test_analyze import row, run, write_run
 
 import analysis.figures
+import analysis.formatting
 import analysis.robustness
 import analysis.runs
 import analysis.statistics
+import analysis.tables
 
 SENSOR = "RandomNormalNoisyObservation(0.1)"
 PUSH = "RandomNormalNoisyAction(0.3)"
@@ -231,10 +233,10 @@ def test_heatmap_and_curves(tmp_path):
     runs = analysis.runs.read_runs(tmp_path)
     found, notes = analysis.robustness.read_robustness(tmp_path, runs)
     tables = analysis.robustness.robustness_tables(found)
-    drawn = analysis.figures.robustness_figures(tables["robustness"][0])
+    drawn = analysis.figures.robustness_figures(tables["robustness"].frame)
     drawn = {name: (figure, caption) for name, figure, caption in drawn}
     heatmap = "robustness_heatmap_PPO_Hopper-v5"
-    curves = f"robustness_curves_PPO_{analysis.figures.slug(SENSOR)}"
+    curves = f"robustness_curves_PPO_{analysis.formatting.slug(SENSOR)}"
     assert notes == [] and set(drawn) == {heatmap, curves}
 
     ax = drawn[heatmap][0].axes[0]
@@ -265,5 +267,5 @@ def test_robustness_of_runs_with_other_settings_is_apart(tmp_path):
         config["args"]["gamma"] = 0.5
         path.write_text(json.dumps(config))
     found, _ = analysis.robustness.read_robustness(tmp_path, analysis.runs.read_runs(tmp_path))
-    scores, _ = analysis.robustness.robustness_tables(found)["robustness_score"]
+    scores = analysis.robustness.robustness_tables(found)["robustness_score"].frame
     assert scores.empty and set(found["algorithm"]) == {"PPO [gamma=0.99]", "PPO [gamma=0.5]"}

@@ -6,6 +6,7 @@ import pytest
 from scipy import stats
 
 import analysis.runs
+import analysis.tables
 import analysis.verdicts
 import analyze
 
@@ -29,7 +30,9 @@ def study(baseline, noisy):
 def judge(baseline, noisy):
     """The statistics table and the sentences of such a study."""
     one = study(baseline, noisy)
-    table = analyze.adjust(analyze.frame("statistics", analyze.statistics_rows(one)))
+    table = analysis.tables.adjust(
+        analysis.tables.frame("statistics", analysis.tables.statistics_rows(one))
+    )
     return table[table["p"].notna()], analysis.verdicts.sentences([one], table)
 
 

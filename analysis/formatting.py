@@ -1,0 +1,115 @@
+"""How results look as text: numbers, and tables in a terminal, in Markdown and in LaTeX."""
+
+import re
+import zlib
+from dataclasses import dataclass, field
+
+import pandas as pd
+from tabulate import tabulate
+
+from analysis.runs import rate_order
+
+# Formats of numbers. z: no "-0"
+TENTH, WHOLE, PLAIN, SHARE, P_VALUE = "z,.1f", "z,.0f", "g", ".2f", ".2g"
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of results, as analyze.py prints and writes it."""
+
+    name: str  # of its files
+    frame: pd.DataFrame
+    caption: str
+    section: str  # of the report: a key of report.SECTIONS
+    formats: dict = field(default_factory=dict)  # column -> format of its numbers; others TENTH
+    only_csv: tuple = ()  # columns that would make the table wider than a page
+
+
+def slug(text):
+    """Turn a label or a noise into a part of a file name; a long one is cut and keeps a hash."""
+    name = re.sub(r"[^A-Za-z0-9._=+-]+", "_", text).strip("_")
+    return name if len(name) <= 150 else f"{name[:140]}_{zlib.crc32(name.encode()):08x}"
+
+
+# Columns that are shown as one: "mean ± std", "estimate [low, high]" or "ours (the baseline's)".
+MERGED = {
+    "baseline": ("baseline_mean", "baseline_std"),
+    "noisy": ("noisy_mean", "noisy_std"),
+    "mean": ("mean", "std"),
+    "average improvement %": ("average_improvement_percent", "std_improvement_percent"),
+    "IQM": ("iqm", "iqm_low", "iqm_high"),
+    "improvement (IQM) %": ("improvement_iqm_percent", "improvement_low", "improvement_high"),
+    "interaction": ("interaction", "interaction_low", "interaction_high"),
+    "interaction %": ("interaction_percent", "percent_low", "percent_high"),
+    "difference": ("difference", "difference_low", "difference_high"),
+    "P(improvement)": ("probability_of_improvement", "probability_low", "probability_high"),
+}
+for _name in ("score", "worst_score", "cvar_score"):
+    MERGED[f"{_name} (baseline)"] = (_name, f"baseline_{_name}")
+for _name in ("mean", "average improvement %"):
+    MERGED[f"paper: {_name}"] = tuple(f"paper_{column}" for column in MERGED[_name])
+
+
+def spelled(name, value, form):
+    """Spell one value of the column `name`; a value that does not exist is a dash."""
+    if pd.isna(value):
+        return "\u2013"
+    if isinstance(value, str):
+        return value or ("baseline" if name == "noise" else "\u2013")
+    return f"{value:{form}}"
+
+
+def merged(title, parts, table, text):
+    """Return one column of text for the columns `parts`; a value that does not exist is a dash."""
+    columns = [text[name] for name in parts]
+    if len(parts) == 3:
+        interval = columns[0] + " [" + columns[1] + ", " + columns[2] + "]"
+        result = interval.where(table[parts[1]].notna(), columns[0])
+    elif title.endswith("(baseline)"):
+        result = columns[0] + " (" + columns[1] + ")"
+    else:
+        result = columns[0] + " \u00b1 " + columns[1]
+    return result.where(table[parts[0]].notna(), "\u2013")
+
+
+def shown(table):
+    """Return a frame as a person reads it: all text, related columns in one, rates side by side."""
+    frame = table.frame.reset_index(drop=True).drop(columns=list(table.only_csv))
+    cells = {
+        name: [spelled(name, value, table.formats.get(name, TENTH)) for value in frame[name]]
+        for name in frame
+    }
+    text = pd.DataFrame(cells, dtype=object)
+    for title, parts in MERGED.items():
+        if parts[-1] in text:
+            text[parts[0]] = merged(title, parts, frame, text)
+            text = text.drop(columns=list(parts[1:])).rename(columns={parts[0]: title})
+    if table.name == "early_performance" and len(text):
+        text["mean"] += " (" + text.pop("n") + ")"
+        keys = ["algorithm", "environment", "noise", "steps_millions"]
+        text = text.pivot(index=keys, columns="noise_rate", values="mean").fillna("\u2013")
+        text = text[sorted(text.columns, key=rate_order)].reset_index()
+    return text.rename(columns=lambda column: column.replace("_", " ").replace("percent", "%"))
+
+
+def text_table(table):
+    """Format a table for the terminal."""
+    text = shown(table)
+    return tabulate(text.values, text.columns, disable_numparse=True) if len(text) else "(empty)"
+
+
+def write_table(out, table):
+    """Write {name}.csv (all digits), .md and .tex (longtable, as people read them)."""
+    table.frame.to_csv(
+        out / f"{table.name}.csv", index=False, float_format="%.10g", lineterminator="\n"
+    )
+    text = shown(table)
+    markdown = tabulate(text.values, text.columns, tablefmt="pipe", disable_numparse=True)
+    (out / f"{table.name}.md").write_text(f"{table.caption}\n\n{markdown}\n")
+    latex = tabulate(text.values, text.columns, tablefmt="latex_longtable", disable_numparse=True)
+    escaped = re.sub(r"([%&_#])", r"\\\1", table.caption)
+    escaped = escaped.replace("|", r"\textbar{}").replace("\n", " ")
+    latex = latex.replace("\n", f"\n\\caption{{{escaped}}}\\\\\n", 1)
+    for sign, command in (("\u00b1", r"$\pm$"), ("\u2013", "--"), (" < ", " $<$ ")):
+        latex = latex.replace(sign, command)
+    (out / f"{table.name}.tex").write_text(latex + "\n")

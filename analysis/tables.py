@@ -1,0 +1,471 @@
+"""The tables of analyze.py: their rows, their captions, and in which order they come."""
+
+from itertools import product
+from math import ceil
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from analysis.formatting import P_VALUE, PLAIN, SHARE, WHOLE, Table
+from analysis.luck import (
+    CONSISTENT_PERCENT,
+    DRAWS,
+    LUCKY,
+    SEEDS_TO_RESAMPLE,
+    add_luck_of_best,
+    add_luck_of_consistent,
+    luck_of_study,
+    luck_rows,
+)
+from analysis.paper import PAPER_CONFIGURATIONS, compare_tables
+from analysis.runs import BASELINE, KEYS
+from analysis.statistics import (
+    COVERAGE,
+    COVERAGE_OF_MIXTURES,
+    MIN_SEEDS,
+    bootstrap_iqm,
+    contrast,
+    holm,
+    improvement_percent,
+    leave_one_seed_out,
+    mann_whitney,
+    mean_std,
+    probability_of_improvement,
+    steps_to_reach,
+)
+from analysis.verdicts import power, verdict
+
+COLUMNS = {
+    "summary": """algorithm environment noise noise_rate n mean std n_baseline baseline_mean
+        baseline_std improvement_percent p std_change_percent steps_to_baseline""",
+    "best": """algorithm environment noise noise_rate baseline_mean baseline_std noisy_mean
+        noisy_std improvement_percent p p_adjusted luck_median_percent luck_95_percent p_luck
+        leave_one_seed_out_percent n n_baseline chosen_from leave_one_seed_out_mean""",
+    "consistency": """algorithm noise noise_rate percent_of_environments
+        average_improvement_percent std_improvement_percent p p_adjusted p_luck environments n
+        fails_at_every_rate""",
+    "luck": """algorithm environments best_beyond_luck configurations
+        consistent consistent_by_luck consistent_by_luck_95 p_consistent consistent_beyond_luck
+        consistently_worse consistently_worse_by_luck consistently_worse_by_luck_95
+        p_consistently_worse consistently_worse_beyond_luck""",
+    "interactions": """algorithm environment noise noise_rate n both_mean first_mean second_mean
+        baseline_mean interaction interaction_low interaction_high standard_error
+        interaction_percent percent_low percent_high""",
+    "early_performance": "algorithm environment noise steps_millions noise_rate mean std n",
+    "statistics": """algorithm environment noise noise_rate verdict improvement_iqm_percent
+        improvement_low improvement_high p p_adjusted comparisons probability_of_improvement
+        probability_low probability_high environments n n_baseline iqm iqm_low iqm_high
+        detectable_percent seeds_needed smallest_p smallest_p_adjusted""",
+}
+
+
+_COLUMNS_WITH = {
+    WHOLE: """n n_baseline environments chosen_from configurations seeds seeds_needed
+        steps_to_baseline percent_of_environments best_beyond_luck consistent
+        consistent_beyond_luck consistently_worse consistently_worse_beyond_luck""",
+    P_VALUE: """p p_adjusted smallest_p smallest_p_adjusted p_luck paper_p_luck p_consistent
+        p_consistently_worse""",
+    SHARE: "probability_of_improvement probability_low probability_high",
+    PLAIN: "steps_millions",
+}
+FORMATS = {name: form for form, names in _COLUMNS_WITH.items() for name in names.split()}
+LUCK_ONLY_CSV = ("consistent_by_luck_95", "consistently_worse_by_luck_95")
+
+
+def frame(name, rows):
+    """Make a table of a list of dicts, with the columns of its kind even when it is empty."""
+    return pd.DataFrame(list(rows), columns=COLUMNS[name].split())
+
+
+def row_keys(algorithm, environment, config):
+    """Return the columns that say what a row is about."""
+    noise, rate = config
+    return {"algorithm": algorithm, "environment": environment, "noise": noise, "noise_rate": rate}
+
+
+def summary_rows(study):
+    """Yield the final mean and std of every configuration, against the baseline of its env."""
+    for (e, env), config in product(enumerate(study.environments), study.returns):
+        mean, std, n = mean_std(study.final(config)[:, e])
+        if n == 0:
+            continue
+        base_mean, base_std, base_n = mean_std(study.final(BASELINE)[:, e])
+        row = {
+            **row_keys(study.algorithm, env, config),
+            "n": n,
+            "mean": mean,
+            "std": std,
+            "n_baseline": base_n,
+            "baseline_mean": base_mean,
+            "baseline_std": base_std,
+        }
+        if config != BASELINE:
+            row["improvement_percent"] = improvement_percent(mean, base_mean)
+            row["std_change_percent"] = improvement_percent(std, base_std)
+        curves = study.returns[config][..., e]
+        row["steps_to_baseline"] = steps_to_reach(curves, study.steps, base_mean)
+        yield row
+
+
+def best_rows(study, summary):
+    """Yield the best noise per environment, with the leave-one-seed-out value of choosing it."""
+    noisy = summary[summary["improvement_percent"].notna()]
+    for env, group in noisy[noisy["algorithm"] == study.algorithm].groupby("environment"):
+        best = group.loc[group["mean"].idxmax()]
+        e = study.environments.index(env)
+        finals = np.stack([study.final(c)[:, e] for c in study.returns if c != BASELINE])
+        held_out = leave_one_seed_out(finals)
+        yield best.to_dict() | {
+            "noisy_mean": best["mean"],
+            "noisy_std": best["std"],
+            "chosen_from": len(group),
+            "leave_one_seed_out_mean": held_out,
+            "leave_one_seed_out_percent": improvement_percent(held_out, best["baseline_mean"]),
+        }
+
+
+def consistency_rows(summary):
+    """Yield per noise and rate the share of envs that are matched or better, and by how much."""
+    keys = ["algorithm", "noise", "noise_rate"]
+    for key, group in summary[summary["improvement_percent"].notna()].groupby(keys):
+        mean, std, count = mean_std(group["improvement_percent"])
+        yield dict(zip(keys, key, strict=True)) | {
+            "percent_of_environments": 100 * (group["improvement_percent"] >= 0).mean(),
+            "average_improvement_percent": mean,
+            "std_improvement_percent": std,
+            "environments": count,
+            "n": group["n"].min(),
+        }
+
+
+def split_consistency(consistency):
+    """Return the rows with at least 80 % of the environments, best first, and those with 0 %.
+
+    One environment says nothing about consistency.
+    """
+    consistency = consistency[consistency["environments"] > 1]
+    share = consistency["percent_of_environments"]
+    by = ["algorithm", "percent_of_environments", "average_improvement_percent"]
+    good = consistency[share >= CONSISTENT_PERCENT].drop(columns="fails_at_every_rate")
+    good = good.sort_values(by, ascending=[True, False, False], kind="stable")
+    highest = share.groupby([consistency["algorithm"], consistency["noise"]]).transform("max")
+    bad = consistency.assign(fails_at_every_rate=np.where(highest == 0, "yes", "no"))[share == 0]
+    return good, bad
+
+
+def early_rows(study):
+    """Yield mean and std at every 0.2 M steps, or at every fifth of a run below 1 M steps."""
+    total = study.steps[-1]
+    stride = 200_000 if total >= 1_000_000 else total / 5
+    wanted = np.arange(1, round(total / stride) + 1) * stride
+    places = np.unique(np.searchsorted(study.steps, wanted, side="right") - 1)
+    places = places[places >= 0]
+    noises = sorted({noise for noise, _ in study.returns if noise})
+    for (e, env), noise in product(enumerate(study.environments), noises):
+        configs = [config for config in study.returns if config[0] == noise]
+        if not any(np.isfinite(study.final(config)[:, e]).any() for config in configs):
+            continue  # not tried here: the baseline alone would be no comparison
+        for i, config in product(places, [BASELINE, *configs]):
+            mean, std, n = mean_std(study.returns[config][i, :, e])
+            if n > 0:
+                yield {
+                    **row_keys(study.algorithm, env, (noise, config[1])),
+                    "steps_millions": study.steps[i] / 1e6,
+                    "mean": mean,
+                    "std": std,
+                    "n": n,
+                }
+
+
+def statistics_rows(study):
+    """Yield IQM, improvement, probability of improvement and test, per env and over several."""
+    everywhere = list(range(len(study.environments)))
+    others = [e for e in everywhere if not study.environments[e].startswith("Pusher")]
+    scopes = {env: [e] for e, env in enumerate(study.environments)}
+    if study.phase != "confirmation":  # there each environment has its one comparison
+        scopes["all"] = everywhere
+        if others != everywhere:
+            scopes["all but Pusher"] = others
+    for (scope, chosen), config in product(scopes.items(), study.returns):
+        x, y = study.final(config)[:, chosen], study.final(BASELINE)[:, chosen]
+        here = np.isfinite(x).any(axis=0)
+        both = here & np.isfinite(y).any(axis=0)
+        row = row_keys(study.algorithm, scope, config)
+        if scope.startswith("all"):
+            if config == BASELINE or both.sum() < 2:
+                continue
+        elif not here.any():
+            continue
+        else:  # returns of different environments have no common scale
+            row["n"] = np.isfinite(x).sum()
+            row["iqm"], row["iqm_low"], row["iqm_high"] = bootstrap_iqm(x)
+        if config != BASELINE and both.any():
+            row |= against_baseline(x[:, both], y[:, both])
+        yield row
+
+
+def against_baseline(x, y):
+    """Return the part of a row of statistics that compares x with y, both (seeds x envs)."""
+    improvement, improvement_low, improvement_high = bootstrap_iqm(x, y)
+    probability, probability_low, probability_high = probability_of_improvement(x, y)
+    p, smallest_p = mann_whitney(x, y)
+    row = {
+        "environments": x.shape[1],
+        "n": np.isfinite(x).sum(axis=0).min(),
+        "n_baseline": np.isfinite(y).sum(axis=0).min(),
+        "improvement_iqm_percent": improvement,
+        "improvement_low": improvement_low,
+        "improvement_high": improvement_high,
+        "probability_of_improvement": probability,
+        "probability_low": probability_low,
+        "probability_high": probability_high,
+        "p": p,
+        "smallest_p": smallest_p,
+    }
+    if x.shape[1] == 1:
+        row["detectable_percent"], row["seeds_needed"] = power(x[:, 0], y[:, 0], improvement)
+    return row
+
+
+def adjust(statistics, confirmations=()):
+    """Add p corrected for all comparisons of a family, the smallest in reach, and verdicts.
+
+    A family is an algorithm in one environment, corrected with Benjamini and Hochberg's method. The
+    `confirmations` (algorithms) of `./benchmark.sh choose` were fixed beforehand: they are one
+    family, corrected with Holm's method.
+    """
+    tested = statistics[statistics["p"].notna()]
+    confirmed = tested["algorithm"].isin(confirmations)
+    families = [(tested[confirmed], holm)] if confirmed.any() else []
+    for _, family in tested[~confirmed].groupby(["algorithm", "environment"]):
+        families.append((family, stats.false_discovery_control))
+    for family, correct in families:
+        number = len(family)
+        statistics.loc[family.index, "p_adjusted"] = correct(family["p"].to_numpy(float))
+        alone = np.minimum(1, family["smallest_p"].astype(float) * number)
+        statistics.loc[family.index, "smallest_p_adjusted"] = alone
+        statistics.loc[family.index, "comparisons"] = number
+    statistics["verdict"] = [verdict(row) for _, row in statistics.iterrows()]
+    return statistics
+
+
+def interaction_rows(study):
+    """Yield, for two noises and both together: how much more do they change than their sum?
+
+    I = J(A + B) - J(A) - J(B) + J(0) of the mean final returns, in every environment where all
+    four have at least MIN_SEEDS seeds, with a 95 % interval; then relative to |J(0)|.
+    """
+    for (e, environment), config in product(enumerate(study.environments), study.returns):
+        parts = list(zip(config[0].split(" + "), config[1].split(" + "), strict=True))
+        if len(parts) != 2 or parts[0] == parts[1]:
+            continue
+        cells = []
+        for part in (config, *parts, BASELINE):
+            finals = study.final(part)[:, e] if part in study.returns else np.empty(0)
+            cells.append(finals[np.isfinite(finals)])
+        if min(map(len, cells)) < MIN_SEEDS:
+            continue
+        both, first, second, alone = cells
+        value, error, low, high = contrast(cells, [1, -1, -1, 1])
+        percent = 100 / abs(alone.mean()) if alone.mean() else np.nan
+        yield {
+            **row_keys(study.algorithm, environment, config),
+            "n": min(map(len, cells)),
+            "both_mean": both.mean(),
+            "first_mean": first.mean(),
+            "second_mean": second.mean(),
+            "baseline_mean": alone.mean(),
+            "interaction": value,
+            "interaction_low": low,
+            "interaction_high": high,
+            "standard_error": error,
+            "interaction_percent": value * percent,
+            "percent_low": low * percent,
+            "percent_high": high * percent,
+        }
+
+
+def with_p(table, statistics):
+    """Fill in the test of every row of a table that compares a noise with the baseline.
+
+    A table without environments has averages over all of them: it gets the test over all.
+    """
+    keys = KEYS
+    if "environment" not in table:
+        keys = [name for name in KEYS if name != "environment"]
+        statistics = statistics[statistics["environment"] == "all"]
+    tests = statistics.set_index(keys)[["p", "p_adjusted"]]
+    found = tests.reindex(pd.MultiIndex.from_frame(table[keys])).set_index(table.index)
+    for name in ("p", "p_adjusted"):
+        if name in table:
+            table[name] = found[name]
+    return table
+
+
+def family_notes(statistics):
+    """Say where the number of seeds is too small to show a difference, if corrected."""
+    notes = []
+    tested = statistics[statistics["p"].notna()]
+    keys = ["comparisons", "smallest_p"]
+    for algorithm, rows in tested.groupby("algorithm"):
+        best = rows.sort_values("smallest_p", kind="stable").drop_duplicates("environment")
+        best = best.sort_index()
+        for (size, smallest), same in best.groupby(keys, sort=False):
+            where = f"{algorithm}, {', '.join(same['environment'])}"
+            seeds = f"{min(same['n'].min(), same['n_baseline'].min()):.0f} seeds"
+            needed = ceil(round(size * smallest / 0.05, 9))
+            if smallest > 0.05:
+                notes.append(
+                    f"{where}: with {seeds} no difference can be significant (smallest possible p: "
+                    f"{smallest:.2g})."
+                )
+            elif needed > 1:
+                notes.append(
+                    f"{where}: with {seeds} and {size:.0f} comparisons, differences can be "
+                    f"significant after the correction only if at least {needed} of them are "
+                    f"(smallest possible p: {smallest:.2g}, corrected for one alone "
+                    f"{min(1, size * smallest):.2g})."
+                )
+    return notes
+
+
+CAPTIONS = {
+    "best": """Best noise tried for each algorithm and environment, which may be worse than none,
+against the baseline without noise: final test return, mean \u00b1 sample standard deviation over n
+seeds; p: exact Mann-Whitney test, then adjusted for all noises tried there. The best of many is
+chosen on the seeds that it is reported on, which flatters it. Luck: the improvement that the best
+of as many configurations would show if none did anything, its median and 95 % quantile; p luck is
+the probability that it is at least as high as the one observed. Leave one seed out values the
+procedure of choosing, not the noise that is named here: it chooses on all seeds but one, measures
+on that one and takes the mean over seeds. It is descriptive: its terms share seeds, so it has no
+interval.""",
+    "consistent": """Noise that matches or betters the baseline in at least 80 % of two or more
+environments: improvement over |baseline|, mean \u00b1 standard deviation over environments; p: the
+exact test over all of them, then adjusted for all configurations (Benjamini-Hochberg); p luck: the
+probability that the highest average of as many configurations is as high if none does anything; n
+is the smallest number of seeds in any environment.""",
+    "consistently_worse": """Noise that is worse than the baseline in each of two or more
+environments (0 %); columns as in the table of consistent noise, p luck with the lowest average.
+Worse at every rate that was tried:""",
+    "luck": f"""What luck alone would show. {DRAWS:,} sweeps are drawn in which no noise does
+anything: the baseline and all configurations anew, with their numbers of seeds, from a normal
+distribution with the pooled standard deviation within configurations (from {SEEDS_TO_RESAMPLE}
+seeds of the baseline on with the shape of their returns). By luck: the mean number of rows in the
+tables of consistent and consistently worse noise, and its 95 % quantile; p: the probability of at
+least as many rows as observed. Beyond luck: rows with a p luck of {LUCKY} or less. Configurations
+are those in two or more environments. Where returns have a long tail of high ones the best of many
+is higher by luck than a normal distribution says.""",
+    "early_performance": """Test return during training, by noise rate (0.00 is the baseline):
+mean \u00b1 sample standard deviation over (n) seeds.""",
+    "summary": """Final test return of every configuration: mean \u00b1 sample standard deviation
+over n seeds, improvement over |baseline| with the p of the exact Mann-Whitney test, not corrected,
+and change of the standard deviation. Steps to
+baseline: the first evaluation at which the mean over seeds reaches the baseline's final mean.""",
+    "statistics": f"""IQM: interquartile mean of the final returns over n seeds. Improvement: IQM
+of (return - baseline mean) / |baseline mean| over seeds and environments, minus that of the
+baseline's own returns. [ ]: 95 % intervals from a stratified bootstrap over seeds (Student's t
+times the bootstrap standard error, with Satterthwaite's degrees of freedom: few seeds of the
+baseline widen it as much as few with noise). In simulated samples of one
+environment they held the true IQM in at least
+{", ".join(f"{c} % (n = {n})" for n, c in COVERAGE.items())} of the cases where returns were
+normal, skewed or 20 % of them in a low peak, but in
+{", ".join(f"{c} % (n = {n})" for n, c in COVERAGE_OF_MIXTURES.items())} where 40 % were in a low
+and narrow peak. P(improvement):
+probability that a noisy run beats a baseline run, averaged over environments, with Newcombe's
+interval. No interval for n < {MIN_SEEDS}. p: exact two-sided Mann-Whitney test, stratified by
+environment. It is the primary test: where an interval says otherwise, p decides. In a full grid the
+rows of all environments together are primary: in one environment alone no configuration with five
+seeds can reach 0.05 on its own after the adjustment. p adjusted: Benjamini-Hochberg over one
+family, all configurations of an algorithm in one environment, or in all of them together; the
+verdict is better or worse where it is at most 0.05, and perhaps so where only p is. Smallest p
+adjusted: what one configuration alone could reach at most with its number of seeds. Detectable: the
+improvement that these seeds find at the 5 % level, uncorrected, with 80 % power; seeds needed: how
+many on each side the observed improvement takes. Both are for normal returns with the standard
+deviation of these seeds.""",
+    "interactions": """Two noises together: interaction = mean with both - mean with the first -
+mean with the second + mean without noise, of the final test returns, where each of the four has at
+least 3 seeds (n is the smallest number), with a 95 % interval (Welch, Satterthwaite), and in
+percent of |mean without noise|. Above zero, both together are better than their two effects added
+up. This is descriptive: nothing is corrected for the number of rows.""",
+    "choice": """How ./benchmark.sh choose came to its noise: rounds of the search, in which the
+better half survives (score: mean over the seeds of the last three tests), and the confirmation of
+the winner on fresh seeds (1001 and up; score: mean final test return; survives: whether it was
+shown to be better than no noise). Search and confirmation have rows of their own everywhere, and
+only the confirmation is judged: the search's seeds chose the noise, which flatters it.""",
+    "missing": """Runs that are in no table and no figure, with their seeds. Missing are the seeds
+that at least half of an algorithm's configurations with noise have, and baselines.""",
+    "compare_luck": f"""The same for the paper's tables: {PAPER_CONFIGURATIONS} configurations in
+each environment. Only means and standard deviations are printed there, so returns are taken as
+normal, with the standard deviation of each baseline, known from 5 seeds (PPO 10).""",
+    "compare": """The paper's table (environments v2, 1,000,000 steps) beside ours, with the
+difference in standard errors where the steps are the same; listed by: whose table has the row.
+Paper: luck: see the table of luck. Ours:""",
+}
+CAPTIONS = {name: " ".join(text.split()) for name, text in CAPTIONS.items()}
+
+
+def make_tables(studies, paper=None):
+    """Compute every table: a dict of name -> Table, in the order of the report.
+
+    `paper` has the paper's tables (read_paper), to be set beside ours.
+    """
+    summary = frame("summary", (row for study in studies for row in summary_rows(study)))
+    # The seeds of a search chose the noise, so they cannot judge it.
+    judging = [study for study in studies if study.phase != "search"]
+    judged = summary[summary["algorithm"].isin([study.algorithm for study in judging])]
+    best = frame("best", (row for study in judging for row in best_rows(study, judged)))
+    consistency = frame("consistency", consistency_rows(judged))
+    early = frame("early_performance", (row for study in studies for row in early_rows(study)))
+    statistics = frame("statistics", (row for study in judging for row in statistics_rows(study)))
+    confirmations = [study.algorithm for study in studies if study.phase == "confirmation"]
+    statistics = adjust(statistics, confirmations)
+    summary, judged, best, consistency = (
+        with_p(table, statistics) for table in (summary, judged, best, consistency)
+    )
+    good, bad = split_consistency(consistency)
+    lucks = {study.algorithm: luck_of_study(study) for study in judging}
+    best = add_luck_of_best(best, lucks)
+    good, bad = add_luck_of_consistent(good, bad, lucks)
+    luck = frame("luck", luck_rows(lucks, best, good, bad))
+    failing = bad[bad["fails_at_every_rate"] == "yes"][["algorithm", "noise"]].drop_duplicates()
+    failing = "; ".join(f"{noise} ({algorithm})" for algorithm, noise in failing.values) or "none"
+    limits = "\n".join(family_notes(statistics))
+    tables = [
+        table_of("best", best, only_csv=("leave_one_seed_out_mean",)),
+        table_of("consistent", good),
+        table_of("consistently_worse", bad, f"{CAPTIONS['consistently_worse']} {failing}."),
+        table_of("luck", luck, only_csv=LUCK_ONLY_CSV),
+        table_of(
+            "statistics",
+            statistics,
+            f"{CAPTIONS['statistics']}\n{limits}",
+            only_csv=("environments", "comparisons", "smallest_p", "smallest_p_adjusted"),
+        ),
+        table_of("early_performance", early),
+    ]
+    found = frame("interactions", (row for study in judging for row in interaction_rows(study)))
+    if len(found):
+        tables.append(table_of("interactions", found))
+    for base in sorted({study.base for study in studies}):
+        same = [study.algorithm for study in studies if study.base == base]
+        table = summary[summary["algorithm"].isin(same)]
+        tables.append(table_of(f"summary_{base}", table, CAPTIONS["summary"], "summary"))
+    if paper:
+        lengths = {study.algorithm: study.steps[-1] for study in studies}
+        caption = ", ".join(f"{algorithm} {steps:,} steps" for algorithm, steps in lengths.items())
+        caption = f"{CAPTIONS['compare']} {caption}."
+        listed = judged, best, consistency, good, bad, early
+        for name, table in compare_tables(paper, lengths, *listed):
+            section = name.removeprefix("compare_")
+            if section == "luck":
+                text = CAPTIONS["compare_luck"]
+                tables.append(table_of(name, table, text, section, LUCK_ONLY_CSV))
+            else:
+                tables.append(table_of(name, table, caption, section))
+    return {table.name: table for table in tables}
+
+
+def table_of(name, frame, caption=None, section=None, only_csv=()):
+    """Make a Table with the formats of this module; caption and section are those of its name."""
+    return Table(name, frame, caption or CAPTIONS[name], section or name, FORMATS, only_csv)
