@@ -36,7 +36,13 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from analysis.runs import is_run, labels, read_config
-from noisy_wrappers import canonical_noises, make_noisy, noise_slug
+from noisy_wrappers import (
+    NotFiniteError,
+    canonical_env_id,
+    canonical_noises,
+    make_noisy,
+    noise_slug,
+)
 
 HEADER = ["noise", "noise_rate", "episode", "episodic_return", "episodic_length"]
 DISPLAY = "import glfw; assert glfw.init() and glfw.get_primary_monitor()"
@@ -146,6 +152,10 @@ def load(run, render_mode=None):
         script = importlib.import_module(name)
     except ImportError as error:
         fail(f"{run.folder}: cannot import {name}: {error}")
+    try:
+        canonical_env_id(run.environment)  # imports its module
+    except ValueError as error:
+        fail(error)
     steps = json.loads(run.settings).get("max_episode_steps")
     drawn = {"render_mode": render_mode} if render_mode else {}  # not every class takes it
     env = script.make_env(run.environment, max_episode_steps=steps, **drawn)
@@ -366,5 +376,5 @@ if __name__ == "__main__":
         main(tyro.cli(Args, description=__doc__))
     except KeyboardInterrupt:
         fail("stopped; what was played is stored, but nothing with another --seed", code=130)
-    except FloatingPointError as error:  # from the environment
+    except NotFiniteError as error:  # from the environment
         fail(error, code=1)

@@ -25,14 +25,18 @@ import ast
 import contextlib
 import hashlib
 import importlib
+import importlib.machinery
 import inspect
 import math
 import numbers
+import os
 import re
+import sys
 import zlib
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -44,11 +48,14 @@ from numpy.typing import NDArray
 __version__ = "0.1.0"
 
 __all__ = [
+    "MAY_DIFFER_IN_A_RUN",
+    "MAY_DIFFER_IN_A_TABLE",
     "WRAPPERS",
     "EnvState",
     "FiniteNumbers",
     "Noise",
     "NoiseWrapper",
+    "NotFiniteError",
     "ObservationNoise",
     "RandomDropoutObservation",
     "RandomEarlyTermination",
@@ -61,6 +68,7 @@ __all__ = [
     "RandomUniformScaleObservation",
     "RandomUniformScaleReward",
     "RewardNoise",
+    "SpaceError",
     "canonical_env_id",
     "canonical_noises",
     "make_flat",
@@ -69,6 +77,8 @@ __all__ = [
     "noise_statistics",
     "noise_wrappers",
     "parse_noise",
+    "refusals",
+    "run_folder",
     "run_name",
     "set_progress",
     "signatures",
@@ -134,10 +144,11 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def noise_statistics(self) -> dict[str, float]:
         """Return :func:`noise_statistics` of this wrapper and of those inside."""
-        statistics = {}
-        for name, wrapper in noise_wrappers(self).items():
-            statistics[f"{name}/rate"] = wrapper.noise_rate
-            statistics[f"{name}/applied_fraction"] = wrapper.applied_fraction
+        statistics, wrappers = {}, noise_wrappers(self)
+        for name, wrapper in wrappers.items():
+            prefix = f"{name}/" if len(wrappers) > 1 else ""
+            statistics[f"{prefix}rate"] = wrapper.noise_rate
+            statistics[f"{prefix}applied_fraction"] = wrapper.applied_fraction
         return statistics
 
     @property
@@ -663,19 +674,27 @@ class RecordEpisodeStatistics(gym.wrappers.RecordEpisodeStatistics[Any, Any]):
             raise ValueError(_RECORDED) from error
 
 
+class NotFiniteError(FloatingPointError):
+    """A number that training cannot go on with: NaN, infinite, or no number at all."""
+
+
+class SpaceError(ValueError):
+    """Observations or actions that are no vectors of numbers."""
+
+
 class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Stops at NaN and infinity, makes rewards floats and observations arrays of their own.
 
     A learner that is given NaN is lost from there on, and says so much later or never; so it raises
-    FloatingPointError, which says whether the action was NaN already, as after a divergence. The
-    reward may be an array of one number. An observation is copied: an environment may write the
-    next one into the same array.
+    NotFiniteError, which says whether the action was NaN already, as after a divergence. The
+    reward may be an array of one number, but no text. An observation is copied: an environment may
+    write the next one into the same array.
 
     >>> env = FiniteNumbers(gym.make("Pendulum-v1", disable_env_checker=True))
     >>> _ = env.reset(seed=0)
     >>> env.step(np.array([np.nan]))
     Traceback (most recent call last):
-    FloatingPointError: step 1 of an episode: the environment was given the action [nan]
+    noisy_wrappers.NotFiniteError: step 1 of an episode: the environment was given the action [nan]
     """
 
     def __init__(self, env: Env):
@@ -694,8 +713,10 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def step(self, action: Any) -> Step:
         """Step the environment and check the observation and the reward."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        number = float(reward.item() if isinstance(reward, np.ndarray) else reward)
         self._steps += 1
+        if isinstance(reward, str):
+            self._stop("returned the reward", reward)
+        number = float(reward.item() if isinstance(reward, np.ndarray) else reward)
         if not (math.isfinite(number) and np.isfinite(observation).all()):
             if isinstance(action, np.ndarray):
                 self._check("was given the action", action)
@@ -705,10 +726,10 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def _check(self, what: str, value: Any) -> None:
         if not np.isfinite(value).all():
-            numbers = np.asarray(value).tolist()
-            raise FloatingPointError(
-                f"step {self._steps} of an episode: the environment {what} {numbers}"
-            )
+            self._stop(what, np.asarray(value).tolist())
+
+    def _stop(self, what: str, value: Any) -> None:
+        raise NotFiniteError(f"step {self._steps} of an episode: the environment {what} {value!r}")
 
 
 @dataclass(frozen=True)
@@ -904,12 +925,12 @@ def make_flat(env: Env) -> Env:
 
     >>> make_flat(gym.make("Pendulum-v1").unwrapped)
     <FiniteNumbers<PendulumEnv<Pendulum-v1>>>
-    >>> make_flat(gym.make("CartPole-v1"))
+    >>> make_flat(gym.make("CartPole-v1"))  # doctest: +ELLIPSIS
     Traceback (most recent call last):
-    ValueError: needs Box actions of floats in one dimension; CartPole-v1 has Discrete(2)
+    noisy_wrappers.SpaceError: needs Box actions of floats in one dimension; CartPole-v1 has ...
 
     Raises:
-        ValueError: actions that are no vector of floats, or observations that cannot become one.
+        SpaceError: actions that are no vector of floats, or observations that cannot become one.
     """
     name = env.spec.id if env.spec else str(env)
     space = env.observation_space
@@ -918,13 +939,13 @@ def make_flat(env: Env) -> Env:
         env = gym.wrappers.FlattenObservation(env)
     observations, actions = env.observation_space, env.action_space
     if not isinstance(observations, gym.spaces.Box) or observations.dtype.kind not in "fiu":
-        raise ValueError(f"needs Box observations of numbers; {name} has {observations}")
+        raise SpaceError(f"needs Box observations of numbers; {name} has {observations}")
     if (
         not isinstance(actions, gym.spaces.Box)
         or actions.dtype.kind != "f"
         or len(actions.shape) != 1
     ):
-        raise ValueError(f"needs Box actions of floats in one dimension; {name} has {actions}")
+        raise SpaceError(f"needs Box actions of floats in one dimension; {name} has {actions}")
     return FiniteNumbers(env)
 
 
@@ -978,12 +999,13 @@ def noise_wrappers(env: Env) -> dict[str, NoiseWrapper]:
 def noise_statistics(env: Any) -> dict[str, float]:
     """Return the rate and the realised rate of an environment's noise wrappers, for a log.
 
-    Of a vector of environments, as :func:`set_progress` takes one, these are the means.
+    Where noises are combined, the wrapper's name stands in front. Of a vector of environments, as
+    :func:`set_progress` takes one, these are the means.
 
     >>> env = make_noisy(gym.make("CartPole-v1"), ["RandomNormalNoisyReward(1)"], [1.0])
     >>> _ = env.reset(), env.step(0)
     >>> noise_statistics(env)
-    {'RandomNormalNoisyReward/rate': 1.0, 'RandomNormalNoisyReward/applied_fraction': 1.0}
+    {'rate': 1.0, 'applied_fraction': 1.0}
 
     Raises:
         ValueError: a vector of environments whose noises differ.
@@ -1083,17 +1105,40 @@ def _without_arrays(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 
+# The scripts' arguments that change nothing about what a run learns. A run may be resumed with
+# others, and a finished one counts as done whatever it had.
+MAY_DIFFER_IN_A_RUN = frozenset(
+    ("runs_dir", "overwrite", "torch_threads", "compile", "checkpoint_frequency")
+)
+# Runs with other values of these may stand in one row of a table, too: a GPU rounds otherwise, and
+# tests do not touch training. But a run keeps to the ones that it began with.
+MAY_DIFFER_IN_A_TABLE = MAY_DIFFER_IN_A_RUN | {"cuda", "eval_frequency"}
+
+
 def noise_slug(noises: Sequence[str], rates: Sequence[float | str]) -> str:
     """Return noises as a part of a file's name, "" for none; equal configurations have equal ones.
 
     >>> noise_slug(["RandomUniformScaleReward(.5, 1.5)"], [0.05])
-    'RandomUniformScaleReward_0.5_1.5_p0.05'
+    'p0.05_UniformScaleReward_0.5_1.5'
     """
-    words = []
-    for noise, rate in _pair(noises, rates):
-        name_and_arguments = re.findall(r"[^(), ]+", str(noise))
-        words.append("_".join([*name_and_arguments, f"p{rate}".replace(":", "to")]))
-    return "+".join(words)
+    return "_".join(_rates_and_names(noises, rates)) if noises else ""
+
+
+def _rates_and_names(noises: Sequence[str], rates: Sequence[float | str]) -> list[str]:
+    """Return rates and noises as two parts of a file's name, or nothing if all rates are 0."""
+    pairs = _pair(noises, rates)
+    if not pairs:
+        return []
+    names = [_words(noise).removeprefix("Random") for noise, _ in pairs]
+    return ["p" + "+".join(_rate_word(rate) for _, rate in pairs), "+".join(names)]
+
+
+def _words(noise: Noise) -> str:
+    return "_".join(re.findall(r"[^(), ]+", str(noise)))
+
+
+def _rate_word(rate: float | str) -> str:
+    return str(rate).replace(":", "to")
 
 
 def run_name(
@@ -1101,21 +1146,39 @@ def run_name(
 ) -> str:
     """Return the name of a run's folder, the same for all spellings of one configuration.
 
-    Where it would be too long for a file system, the noises are cut and end in a hash.
+    What tells the runs of a sweep apart comes first: TensorBoard's list shows 31 characters. Where
+    the name would be too long for a file system, the noises are cut and end in a hash.
 
     >>> run_name("Hopper-v5", "sac", ["RandomUniformScaleReward(.5, 1.5)"], [0.05], seed=1)
-    'Hopper-v5__sac__RandomUniformScaleReward_0.5_1.5_p0.05__1'
+    'p0.05_s1_UniformScaleReward_0.5_1.5__Hopper-v5__sac'
     >>> run_name("Hopper-v5", "sac", ["RandomEarlyTermination(50)"], ["1:0"], seed=1)
-    'Hopper-v5__sac__RandomEarlyTermination_50_p1.0to0.0__1'
+    'p1.0to0.0_s1_EarlyTermination_50__Hopper-v5__sac'
     >>> run_name("ALE/Pong-v5", "ppo", [], [], seed=1)
-    'ALE-Pong-v5__ppo__baseline__1'
+    'baseline_s1__ALE-Pong-v5__ppo'
     """
-    slug = noise_slug(noises, rates) or "baseline"
-    name = f"{_safe(env_id)}__{_safe(exp_name)}__{slug}__{seed}"
-    if len(name) > 240:  # a file's name has at most 255 bytes
-        short_slug = f"{slug[:100]}_{hashlib.sha256(slug.encode()).hexdigest()[:16]}"
-        name = f"{_safe(env_id)}__{_safe(exp_name)}__{short_slug}__{seed}"
-    return name
+    rate, *names = _rates_and_names(noises, rates) or ["baseline"]
+    first = "_".join([rate, f"s{seed}", *names])
+    end = f"__{_safe(env_id)}__{_safe(exp_name)}"
+    if len(first + end) > 240:  # a file's name has at most 255 bytes
+        first = f"{first[:100]}_{hashlib.sha256(first.encode()).hexdigest()[:16]}"
+    return first + end
+
+
+def run_folder(
+    runs_dir: str | Path,
+    env_id: str,
+    exp_name: str,
+    noises: Sequence[str],
+    rates: Sequence[float | str],
+    seed: int,
+) -> Path:
+    """Return a run's folder: :func:`run_name` in runs_dir, or the one that version 0.1 has made."""
+    pairs = _pair(noises, rates)
+    slug = "+".join(f"{_words(noise)}_p{_rate_word(rate)}" for noise, rate in pairs) or "baseline"
+    old_name = f"{_safe(env_id)}__{_safe(exp_name)}__{slug}__{seed}"
+    if len(old_name) <= 240 and Path(runs_dir, old_name).is_dir():
+        return Path(runs_dir, old_name)
+    return Path(runs_dir, run_name(env_id, exp_name, noises, rates, seed))
 
 
 def _safe(text: str) -> str:
@@ -1127,25 +1190,62 @@ def canonical_env_id(env_id: str) -> str:
     """Return the id of the environment that ``gymnasium.make(env_id)`` makes, with its version.
 
     "module:Env-v0" imports the module, which registers the environment, and stays "module:Env-v0".
+    A module of the folder that Python was started in wins over one of this project's.
 
     >>> canonical_env_id("Hopper")
     'Hopper-v5'
 
     Raises:
-        ValueError: an environment that is not registered or a module that cannot be imported.
+        ValueError: an environment that is not registered or a module that does not exist; what a
+            module raises while it is imported passes through.
     """
     module, colon, name = env_id.rpartition(":")
+    if module:
+        _import_module(module, env_id)
     try:
-        if module:
-            importlib.import_module(module)
         namespace, base_name, version = parse_env_id(name)
         if version is None:
             version = find_highest_version(namespace, base_name)
         spec = gym.spec(get_env_id(namespace, base_name, version))
-    except Exception as error:  # a module may raise anything
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise ValueError(f"there is no environment {env_id!r}: {reason}") from error
+    except gym.error.Error as error:
+        raise ValueError(f"there is no environment {env_id!r}: {error}") from error
     return f"{module}{colon}{spec.id}"
+
+
+def _import_module(module: str, env_id: str) -> None:
+    """Import the module of an environment, as if this file's folder came last."""
+    here, caller, path = str(Path(__file__).parent), os.getcwd(), sys.path[:]
+    others = [folder for folder in path if folder not in (here, caller)]
+    sys.path[:] = [*others, here] if caller == here else [caller, *others, here]
+    top = module.partition(".")[0]
+    try:
+        if not all(map(str.isidentifier, module.split("."))):
+            raise ValueError(f"there is no environment {env_id!r}: {module!r} is no module's name")
+        loaded, found = sys.modules.get(top), importlib.machinery.PathFinder.find_spec(top)
+        if loaded and found and found.origin != getattr(loaded, "__file__", found.origin):
+            raise ValueError(
+                f"there is no environment {env_id!r}: a module {top!r} is loaded already, from "
+                f"{loaded.__file__}; rename yours"
+            )
+        importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+            raise  # it exists, and imports another one that does not
+        raise ValueError(f"there is no environment {env_id!r}: {error}") from error
+    finally:
+        sys.path[:] = path
+
+
+def refusals(env_id: str) -> tuple[type[Exception], ...]:
+    """Return the errors that ``make_flat(gymnasium.make(env_id))`` raises on purpose.
+
+    They are Gymnasium's and this module's. Of Gymnasium's own environments a missing dependency is
+    an ImportError; any other error comes from the environment's code.
+    """
+    spec = gym.registry.get(env_id.rpartition(":")[2])
+    maker: Any = spec.entry_point if spec else ""  # "package.module:Class" or a function
+    is_gymnasiums = getattr(maker, "__module__", str(maker)).startswith("gymnasium.")
+    return (gym.error.Error, SpaceError, *([ImportError] if is_gymnasiums else []))
 
 
 def _layers(env: Env) -> Iterator[gym.Wrapper[Any, Any, Any, Any]]:

@@ -7,8 +7,8 @@ defaults of CleanRL's sac_continuous_action.py. The noise is that of Khraishi an
     python sac_continuous_noisy.py --env-id HalfCheetah-v5 --seed 1
     python sac_continuous_noisy.py --noise "RandomUniformScaleReward(0.5, 1.5)" --noise-rate 0.05
 
-Writes runs/{env_id}__{exp_name}__{noise}__{seed}/: config.json, eval.csv, TensorBoard events, and
-policy.pt and result.json when done. The same command again resumes from checkpoint.pt.
+Writes config.json, eval.csv, TensorBoard events, policy.pt and result.json into a folder in runs/.
+You can interrupt it at any time; run the same command again to resume.
 """
 
 import contextlib
@@ -25,6 +25,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+if __name__ == "__main__":  # Ctrl-C during the imports below ends the program without a traceback
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
 import gymnasium as gym
 import mujoco
 import numpy as np
@@ -39,6 +42,7 @@ from tqdm import tqdm
 import noisy_wrappers as noisy
 
 TEST_SEED = 1_000_000  # of the first test episode; the same in every run and evaluation
+EVAL_FREQUENCY = 10_000  # default of --eval-frequency; at most a tenth of the run
 LOG_STD_MIN, LOG_STD_MAX = -5, 2
 
 
@@ -46,19 +50,20 @@ LOG_STD_MIN, LOG_STD_MAX = -5, 2
 class Args:
     """Command-line arguments; the algorithm's are those of CleanRL and the paper (Appendix A.2)."""
 
-    exp_name: str = Path(__file__).stem  # name of the experiment, part of the run folder's name
-    seed: int = 1  # seed of everything that is random
     env_id: str = "HalfCheetah-v5"  # Gymnasium environment: Name-v0, or module:Name-v0
+    seed: int = 1  # seed of everything that is random
+    total_timesteps: int = 1_000_000  # environment steps to train for
     max_episode_steps: int | None = None  # time limit of episodes, in place of the environment's
-    noise: tuple[str, ...] = ()  # noises of the training environment; without any: the baseline
-    noise_rate: tuple[float | str, ...] = ()  # probability of each noise, or start:end of it
+    exp_name: str = Path(__file__).stem  # name of the experiment, part of the run folder's name
     runs_dir: str = "runs"  # folder in which the run's own folder is made
     overwrite: bool = False  # delete the files in the run's folder and start again
-    total_timesteps: int = 1_000_000  # environment steps to train for
-    eval_frequency: int = 10_000  # environment steps between two tests; 0: only one, at the end
-    eval_episodes: int = 10  # episodes in each test
     checkpoint_frequency: int = 50_000  # environment steps between two checkpoints
-    cuda: bool = False  # train on the GPU; for networks this small the CPU is a good choice
+    noise: tuple[str, ...] = ()  # noises of the training environment; without any: the baseline
+    noise_rate: tuple[float | str, ...] = ()  # probability of each noise, or start:end of it
+    eval_frequency: int | None = None  # steps between tests (default 10,000 or less; 0: at the end)
+    eval_episodes: int = 10  # episodes in each test
+
+    cuda: bool = False  # train on a GPU (not tested on one yet); these networks are small
     torch_threads: int = 1  # CPU threads; several runs side by side gain more than threads do
     compile: bool = True  # compile the updates, which takes a C++ compiler
     # precision of float32 products, raised to highest where another would cost accuracy; with bf16
@@ -80,7 +85,7 @@ class Args:
 
 def make_env(env_id, **kwargs):
     """Make the clean environment, whose observations and actions are vectors."""
-    with fail_on(Exception, f"--env-id {env_id}"):  # its constructor may raise anything
+    with fail_on(noisy.refusals(env_id), f"--env-id {env_id}"):
         return noisy.make_flat(gym.make(env_id, disable_env_checker=True, **kwargs))
 
 
@@ -127,7 +132,7 @@ class Critic(nn.Module):
 
 
 class Actor(nn.Module):
-    """A Gaussian policy, squashed to the action bounds; its standard normal noise is an input."""
+    """A Gaussian policy, squashed to the action bounds; the standard normal `eps` is an input."""
 
     def __init__(self, env):
         super().__init__()
@@ -136,23 +141,23 @@ class Actor(nn.Module):
         self.register_buffer("action_scale", (high - low) / 2)
         self.register_buffer("action_bias", (high + low) / 2)
 
-    def forward(self, observations, noise):
+    def forward(self, observations, eps):
         """Return actions (B, A) and their log-probabilities (B,)."""
         mean, log_std = self.network(observations).chunk(2, dim=-1)
         # a smooth clamp, from SpinUp / Denis Yarats
         log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (torch.tanh(log_std) + 1)
-        squashed = torch.tanh(mean + log_std.exp() * noise)
+        squashed = torch.tanh(mean + log_std.exp() * eps)
         actions = squashed * self.action_scale + self.action_bias
-        log_prob = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
+        log_prob = -0.5 * eps.square() - log_std - 0.5 * math.log(2 * math.pi)
         log_prob = log_prob - torch.log(self.action_scale * (1 - squashed.square()) + 1e-6)
         return actions, log_prob.sum(1)
 
-    def policy(self, observation, noise=0.0):
-        """Return the action for one observation, NumPy to NumPy; noise 0 gives the mean action."""
+    def policy(self, observation, eps=0.0):
+        """Return the action for one observation, NumPy to NumPy; eps 0 gives the mean action."""
         scale, bias = self.action_scale.cpu().numpy(), self.action_bias.cpu().numpy()
         mean, log_std = np.split(in_numpy(self.network, observation), 2)
         log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (np.tanh(log_std) + 1)
-        return np.tanh(mean + np.exp(log_std) * noise) * scale + bias
+        return np.tanh(mean + np.exp(log_std) * eps) * scale + bias
 
 
 class ReplayBuffer:
@@ -187,8 +192,7 @@ class ReplayBuffer:
         # take is twice as fast as [rows]
         arrays = [getattr(self, name).take(rows, axis=0) for name in self.ARRAYS]
         observations, actions, rewards, terminated = map(torch.from_numpy, arrays)
-        next_observations = self.observations.take((rows + 1) % self.rows, axis=0)
-        next_observations = torch.from_numpy(next_observations)
+        next_observations = torch.from_numpy(self.observations.take((rows + 1) % self.rows, axis=0))
         for i, row in enumerate(rows.tolist()):
             if row in self.final:
                 next_observations[i] = self.final[row]
@@ -210,34 +214,30 @@ class ReplayBuffer:
 # LOSSES: pure functions of the parameters to learn and of what stays -> the loss, and curves
 
 
-def critic_loss(params, critic, target, actor, log_alpha, batch, noise, gamma):
+def critic_loss(params, critic, target, actor, log_alpha, batch, eps, gamma):
     """Mean squared error of Q1 and Q2 to y = r + gamma (min(Q1', Q2') - alpha log pi)(s', a')."""
     observations, actions, rewards, next_observations, terminated = batch
-    next_actions, next_log_prob = actor(next_observations, noise)
+    next_actions, next_log_prob = actor(next_observations, eps)
     next_q = target(next_observations, next_actions).amin(0)
     y = rewards + (1 - terminated) * gamma * (next_q - log_alpha.exp() * next_log_prob)
-    q = functional_call(critic, params, (observations, actions))
-    (qf1_values, qf2_values), (qf1_loss, qf2_loss) = q.mean(1), (q - y).square().mean(1)
-    curves = {
-        "qf1_values": qf1_values,
-        "qf2_values": qf2_values,
-        "qf1_loss": qf1_loss,
-        "qf2_loss": qf2_loss,
-        "qf_loss": (qf1_loss + qf2_loss) / 2,
-    }
-    return qf1_loss + qf2_loss, curves
+    q1, q2 = functional_call(critic, params, (observations, actions))
+    qf1_loss, qf2_loss = (q1 - y).square().mean(), (q2 - y).square().mean()
+    loss = qf1_loss + qf2_loss
+    values = {"qf1_values": q1.mean(), "qf2_values": q2.mean()}
+    losses = {"qf1_loss": qf1_loss, "qf2_loss": qf2_loss, "qf_loss": loss / 2}
+    return loss, values | losses
 
 
-def actor_loss(params, actor, critic, log_alpha, observations, noise):
+def actor_loss(params, actor, critic, log_alpha, observations, eps):
     """The mean of alpha log pi(a|s) - min(Q1, Q2)(s, a), a ~ pi, with frozen critics."""
-    actions, log_prob = functional_call(actor, params, (observations, noise))
+    actions, log_prob = functional_call(actor, params, (observations, eps))
     loss = (log_alpha.exp() * log_prob - critic(observations, actions).amin(0)).mean()
     return loss, {"actor_loss": loss, "alpha": log_alpha.exp()}
 
 
-def temperature_loss(params, actor, observations, noise, target_entropy):
+def temperature_loss(params, actor, observations, eps, target_entropy):
     """The mean of -alpha (log pi(a|s) + target entropy), a ~ pi, with a frozen policy."""
-    _, log_prob = actor(observations, noise)
+    _, log_prob = actor(observations, eps)
     loss = (-params["log_alpha"].exp() * (log_prob + target_entropy)).mean()
     return loss, {"alpha_loss": loss}
 
@@ -268,7 +268,7 @@ def updater(loss, network, optimizer, args):
 
 def train(args, stop=lambda: False):
     """Train one agent; return False if stop(), asked whenever an episode ends, ended it early."""
-    args, env, test_env = check(args)
+    args, env, test_env = make_envs(args)
     if not np.isfinite([env.action_space.low, env.action_space.high]).all():
         fail(f"SAC needs bounded actions; some of {args.env_id} have no bounds")
     torch.set_num_threads(args.torch_threads)
@@ -324,17 +324,17 @@ def train(args, stop=lambda: False):
         if global_step > args.learning_starts:
             # LEARN: critic
             batch = [tensor.to(device) for tensor in buffer.sample(args.batch_size, rng)]
-            noise = torch.randn(batch[1].shape).to(device)
-            curves = update_critic(critic, target, actor, log_alpha, batch, noise, args.gamma)
+            eps = torch.randn(batch[1].shape).to(device)
+            curves = update_critic(critic, target, actor, log_alpha, batch, eps, args.gamma)
 
             # LEARN: actor and temperature, for all steps since the last time
             if global_step % args.policy_frequency == 0:
                 for _ in range(args.policy_frequency):
-                    noise = torch.randn(batch[1].shape).to(device)
-                    curves |= update_actor(actor, critic, log_alpha, batch[0], noise)
+                    eps = torch.randn(batch[1].shape).to(device)
+                    curves |= update_actor(actor, critic, log_alpha, batch[0], eps)
                     if args.autotune:
-                        noise = torch.randn(batch[1].shape).to(device)
-                        curves |= update_alpha(actor, batch[0], noise, target_entropy)
+                        eps = torch.randn(batch[1].shape).to(device)
+                        curves |= update_alpha(actor, batch[0], eps, target_entropy)
 
             # LEARN: target
             if global_step % args.target_network_frequency == 0:
@@ -385,12 +385,23 @@ def fail(message, code=2):
 
 @contextlib.contextmanager
 def fail_on(errors, message, code=2):
-    """Turn such errors into one line: the message, and what the error says."""
+    """Turn such errors into one line, the message and what the error says; note it on others."""
     try:
         yield
     except errors as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         fail(f"{message}: {reason}", code)
+    except Exception as error:  # of the environment, say: its traceback is what the user needs
+        error.add_note(f"({message})")
+        raise
+
+
+def say(text):
+    """Print a line; training goes on if its reader has left, as in `... | head`."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def read_args():
@@ -406,28 +417,44 @@ def read_args():
     return tyro.cli(Args, args=words, description=f"{__doc__}\n{noises}")
 
 
-def check(args):
-    """Return the arguments in full, the noisy environment and a clean one; fail if one is wrong."""
+def check_numbers(args):
+    """Fail if a number is out of its range."""
     at_most = {"gamma": 1, "gae_lambda": 1, "tau": 1, "torch_threads": os.cpu_count()}
     for name, value in asdict(args).items():
+        if type(value) not in (int, float):
+            continue
         may_be_zero = type(value) is float or name in ("seed", "eval_frequency", "learning_starts")
-        low, high = 0 if may_be_zero else 1, at_most.get(name, 2**63 - 1)
-        if type(value) in (int, float) and not low <= value <= high:
-            fail(f"--{name.replace('_', '-')} must be from {low} to {high:.3g}, not {value}")
+        low, high = 0 if may_be_zero else 1, at_most.get(name, math.inf)
+        wanted = f"at least {low}" if high == math.inf else f"from {low} to {high}"
+        if not math.isfinite(value):
+            wanted = "a finite number"
+        elif value >= 2**63:
+            wanted = "a smaller number"
+        elif low <= value <= high:
+            continue
+        fail(f"--{name.replace('_', '-')} must be {wanted}, not {value}")
+
+
+def make_envs(args):
+    """Return the arguments in full, the noisy environment and a clean one; fail if one is wrong."""
+    check_numbers(args)
+    if args.exp_name in ("", ".", ".."):
+        fail(f"--exp-name must be a name, not {args.exp_name!r}")
     if args.cuda and not torch.cuda.is_available():
         fail("--cuda: PyTorch finds no GPU; leave it out to run on the CPU")
     try:
         env_id = noisy.canonical_env_id(args.env_id)
         noise, noise_rate = noisy.canonical_noises(args.noise, args.noise_rate)
-        test_env = make_env(env_id, max_episode_steps=args.max_episode_steps)  # never sees noise
-        env = make_env(env_id, max_episode_steps=args.max_episode_steps)
-        env = noisy.make_noisy(env, noise, noise_rate)
     except ValueError as error:
         fail(error)
+    test_env = make_env(env_id, max_episode_steps=args.max_episode_steps)  # never sees noise
+    env = make_env(env_id, max_episode_steps=args.max_episode_steps)
+    with fail_on(ValueError, f"--noise in {env_id}"):
+        env = noisy.make_noisy(env, noise, noise_rate)
     if not isinstance(env.unwrapped.observation_space, gym.spaces.Box):
-        print(f"{env_id}: observations are flattened to {test_env.observation_space}")
+        say(f"{env_id}: observations are flattened to {test_env.observation_space}")
     if env.spec.max_episode_steps is None:
-        print(f"{env_id} declares no time limit; --max-episode-steps sets one")
+        say(f"{env_id} declares no time limit; --max-episode-steps sets one")
     return replace(args, env_id=env_id, noise=noise, noise_rate=noise_rate), env, test_env
 
 
@@ -460,25 +487,25 @@ def use_matmul_precision(precision, device):
 
 def can_compile(device):
     """Return whether torch.compile works here; if it does not, say why."""
+    say("compiling ...")
     try:
         torch.compile(torch.neg)(torch.zeros(8, device=device))
         torch.compiler.reset()  # forget what earlier runs of this process compiled
         return True
     except Exception as error:  # no C++ compiler, no Python headers, ...
         reason = str(getattr(error, "inner_exception", error)).strip()
-        print("not compiled:", reason.partition("\n")[0])
+        say(f"not compiled: {reason.partition(chr(10))[0]}")
         return False
 
 
 class Run:
     """The run's folder: what is written into it, and read again to resume."""
 
-    saved_step = 0  # of the newest checkpoint; of the class, for the signal handler
-
     def __init__(self, args, algorithm, precision, env):
         """Open the folder; fail if another process uses it, or if it holds a different run."""
-        name = noisy.run_name(args.env_id, args.exp_name, args.noise, args.noise_rate, args.seed)
-        self.args, self.folder, self.start = args, Path(args.runs_dir, name), time.time()
+        configuration = (args.env_id, args.exp_name, args.noise, args.noise_rate, args.seed)
+        self.folder = noisy.run_folder(args.runs_dir, *configuration)
+        self.args, self.start, self.saved_step = args, time.time(), 0
         self.noise, self.returns = noisy.noise_wrappers(env), env.get_wrapper_attr("return_queue")
         with fail_on(OSError, "--runs-dir"):
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -489,16 +516,26 @@ class Run:
         for path in sorted(filter(Path.is_file, old), reverse=True):  # result.json before policy.pt
             path.unlink()
         self.checkpoint, result = self.folder / "checkpoint.pt", self.folder / "result.json"
-        self.config = {"algorithm": algorithm, "args": asdict(args), "versions": {}}
         self.is_finished = result.exists()
         if any(self.folder.glob("*.json")) or self.checkpoint.exists():
             self.config = self._old_config()
+        else:
+            if args.eval_frequency is None:
+                args.eval_frequency = max(1, min(EVAL_FREQUENCY, args.total_timesteps // 10))
+            self.config = {"algorithm": algorithm, "args": asdict(args), "versions": {}}
         if self.is_finished:
             with self._reading(result):
-                mean = json.loads(result.read_text())["final_return_mean"]
-                print(f"{self.folder} is finished: mean test return {mean:.1f}")
+                self.mean = json.loads(result.read_text())["final_return_mean"]
             self.checkpoint.unlink(missing_ok=True)
+            self._say_finished()
         else:
+            noises = zip(args.noise, args.noise_rate, strict=True)
+            noises = " + ".join(f"{noise} at {rate}" for noise, rate in noises)
+            say(
+                f"{algorithm} on {args.env_id} | noise: {noises or 'none (baseline)'} | seed "
+                f"{args.seed} | {args.total_timesteps:,} steps | "
+                f"{'cuda' if args.cuda else 'cpu'} | {self.folder}"
+            )
             self._note_versions(precision)
 
     def _note_versions(self, precision):
@@ -512,16 +549,19 @@ class Run:
             for name, value in new.items():
                 used = str(old.setdefault(name, value))
                 if str(value) not in used.split(", "):  # changed since the run began: keep both
-                    print(f"{name} is {value} now; this run had {used} so far")
+                    say(f"{name} is {value} now; this run had {used} so far")
                     old[name] = f"{used}, {value}"
 
     def _old_config(self):
-        path, new = self.folder / "config.json", asdict(self.args)
-        for name in ("runs_dir", "overwrite", "torch_threads", "compile", "checkpoint_frequency"):
-            del new[name]  # may differ
+        path = self.folder / "config.json"
         with self._reading(path):
             config = json.loads(path.read_text())
-            old = {name: config["args"].get(name) for name in new}
+            old = {name: config["args"].get(name) for name in asdict(self.args)}
+        if self.args.eval_frequency is None:
+            self.args.eval_frequency = old["eval_frequency"]
+        new = asdict(self.args)
+        for name in noisy.MAY_DIFFER_IN_A_RUN:
+            del new[name]
         differ = [f"{name} {old[name]}, not {new[name]}" for name in new if old[name] != new[name]]
         if differ:
             advice = "choose another --exp-name or --runs-dir; --overwrite deletes that run"
@@ -535,7 +575,7 @@ class Run:
         if self.checkpoint.exists():
             with self._reading(self.checkpoint):
                 step = self._load()
-            print(f"resumed at step {step}")
+            say(f"resumed at step {step}")
         else:
             for path in self.folder.glob("events.*"):  # of a start that left no checkpoint
                 path.unlink()
@@ -546,13 +586,16 @@ class Run:
         if step == 0:
             table = "".join(f"|{name}|{value}|\n" for name, value in asdict(self.args).items())
             self.writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + table)
-            # for the table HPARAMS: what tells the runs of a folder apart
+            # for the table HPARAMS: what tells runs apart, and settings that are not the default
             columns = {name: getattr(self.args, name) for name in ("env_id", "exp_name", "seed")}
-            columns["noise"] = " + ".join(self.args.noise)
-            columns["noise_rate"] = max([0.0, *(w.noise_rate for w in self.noise.values())])
-            for summary in hparams(columns, {"eval/episodic_return_mean": 0}):
-                self.writer.file_writer.add_summary(summary)
-        Run.saved_step, self.printed, self.last_test = step, time.time(), ""
+            columns["noise"] = " + ".join(self.args.noise) or "none"
+            columns["noise_rate"] = " + ".join(map(str, self.args.noise_rate)) or "none"
+            for name, value in asdict(self.args).items():
+                if name not in noisy.MAY_DIFFER_IN_A_TABLE and value != getattr(Args, name):
+                    columns.setdefault(name, value)
+            # Without an experiment of its own (hparams()[0]), TensorBoard shows all runs' columns
+            self.writer.file_writer.add_summary(hparams(columns, {})[1])
+        self.saved_step, self.printed, self.last_test = step, time.time(), ""
         total = self.args.total_timesteps
         self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None)  # on terminals
         return step
@@ -561,8 +604,10 @@ class Run:
         if zipfile.ZipFile(self.checkpoint).testzip():  # torch.load checks no checksums
             raise ValueError("it is damaged")
         checkpoint = torch.load(self.checkpoint, weights_only=True)
-        if (checkpoint["format"], checkpoint["run"]) != (3, self.folder.name):
-            raise ValueError(f"it has format {checkpoint['format']} of {checkpoint['run']}")
+        if checkpoint["format"] != 4:
+            raise ValueError("another version of this script wrote it, which can finish the run")
+        if checkpoint["run"] != self.folder.name:
+            raise ValueError(f"it belongs to {checkpoint['run']}")
         for part, state in zip(self.state, checkpoint["state"], strict=True):
             part.load_state_dict(state)
         torch.set_rng_state(checkpoint["torch"])
@@ -575,7 +620,7 @@ class Run:
         with self._writing("events.*"):
             self.writer.flush()  # to be no older than the checkpoint
         checkpoint = {
-            "format": 3,
+            "format": 4,
             "run": self.folder.name,
             "step": step,
             "state": [part.state_dict() for part in self.state],
@@ -584,31 +629,40 @@ class Run:
             "seconds": time.time() - self.start,
         }
         self._write("checkpoint.pt", checkpoint)
-        Run.saved_step = step
+        self.saved_step = step
 
     def log(self, step, **groups):
-        """Log finite numbers as group/name to TensorBoard, and the speed; show the progress."""
-        total, sps = self.args.total_timesteps, step / (time.time() - self.start)
-        tags = {"charts/SPS": sps}
+        """Log numbers as group/name to TensorBoard, and the speed; show the progress."""
+        self._add_scalars(step, groups)
+        self._add_scalars(step, {"charts": {"SPS": step / (time.time() - self.start)}})
+        self._show_progress(step)
+
+    def _add_scalars(self, step, groups):
+        tags = {}
         for group, values in groups.items():
             tags |= {f"{group}/{name}": float(value) for name, value in values.items()}
         if not all(map(math.isfinite, tags.values())):
-            raise FloatingPointError(f"step {step}: training diverged, not all is finite: {tags}")
+            reason = f"step {step}: training diverged, not all is finite: {tags}"
+            raise noisy.NotFiniteError(reason)
         with self._writing("events.*"):
             for tag, value in tags.items():
                 self.writer.add_scalar(tag, value, step)
+
+    def _show_progress(self, step):
+        total, sps = self.args.total_timesteps, step / (time.time() - self.start)
         self.bar.update(step - self.bar.n)
         if self.bar.disable and time.time() - self.printed > 10:
             eta = tqdm.format_interval((total - step) / sps)
-            print(f"step={step}/{total} sps={sps:.0f} {self.last_test}eta={eta}")
+            # sweep/__main__.py reads this line
+            say(f"step={step}/{total} sps={sps:.0f} {self.last_test}eta={eta}")
             self.printed = time.time()
 
     def log_episode(self, step, episode):
         """Log a training episode as RecordEpisodeStatistics saw it, before reward noise."""
         self.log(step, charts={"episodic_return": episode["r"], "episodic_length": episode["l"]})
 
-    def log_test(self, step, results, now=None):
-        """Log the (N, 2) returns and lengths of a test that fell due at a step, at most `now`."""
+    def log_test(self, step, results):
+        """Log the (N, 2) returns and lengths of a test that fell due at a step."""
         for i, (episodic_return, length) in enumerate(results.tolist()):
             self.eval_csv += f"{step},{i},{episodic_return},{length:.0f}\n"
         self._write("eval.csv", self.eval_csv)
@@ -617,18 +671,21 @@ class Run:
         self.last_test, self.printed = f"eval_return={self.mean:.1f} ", 0  # 0: print it now
         self.bar.set_description_str(self.last_test)
         values = {"return_mean": self.mean, "return_std": self.std, "length_mean": length}
-        self.log(now or step, eval={f"episodic_{name}": value for name, value in values.items()})
+        self._add_scalars(step, {"eval": {f"episodic_{name}": x for name, x in values.items()}})
+        self._show_progress(max(step, self.bar.n))
 
     def finish(self, step, policy):
         """Write policy.pt and, last of all, result.json; the checkpoint has served."""
         seconds = time.time() - self.start
         with self._writing("events.*"):
+            self.writer.file_writer.add_summary(hparams({}, {})[2])  # HPARAMS: success
             self.writer.close()
         result = {
             "final_return_mean": self.mean,
             "final_return_std": self.std,
             "final_return_n": self.args.eval_episodes,
             "total_timesteps": self.args.total_timesteps,
+            "trained_timesteps": step,  # PPO: whole rollouts
             "train_return_mean_last_100": np.mean(self.returns) if self.returns else None,
             "steps_per_second": step / seconds,
             "wall_time_seconds": seconds,
@@ -639,7 +696,11 @@ class Run:
         self._write("result.json", json.dumps(result, indent=2) + "\n")
         self.checkpoint.unlink(missing_ok=True)
         self.bar.close()
-        print(f"{self.folder} is finished: mean test return {self.mean:.1f}")
+        self._say_finished()
+
+    def _say_finished(self):
+        say(f"{self.folder} is finished: mean test return {self.mean:.1f}")
+        say(f"See its curves with: tensorboard --logdir {self.args.runs_dir}")
 
     def _reading(self, path):
         return fail_on(Exception, f"cannot read {path} (if damaged, --overwrite starts afresh)")
@@ -671,16 +732,15 @@ if __name__ == "__main__":
         signals.append(number)
         if len(signals) > 1:
             os._exit(128 + number)
-        told = "stopping at the end of this episode; Ctrl-C again to discard everything since step"
+        told = b"stopping at the end of this episode; Ctrl-C again to stop without a checkpoint\n"
         with contextlib.suppress(OSError):  # nobody may be left to read it; print is not safe here
-            os.write(1, f"{told} {Run.saved_step}\n".encode())
+            os.write(1, told)
 
     signal.signal(signal.SIGTERM, stop_run)
     signal.signal(signal.SIGINT, stop_run)
-    sys.stdout.reconfigure(line_buffering=True)
-    sys.path.append(os.getcwd())  # for the module of --env-id module:Name-v0
-    with fail_on(FloatingPointError, "training stopped", code=1):
+    sys.path.append(os.getcwd())  # for what the module of --env-id module:Name-v0 imports
+    with fail_on(noisy.NotFiniteError, "training stopped", code=1):
         finished = train(read_args(), stop=lambda: bool(signals))
     if not finished:
-        print(f"stopped; the same command goes on from step {Run.saved_step}")
+        say("stopped; run the same command again to resume")
         raise SystemExit(128 + signals[0])

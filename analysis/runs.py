@@ -14,12 +14,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from noisy_wrappers import MAY_DIFFER_IN_A_TABLE
+
 KEYS = ["algorithm", "environment", "noise", "noise_rate"]
 BASELINE = ("", "0.00")  # a configuration is (noise, noise_rate), both as text
 EVAL_HEADER = "step,episode,episodic_return,episodic_length\n"
-# Arguments that do not change what is learned; the grids of evaluation steps are intersected.
-NOT_SETTINGS = {"env_id", "seed", "noise", "noise_rate", "runs_dir", "overwrite", "cuda", "compile"}
-NOT_SETTINGS |= {"torch_threads", "checkpoint_frequency", "eval_frequency"}
+# Arguments that have columns of their own, or may differ; the steps of tests are intersected.
+NOT_SETTINGS = {"env_id", "seed", "noise", "noise_rate"} | MAY_DIFFER_IN_A_TABLE
 RUN_COLUMNS = ["run", "status", "reason", "base", "phase", *KEYS, "seed", "episodes", "total"]
 RUN_COLUMNS += ["settings", "versions", "steps", "returns"]
 CHOICE_COLUMNS = [*KEYS[:2], "phase", "round", *KEYS[2:], "seeds", "score", "survives"]

@@ -66,7 +66,8 @@ def read_log(run, now):
         exit_status = int(end[1]) if end else None
         if progress:
             step, steps_per_second = int(progress[1]), int(progress[2])
-        if not line.startswith("# ") and re.search(r"\w", line):
+        # "(" begins the notes that the scripts leave below a traceback
+        if not line.startswith(("# ", "(")) and re.search(r"\w", line):
             last_line = line.strip()
     return Log(path, now - status.st_mtime, step, steps_per_second, exit_status, last_line)
 

@@ -18,7 +18,7 @@ import sys
 from pathlib import Path
 from typing import NamedTuple
 
-from noisy_wrappers import canonical_env_id, canonical_noises, run_name
+from noisy_wrappers import MAY_DIFFER_IN_A_RUN, canonical_env_id, canonical_noises, run_folder
 
 PROJECT = Path(__file__).resolve().parent.parent
 SEEDS = {"sac": range(1, 6), "td3": range(1, 6), "ppo": range(1, 11)}  # the paper's
@@ -74,8 +74,6 @@ GIVEN_BY_THE_GRID = {  # options of the scripts, and those of the sweep that set
     "runs-dir": "--runs-dir",
     "exp-name": "--runs-dir",  # a sweep's folders are told apart by where they lie
 }
-# A finished run counts as done whatever it had for these: the scripts' class Run ignores them, too
-MAY_DIFFER = {"overwrite", "torch-threads", "compile", "checkpoint-frequency"}
 
 
 class Run(NamedTuple):
@@ -369,8 +367,8 @@ def make_run(args, algorithm, env_id, noises, rates, seed):
         arguments += ["--noise", *noises, "--noise-rate", *map(str, rates)]
     arguments += ["--total-timesteps", str(args.total_timesteps)]
     arguments += ["--runs-dir", args.runs_dir, *args.extra]
-    name = run_name(env_id, script.removesuffix(".py"), noises, rates, seed)
-    folder, kind = Path(args.runs_dir, name), (algorithm, env_id)
+    exp_name, kind = script.removesuffix(".py"), (algorithm, env_id)
+    folder = run_folder(args.runs_dir, env_id, exp_name, noises, rates, seed)
     options = script_options(script, tuple(args.extra))
     return Run(folder, kind, args.total_timesteps, script, arguments, options)
 
@@ -401,14 +399,14 @@ def runs_in(folder):
     runs = []
     for name in sorted(names):
         path = folder / name / "config.json"
-        steps = 0  # unknown: it has failed before it began
+        kind, steps = ("", ""), 0  # unknown: it has failed before it began
         if path.exists():
             try:
-                steps = json.loads(path.read_text())["args"]["total_timesteps"]
+                args = json.loads(path.read_text())["args"]
+                kind, steps = (args.get("exp_name"), args.get("env_id")), args["total_timesteps"]
             except (OSError, ValueError, KeyError, TypeError) as error:
                 fail(f"cannot read {path} ({type(error).__name__}: {error}); delete its folder")
-        env_id, script = name.split("__")[:2]
-        runs.append(Run(folder / name, (script, env_id), steps, "", [], {}))
+        runs.append(Run(folder / name, kind, steps, "", [], {}))
     return runs
 
 
@@ -447,8 +445,11 @@ def other_options(run, made_with):
     differences = []
     for name, wanted in run.options.items():
         default = defaults(run.script)[name]
-        made = made_with.get(name.replace("-", "_"), default)
-        if name not in MAY_DIFFER and made != wanted:
+        field = name.replace("-", "_")
+        made = made_with.get(field, default)
+        if field in MAY_DIFFER_IN_A_RUN or (field == "eval_frequency" and wanted is None):
+            continue  # where no frequency of tests is asked for, a run keeps its own
+        if made != wanted:
             differences.append(f"--{name} {made}, not {wanted}")
     return differences
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from statistics import fmean
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
-from noisy_wrappers import run_name  # noqa: E402
+from noisy_wrappers import run_folder  # noqa: E402
 
 EPISODES = 10  # the scripts' default
 
@@ -50,14 +50,14 @@ def train(argv):
     args = parser.parse_args(argv)
     args.noise_rate = [rate if ":" in rate else float(rate) for rate in args.noise_rate]
     exp_name = args.script.removesuffix(".py")
-    name = run_name(args.env_id, exp_name, args.noise, args.noise_rate, args.seed)
-    folder = Path(args.runs_dir, name)
+    configuration = (args.env_id, exp_name, args.noise, args.noise_rate, args.seed)
+    folder = run_folder(args.runs_dir, *configuration)
     folder.mkdir(parents=True, exist_ok=True)
     config = {"algorithm": exp_name[:3].upper(), "versions": {}}
-    config["args"] = vars(args) | {"eval_episodes": EPISODES}
+    config["args"] = vars(args) | {"eval_episodes": EPISODES, "exp_name": exp_name}
     (folder / "config.json").write_text(json.dumps(config))
     print(f"step=0/{args.total_timesteps} sps=100", flush=True)
-    if fnmatch.fnmatch(name, os.environ.get("STUB_FAILS", "")):
+    if fnmatch.fnmatch(folder.name, os.environ.get("STUB_FAILS", "")):
         sys.exit("error: this one fails")
     time.sleep(float(os.environ.get("STUB_SECONDS", 0)))
 

@@ -57,18 +57,48 @@ class Other(Count):
         vars(self).update(spaces)
 
 
-class Broken(Count):
-    """Its constructor raises."""
+class Buggy(Count):
+    """Its author made a mistake, in the constructor, in reset or in step."""
+
+    def __init__(self, where):
+        super().__init__()
+        self.where = where
+        self.mistake("constructor")
+
+    def mistake(self, where):
+        if where == self.where:
+            {}["missing"]
+
+    def reset(self, **kwargs):
+        self.mistake("reset")
+        return super().reset(**kwargs)
+
+    def step(self, action):
+        self.mistake("step")
+        return super().step(action)
+
+
+class BadValue(Count):
+    """Its constructor raises a ValueError."""
 
     def __init__(self):
-        raise RuntimeError("first line\nsecond line")
+        raise ValueError("of the environment's own")
 
 
-class Silent(Count):
-    """Its constructor raises an exception without a text."""
+class Overflow(Count):
+    """NumPy is told to raise its own FloatingPointError."""
 
-    def __init__(self):
-        raise AssertionError
+    def step(self, action):
+        with np.errstate(all="raise"):
+            np.float64(1e308) * 10
+
+
+class TextReward(Count):
+    """Its rewards are texts."""
+
+    def step(self, action):
+        observation, _, terminated, truncated, info = super().step(action)
+        return observation, "1.0", terminated, truncated, info
 
 
 class Parts(Count):
@@ -133,5 +163,9 @@ register("BooleanObservation", Other, 8, observation_space=Box(0, 1, (1,), np.bo
 register("Unbounded", Other, 8, action_space=Box(-np.inf, np.inf, (1,)))
 register("MatrixAction", Other, 8, action_space=Box(-1.0, 1.0, (2, 2)))
 register("DoubleAction", Other, 8, action_space=Box(-1.0, 1.0, (1,), np.float64))
-register("Broken", Broken, 8)
-register("Silent", Silent, 8)
+register("BuggyConstructor", Buggy, 8, where="constructor")
+register("BuggyReset", Buggy, 8, where="reset")
+register("BuggyStep", Buggy, 8, where="step")
+register("BadValue", BadValue, 8)
+register("Overflow", Overflow, 8)
+register("TextReward", TextReward, 8)

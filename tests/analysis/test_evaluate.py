@@ -356,7 +356,7 @@ def test_all_of_a_folder_with_logs_and_an_analysis(runs, capsys):
     ]
     means = []
     for seed in (1, 2):
-        rows = stored(runs / f"InvertedPendulum-v5__ppo_continuous_noisy__baseline__{seed}")
+        rows = stored(runs / f"baseline_s{seed}__InvertedPendulum-v5__ppo_continuous_noisy")
         assert len(rows) == 9
         means.append(
             np.mean([float(r["episodic_return"]) for r in rows if r["noise_rate"] == "0.5"])

@@ -15,7 +15,6 @@ import os
 import pickle
 import pkgutil
 import random
-import re
 import resource
 import runpy
 import shutil
@@ -262,7 +261,10 @@ def events(path):
     found = {tag: accumulator.Tensors(tag) for tag in tags["tensors"]}
     found = {tag: [event.step for event in found[tag]] for tag in found}
     for tag in set(tags["scalars"]) - {"charts/SPS"}:
-        found[tag] = [(event.step, repr(event.value)) for event in accumulator.Scalars(tag)]
+        # PPO logs a test under the step at which it fell due; if that lies before the checkpoint, a
+        # resumed run logs the same point again
+        points = [(event.step, repr(event.value)) for event in accumulator.Scalars(tag)]
+        found[tag] = list(dict.fromkeys(points))
     return found
 
 
@@ -372,7 +374,7 @@ def test_killed_while_every_step_ends_an_episode_it_logs_each_once(algorithm, tm
     assert logged["hyperparameters/text_summary"] == [0]
     (tmp_path / "alone").mkdir()
     assert train(algorithm, options(algorithm, tmp_path / "alone", **short))
-    assert outcome(folder(tmp_path / "alone")) == outcome(next(tmp_path.glob("Hopper*")))
+    assert outcome(folder(tmp_path / "alone")) == outcome(next(tmp_path.glob("*__Hopper*")))
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -423,12 +425,11 @@ def test_a_signal_ends_the_episode_and_the_run_resumes(algorithm, number, code, 
     words = options(algorithm, tmp_path)
     result = run(algorithm, words, (TRAINING_STEP, 65, send(number)))
     assert (result.code, result.err) == (code, "")
-    stopping = "stopping at the end of this episode; Ctrl-C again to discard everything since step"
-    [saved] = re.findall(rf"^{stopping} (\d+)$", result.out, re.M)
-    assert 40 <= int(saved) < 65  # a checkpoint is due from step 40 on
+    stopping = "stopping at the end of this episode; Ctrl-C again to stop without a checkpoint"
+    assert f"{stopping}\n" in result.out
     checkpoint = torch.load(folder(tmp_path) / "checkpoint.pt", weights_only=True)
     assert 65 <= checkpoint["step"] < 100
-    assert f"stopped; the same command goes on from step {checkpoint['step']}\n" in result.out
+    assert "stopped; run the same command again to resume\n" in result.out
     assert not (folder(tmp_path) / "policy.pt").exists()
     result = run(algorithm, words, (TRAINING_STEP, 70, send(number)))
     assert (result.code, result.err) == (code, "")
@@ -461,7 +462,7 @@ def test_a_signal_stops_a_run_that_has_an_evaluation_due_at_every_episode(algori
     assert_finished(folder(tmp_path))
     (tmp_path / "alone").mkdir()
     assert train(algorithm, options(algorithm, tmp_path / "alone", **short))
-    assert outcome(folder(tmp_path / "alone")) == outcome(next(tmp_path.glob("Hopper*")))
+    assert outcome(folder(tmp_path / "alone")) == outcome(next(tmp_path.glob("*__Hopper*")))
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -483,7 +484,7 @@ STATE = {  # the order of the list "state" in a checkpoint
 }
 INSIDE = {  # the parts of which each field is tested on its own
     "buffer": "observations actions rewards terminated final position size",
-    "rollout": "observations noise actions rewards dones discounted_return",
+    "rollout": "observations eps actions rewards dones discounted_return",
     "observation_stats": "mean var count",
     "return_stats": "mean var count",
 }
@@ -642,10 +643,10 @@ def test_a_checkpoint_of_another_run_is_refused(algorithm, stopped, checkpoints,
     words, path = stopped
     checkpoint = torch.load(path, weights_only=True)
     torch.save(checkpoint | {"format": 1}, path)
-    assert "format 1" in refused(algorithm, words, capsys)
+    assert "another version of this script wrote it" in refused(algorithm, words, capsys)
     assert not train(algorithm, options(algorithm, tmp_path / "seed", seed=2), episodes=3)
     shutil.copy(folder(tmp_path / "seed") / "checkpoint.pt", path)
-    assert path.parent.name[:-1] + "2" in refused(algorithm, words, capsys)
+    assert path.parent.name.replace("_s1_", "_s2_") in refused(algorithm, words, capsys)
     for other in set(ALGORITHMS) - {algorithm}:  # even under this run's name
         _, foreign = checkpoints(other, LATE)
         torch.save(foreign, path)

@@ -7,6 +7,7 @@ import json
 import math
 import os
 import re
+import signal
 import subprocess
 import sys
 import urllib.parse
@@ -20,12 +21,13 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+import tqdm
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import ppo_continuous_noisy as ppo
 import sac_continuous_noisy as sac
 import td3_continuous_noisy as td3
-from noisy_wrappers import NoiseWrapper, signatures
+from noisy_wrappers import NoiseWrapper, NotFiniteError, signatures
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = {"SAC": sac, "TD3": td3, "PPO": ppo}
@@ -187,8 +189,8 @@ def test_returns_are_recorded_before_reward_noise(algorithm, tmp_path):
 def test_run_folder(algorithm, tmp_path, capsys):
     noise = {"noise": (*NOISES, "RandomMixupObservation(.1)"), "noise_rate": (0.5, 0.25, 0.0)}
     run_dir = run(algorithm, tmp_path, exp_name="an experiment", seed=7, **noise)
-    slug = "RandomEarlyTermination_2_4_p0.25+RandomNormalNoisyReward_0.5_p0.5"
-    assert run_dir.name == f"toy_envs--Tiny-v0__an--experiment__{slug}__7"
+    slug = "p0.25+0.5_s7_EarlyTermination_2_4+NormalNoisyReward_0.5"
+    assert run_dir.name == f"{slug}__toy_envs--Tiny-v0__an--experiment"
     files = {re.sub(r"tfevents.*", "tfevents", path.name) for path in run_dir.iterdir()}
     expected = {"config.json", "eval.csv", "events.out.tfevents", "policy.pt", "result.json"}
     assert files - {".lock"} == expected
@@ -220,7 +222,7 @@ def test_run_folder(algorithm, tmp_path, capsys):
     assert result["final_return_mean"] == pytest.approx(last.mean())
     assert result["final_return_std"] == pytest.approx(last.std(ddof=1))
     assert result["final_return_n"] == 3
-    assert result["total_timesteps"] == 60
+    assert result["total_timesteps"] == result["trained_timesteps"] == 60
     assert result["steps_per_second"] == pytest.approx(60 / result["wall_time_seconds"])
     assert math.isfinite(result["train_return_mean_last_100"])
     applied, counts = result["noise_applied_fraction"], result["noise_applied"]
@@ -241,6 +243,7 @@ def test_run_folder(algorithm, tmp_path, capsys):
         "steps_per_second",
         "wall_time_seconds",
         "total_timesteps",
+        "trained_timesteps",
     }
 
     # the same again, in another spelling: finished, and nothing is written
@@ -249,7 +252,11 @@ def test_run_folder(algorithm, tmp_path, capsys):
     capsys.readouterr()
     noise = {"noise": ("RandomEarlyTermination(2,4)", "RandomNormalNoisyReward(.50)")}
     run(algorithm, tmp_path, exp_name="an experiment", seed=7, noise_rate=(0.25, 0.5), **noise)
-    assert capsys.readouterr().out == f"{run_dir} is finished: mean test return {mean:.1f}\n"
+    finished = f"{run_dir} is finished: mean test return {mean:.1f}\n"
+    assert (
+        capsys.readouterr().out
+        == f"{finished}See its curves with: tensorboard --logdir {tmp_path}\n"
+    )
     lock = run_dir / ".lock"
     after = {path: path.stat().st_mtime_ns for path in run_dir.iterdir()}
     assert after.keys() == before.keys()
@@ -272,6 +279,41 @@ def test_other_arguments_need_overwrite(algorithm, tmp_path, capsys):
     assert json.loads((run_dir / "config.json").read_text())["args"]["gamma"] == 0.5
     assert len(list(run_dir.glob("events*"))) == 1
     assert len(evaluations(run_dir)) == 9
+
+
+@each_script
+def test_ten_tests_at_least_and_a_run_keeps_its_frequency(algorithm, tmp_path):
+    script, short = SCRIPTS[algorithm], {"eval_frequency": None, "eval_episodes": 1}
+    assert script.Args.eval_frequency is None
+    folder = run(algorithm, tmp_path / "short", **short)
+    made_with = json.loads((folder / "config.json").read_text())["args"]["eval_frequency"]
+    assert made_with == 6  # a tenth of 60 steps; PPO tests once in 12 steps, a rollout
+    steps = sorted({row[0] for row in evaluations(folder)})
+    assert steps == list(range(12, 61, 12) if algorithm == "PPO" else range(6, 61, 6))
+    # not given: as the run that goes on had it, whether it is finished or not
+    folder = run(algorithm, tmp_path / "other", eval_frequency=14, eval_episodes=1)
+    run(algorithm, tmp_path / "other", **short)
+    args = arguments(algorithm, tmp_path / "stopped", eval_frequency=14, eval_episodes=1)
+    stops = iter([False] * 3 + [True] * 100)
+    assert not script.train(args, stop=lambda: next(stops))
+    again = run(algorithm, tmp_path / "stopped", **short)
+    assert (again / "eval.csv").read_bytes() == (folder / "eval.csv").read_bytes()
+
+
+@pytest.mark.parametrize("algorithm", SCRIPTS)
+def test_the_default_frequency_of_a_long_run_is_that_of_the_paper(algorithm):
+    assert (50_000 if algorithm == "PPO" else 10_000) == SCRIPTS[algorithm].EVAL_FREQUENCY
+
+
+@each_script
+def test_a_folder_of_version_0_1_is_known(algorithm, tmp_path, capsys):
+    folder = run(algorithm, tmp_path)
+    exp_name = SCRIPTS[algorithm].Args.exp_name
+    old = folder.rename(tmp_path / f"toy_envs--Tiny-v0__{exp_name}__baseline__1")
+    capsys.readouterr()
+    run(algorithm, tmp_path)
+    assert capsys.readouterr().out.startswith(f"{old} is finished: mean test return ")
+    assert list(tmp_path.iterdir()) == [old]
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[]", '{"final_return_mean": 1'])
@@ -307,6 +349,11 @@ def test_overwrite_of_nothing_and_a_short_run(algorithm, tmp_path):
 def test_ppo_evaluates_at_the_end_of_rollouts_under_the_nominal_step(tmp_path):
     rollouts = {"num_steps": 16, "num_minibatches": 2, "eval_episodes": 1}
     run_dir = run("PPO", tmp_path, total_timesteps=100, eval_frequency=20, **rollouts)
+    result = json.loads((run_dir / "result.json").read_text())
+    assert (result["total_timesteps"], result["trained_timesteps"]) == (100, 96)
+    events = EventAccumulator(str(run_dir)).Reload()
+    steps = [event.step for event in events.Scalars("eval/episodic_return_mean")]
+    assert steps == [20, 40, 60, 80, 100]
     # rollouts end at 16, 32, ..., 96; 100 is what was asked for
     assert [row[0] for row in evaluations(run_dir)] == [20, 40, 60, 80, 100]
     run_dir = run("PPO", tmp_path / "often", total_timesteps=48, eval_frequency=5, **rollouts)
@@ -375,7 +422,7 @@ def run_block(script):
 
 
 def test_repeated_helpers_are_word_for_word_identical():
-    everywhere = "make_env fail fail_on read_args check evaluate can_compile "
+    everywhere = "make_env fail fail_on say read_args check_numbers make_envs evaluate can_compile "
     everywhere += "use_matmul_precision Run"
     off_policy = "mlp in_numpy TwinLinear Critic ReplayBuffer updater"
     by_design = {"Args", "Actor", "load_policy", "critic_loss", "actor_loss", "train"}
@@ -567,7 +614,7 @@ def test_a_test_that_was_stopped_is_not_written(algorithm, tmp_path):
 @each_script
 def test_a_name_without_version_is_recorded_with_it(algorithm, tmp_path):
     run_dir = run(algorithm, tmp_path, env_id="toy_envs:Tiny")
-    assert run_dir.name.startswith("toy_envs--Tiny-v0__")
+    assert "__toy_envs--Tiny-v0__" in run_dir.name
     assert json.loads((run_dir / "config.json").read_text())["args"]["env_id"] == "toy_envs:Tiny-v0"
 
 
@@ -579,7 +626,7 @@ def test_a_rate_that_changes_follows_the_steps(algorithm, tmp_path):
         run_dir = run(algorithm, tmp_path, env_id="toy_envs:Count-v0", **noise)
     rates = [call.args[1] for call in spy.call_args_list]
     assert rates == [step / 60 for step in range(8, 60, 8)]  # episodes of 8 steps
-    assert run_dir.name.endswith("RandomNormalNoisyReward_0.5_p1.0to0.0__1")
+    assert run_dir.name.startswith("p1.0to0.0_s1_NormalNoisyReward_0.5__")
     assert json.loads((run_dir / "config.json").read_text())["args"]["noise_rate"] == ["1.0:0.0"]
     applied, of = json.loads((run_dir / "result.json").read_text())["noise_applied"][
         "RandomNormalNoisyReward"
@@ -598,9 +645,13 @@ BAD = [  # arguments, what the message names, of which scripts
     ({"env_id": "no_such_module:Env-v0"}, "no_such_module", SCRIPTS),
     ({"env_id": ""}, "there is no environment ''", SCRIPTS),
     ({"env_id": "Ant-v1"}, "Ant-v1", SCRIPTS),
-    ({"env_id": "toy_envs:Broken-v0"}, "first line second line", SCRIPTS),
+    ({"env_id": "no_such_package.module:Env-v0"}, "no_such_package", SCRIPTS),
+    ({"env_id": ".toy_envs:Tiny-v0"}, "'.toy_envs' is no module's name", SCRIPTS),
+    ({"env_id": "Hopper-v2"}, "moved to the gymnasium-robotics project", SCRIPTS),
+    ({"env_id": "Pusher-v4"}, "only supported on `mujoco<3`", SCRIPTS),
+    ({"exp_name": ""}, "--exp-name must be a name, not ''", SCRIPTS),
+    ({"exp_name": ".."}, "--exp-name must be a name, not '..'", SCRIPTS),
     ({"env_id": "CartPole-v1"}, "Discrete(2)", SCRIPTS),
-    ({"env_id": "toy_envs:Silent-v0"}, "AssertionError", SCRIPTS),
     ({"env_id": "toy_envs:DiscreteAction-v0"}, "needs Box actions", SCRIPTS),
     ({"env_id": "toy_envs:SequenceObservation-v0"}, "needs Box observations", SCRIPTS),
     ({"env_id": "toy_envs:IntegerAction-v0"}, "needs Box actions of floats", SCRIPTS),
@@ -634,12 +685,12 @@ BAD = [  # arguments, what the message names, of which scripts
     ({"torch_threads": 2**70}, "--torch-threads", SCRIPTS),
     ({"target_kl": math.nan}, "--target-kl", ("PPO",)),
     ({"env_id": "toy_envs:MatrixAction-v0"}, "in one dimension", SCRIPTS),
-    ({"seed": -1}, "--seed", SCRIPTS),
-    ({"seed": 2**64}, "--seed", SCRIPTS),
-    ({"gamma": 1.1}, "--gamma", SCRIPTS),
+    ({"seed": -1}, "--seed must be at least 0, not -1\n", SCRIPTS),
+    ({"seed": 2**64}, "--seed must be a smaller number", SCRIPTS),
+    ({"gamma": 1.1}, "--gamma must be from 0 to 1, not 1.1\n", SCRIPTS),
     ({"gamma": -0.1}, "--gamma", SCRIPTS),
-    ({"gamma": math.nan}, "--gamma", SCRIPTS),
-    ({"total_timesteps": 0}, "--total-timesteps", SCRIPTS),
+    ({"gamma": math.nan}, "--gamma must be a finite number, not nan\n", SCRIPTS),
+    ({"total_timesteps": 0}, "--total-timesteps must be at least 1, not 0\n", SCRIPTS),
     ({"total_timesteps": -5}, "--total-timesteps", SCRIPTS),
     ({"eval_episodes": 0}, "--eval-episodes", SCRIPTS),
     ({"eval_episodes": -1}, "--eval-episodes", SCRIPTS),
@@ -744,10 +795,51 @@ def test_a_module_beside_the_caller_and_steps_as_1e2(tmp_path):
     result = command("SAC", *options, cwd=tmp_path)
     assert (result.returncode, result.stderr) == (0, "")
     [run_dir] = (tmp_path / "2e1").iterdir()
-    assert "__1e3__" in run_dir.name
+    assert run_dir.name.endswith("__1e3")
     args = json.loads((run_dir / "config.json").read_text())["args"]
     assert (args["total_timesteps"], args["learning_starts"]) == (120, 50)
     assert args["env_id"] == "my_envs:Tiny-v0"
+
+
+def test_a_module_of_the_callers_wins_over_one_of_ours(tmp_path):
+    (tmp_path / "analyze.py").write_text("from toy_envs import *\n")
+    options = ["--total-timesteps", "20", "--eval-episodes", "1", "--runs-dir", tmp_path / "runs"]
+    result = command("SAC", "--env-id", "analyze:Tiny-v0", *options, cwd=tmp_path)
+    assert (result.returncode, result.stderr) == (0, "")
+    (tmp_path / "tqdm.py").write_text("from toy_envs import *\n")
+    result = command("SAC", "--env-id", "tqdm:Tiny-v0", *options, cwd=tmp_path)
+    assert result.returncode == 2
+    assert_one_line(result.stderr, f"a module 'tqdm' is loaded already, from {tqdm.__file__}")
+
+
+def test_training_goes_on_when_its_reader_has_left(tmp_path):
+    options = ["--env-id", "toy_envs:Tiny-v0", "--total-timesteps", "60", "--eval-frequency", "10"]
+    options += ["--no-compile", "--learning-starts", "20", "--eval-episodes", "1"]
+    alone = command("SAC", *options, "--runs-dir", tmp_path / "alone")
+    assert alone.stdout.count("\n") > 6
+    path = os.pathsep.join([str(ROOT), str(Path(__file__).parent)])
+    line = [sys.executable, sac.__file__, *options, "--runs-dir", str(tmp_path / "runs")]
+    with subprocess.Popen(
+        line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ | {"PYTHONPATH": path}
+    ) as process:
+        process.stdout.readline()
+        process.stdout.close()
+        assert process.stderr.read() == b""
+        assert process.wait(120) == 0
+    one, other = (next((tmp_path / name).iterdir()) / "eval.csv" for name in ("alone", "runs"))
+    assert one.read_bytes() == other.read_bytes()
+
+
+def test_ctrl_c_during_the_imports_is_no_traceback(tmp_path):
+    (tmp_path / "gymnasium.py").write_text("import time; print('now', flush=True); time.sleep(60)")
+    line = [sys.executable, sac.__file__]
+    env = os.environ | {"PYTHONPATH": str(tmp_path)}
+    with subprocess.Popen(
+        line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env
+    ) as process:
+        assert process.stdout.readline() == "now\n"
+        process.send_signal(signal.SIGINT)
+        assert (process.wait(60), process.stderr.read()) == (-signal.SIGINT, "")
 
 
 @each_script
@@ -773,6 +865,51 @@ def test_bad_command_of_tyros(algorithm, options, word, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+# BUGS OF AN ENVIRONMENT, whose author needs the traceback
+
+
+@pytest.mark.parametrize(
+    ("env_id", "error", "note"),
+    [
+        ("toy_envs:BuggyConstructor-v0", KeyError, "(--env-id toy_envs:BuggyConstructor-v0)"),
+        ("toy_envs:BadValue-v0", ValueError, "(--env-id toy_envs:BadValue-v0)"),
+        ("toy_envs:BuggyReset-v0", KeyError, None),
+        ("toy_envs:BuggyStep-v0", KeyError, None),
+        ("toy_envs:Overflow-v0", FloatingPointError, None),
+    ],
+)
+@each_script
+def test_a_bug_of_an_environment_is_shown(algorithm, env_id, error, note, tmp_path):
+    with pytest.raises(error) as raised:
+        run(algorithm, tmp_path, env_id=env_id)
+    assert raised.traceback[-1].path.name == "toy_envs.py"
+    assert getattr(raised.value, "__notes__", [None]) == [note]
+
+
+@pytest.mark.parametrize(
+    ("source", "last_line"),
+    [
+        ("x = ][", "SyntaxError: "),
+        ("undefined_name", "NameError: "),
+        ("import no_such_module_at_all", "ModuleNotFoundError: "),
+    ],
+)
+def test_a_bug_of_an_environments_module_is_shown(source, last_line, tmp_path):
+    (tmp_path / "buggy_module.py").write_text(source)
+    result = command("PPO", "--env-id", "buggy_module:Env-v0", cwd=tmp_path)
+    *traceback, error, note = result.stderr.splitlines()
+    assert result.returncode == 1 and traceback[0] == "Traceback (most recent call last):"
+    assert error.startswith(last_line) and note == "(training stopped)"
+    assert any("buggy_module.py" in line for line in traceback)
+
+
+def test_a_bug_in_a_step_is_shown_by_a_command(tmp_path):
+    result = command("PPO", "--env-id", "toy_envs:BuggyStep-v0", "--no-compile", cwd=tmp_path)
+    *traceback, error, note = result.stderr.splitlines()
+    assert (result.returncode, error, note) == (1, "KeyError: 'missing'", "(training stopped)")
+    assert traceback[0] == "Traceback (most recent call last):"
+
+
 # DIVERGENCE
 
 
@@ -781,7 +918,7 @@ def test_bad_command_of_tyros(algorithm, options, word, tmp_path):
 def test_nan_stops_the_run(algorithm, what, tmp_path):
     nan = {"env_id": f"toy_envs:Nan{what}-v0"}  # from step 70 on; episodes have 8 steps
     message = f"step 6 of an episode: the environment returned the {what.lower()} "
-    with pytest.raises(FloatingPointError, match=message):
+    with pytest.raises(NotFiniteError, match=message):
         run(algorithm, tmp_path, eval_frequency=0, total_timesteps=200, **nan)
     [run_dir] = tmp_path.iterdir()
     assert not (run_dir / "result.json").exists()
@@ -791,10 +928,16 @@ def test_nan_stops_the_run(algorithm, what, tmp_path):
 @pytest.mark.parametrize("algorithm", SCRIPTS)
 def test_nan_at_the_end_is_no_result(algorithm, tmp_path):
     late = {"env_id": "toy_envs:NanLate-v0", "total_timesteps": 190}  # NaN from step 130 on
-    with pytest.raises(FloatingPointError):
+    with pytest.raises(NotFiniteError):
         run(algorithm, tmp_path, eval_frequency=0, **late)
     [run_dir] = tmp_path.iterdir()
     assert not (run_dir / "result.json").exists()
+
+
+@each_script
+def test_a_reward_that_is_a_text_stops_the_run(algorithm, tmp_path):
+    with pytest.raises(NotFiniteError, match="step 1 of an episode: .* the reward '1.0'"):
+        run(algorithm, tmp_path, env_id="toy_envs:TextReward-v0")
 
 
 @each_script
@@ -804,7 +947,7 @@ def test_a_loss_that_is_not_finite_stops_the_run(algorithm, tmp_path):
         "TD3": {"learning_rate": 1e18, "total_timesteps": 22},
         "PPO": {"learning_rate": 1e18},
     }[algorithm]
-    with pytest.raises(FloatingPointError, match=r"^step \d+: training diverged.*losses/"):
+    with pytest.raises(NotFiniteError, match=r"^step \d+: training diverged.*losses/"):
         run(algorithm, tmp_path, **rate)
     [run_dir] = tmp_path.iterdir()
     assert not (run_dir / "result.json").exists()
@@ -839,14 +982,21 @@ def test_command_line(algorithm, commands):
     runs_dir, results = commands
     line, result = results[algorithm]
     assert (result.returncode, result.stderr) == (0, "")
-    [run_dir] = runs_dir.glob(f"*__{algorithm.lower()}_continuous_noisy__*")
-    last, finished = result.stdout.splitlines()[-2:]  # not a terminal: plain lines
+    [run_dir] = runs_dir.glob(f"*__{algorithm.lower()}_continuous_noisy")
+    lines = result.stdout.splitlines()
+    noises = "RandomEarlyTermination(2, 4) at 0.25 + RandomNormalNoisyReward(0.5) at 0.5"
+    begun = (
+        f"{algorithm} on toy_envs:Tiny-v0 | noise: {noises} | seed 1 | 240 steps | cpu | {run_dir}"
+    )
+    assert lines[0] == begun
+    last, finished, curves = lines[-3:]  # not a terminal: plain lines
+    assert curves == f"See its curves with: tensorboard --logdir {runs_dir}"
     assert re.search(r"step=240/240 sps=\d+ .*eval_return=-?\d+\.\d", last)
     assert re.fullmatch(rf"{re.escape(str(run_dir))} is finished: mean test return .*", finished)
     assert json.loads((run_dir / "config.json").read_text())["args"]["seed"] == 1
     again = command(algorithm, *line)
     assert (again.returncode, again.stderr) == (0, "")
-    assert again.stdout == f"{finished}\n"
+    assert again.stdout == f"{finished}\n{curves}\n"
 
 
 @pytest.fixture(scope="module")
@@ -877,7 +1027,7 @@ def scalars(tensorboard, commands):
     """Return a function from an algorithm to the name of its run and {tag: {step: value}}."""
 
     def read(algorithm):
-        [run_dir] = commands[0].glob(f"*__{algorithm.lower()}_continuous_noisy__*")
+        [run_dir] = commands[0].glob(f"*__{algorithm.lower()}_continuous_noisy")
         tags = tensorboard("/data/plugin/scalars/tags")[run_dir.name]
         values = {}
         for tag in tags:
@@ -905,8 +1055,6 @@ def test_tensorboard_shows_the_curves(algorithm, scalars):
     assert set(values) == losses | rate | set(CHARTS.split())
     rows = np.array(evaluations(run_dir)).reshape(-1, 3, 4)
     steps = rows[:, 0, 0].astype(int).tolist()
-    if algorithm == "PPO":  # eval.csv has the step that an evaluation was due at
-        steps = [math.ceil(step / 12) * 12 for step in steps]
     for tag, expected in (
         ("eval/episodic_return_mean", rows[:, :, 2].mean(1)),
         ("eval/episodic_return_std", rows[:, :, 2].std(1, ddof=1)),
@@ -945,15 +1093,19 @@ def test_tensorboard_knows_the_hyperparameters(tensorboard, commands):
     assert {group["name"] for group in groups} == names  # readable, and one for each run
     experiment = tensorboard("/data/plugin/hparams/experiment", {"experimentName": ""})
     columns = [info["name"] for info in experiment["hparamInfos"]]
-    assert columns == ["env_id", "exp_name", "noise", "noise_rate", "seed"]
+    names = {"env_id", "exp_name", "noise", "noise_rate", "seed"}
+    assert names < set(columns)
+    assert not {"runs_dir", "compile", "eval_frequency", "gamma"} & set(columns)
     for group in groups:
         noise = "RandomEarlyTermination(2, 4) + RandomNormalNoisyReward(0.5)"
         assert group["hparams"]["noise"] == noise
-        assert group["hparams"]["noise_rate"] == 0.5  # the highest, to sort runs by
+        assert group["hparams"]["noise_rate"] == "0.25 + 0.5"
+        assert group["hparams"]["total_timesteps"] == 240  # not the default
+        [session] = group["sessions"]
+        assert session["status"] == "STATUS_SUCCESS"
         assert group["hparams"]["env_id"] == "toy_envs:Tiny-v0"
-        [metric] = group["metricValues"]
-        assert metric["name"]["tag"] == "eval/episodic_return_mean"
-        assert metric["trainingStep"] == 240
+        steps = {value["name"]["tag"]: value["trainingStep"] for value in group["metricValues"]}
+        assert steps["eval/episodic_return_mean"] == 240
 
 
 # LEARNING

@@ -252,8 +252,8 @@ def test_two_algorithms_and_environments_at_once(tmp_path):
     found = batches(args)
     assert [len(batch) for batch in found] == [4 * 3, 4 * 2, 4 * 10]
     assert set().union(*found) == {path.name for path in tmp_path.glob("*__*")}
-    assert all(name.endswith("__1") for name in found[0])
-    assert all(name.endswith("__2") for name in found[1])
+    assert all("_s1_" in name for name in found[0])
+    assert all("_s2_" in name for name in found[1])
     sentences = list(choose.conclusion(choose.choices(args), tmp_path))
     assert [sentence.partition(":")[0] for sentence in sentences] == [
         f"{algorithm} on {env}"
