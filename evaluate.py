@@ -24,7 +24,8 @@ import subprocess
 import sys
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -178,30 +179,49 @@ def check(run, conditions):
 
 def play(run, noises, rates, args):
     """Play episodes; return their true returns and lengths, [(return, length), ...]."""
-    name = f"{run.folder.name}__{noise_slug(noises, rates) or 'clean'}"
-    if args.video:
-        folder = args.video / f".{name}"
+    env, policy = load(run)
+    return play_episodes(make_noisy(env, noises, rates), policy, args.episodes, args.seed)
+
+
+def draw(run, noises, rates, args):
+    """Play an episode in a window or into a video: (return, length), or in words why it cannot."""
+    try:
+        if args.video:
+            return record(run, noises, rates, args)
+        env, policy = load(run, "human")
+        [result] = play_episodes(make_noisy(env, noises, rates), policy, 1, args.seed)
+        return result
+    except Exception as error:  # of any library that draws
+        return reason(error)
+
+
+def record(run, noises, rates, args):
+    """Play one episode into a video; return (return, length)."""
+    name = f"{run.folder.name}__{noise_slug(noises, rates) or 'clean'}.mp4"
+    with tempfile.TemporaryDirectory(dir=args.video, prefix=".") as temporary:
+        folder = Path(temporary, "video")  # a new one: RecordVideo warns of one that exists
         env, policy = load(run, "rgb_array")
         env = RecordVideo(env, str(folder), episode_trigger=lambda episode: True)
-    else:
-        env, policy = load(run, "human" if args.render else None)
-    env = make_noisy(env, noises, rates)
+        [result] = play_episodes(make_noisy(env, noises, rates), policy, 1, args.seed)
+        (folder / "rl-video-episode-0.mp4").replace(args.video / name)
+    return result
+
+
+def play_episodes(env, policy, number, seed):
+    """Play episodes and close the environment; return [(true return, length), ...]."""
     results = []
-    for episode in range(args.episodes):
-        observation, _ = env.reset(seed=args.seed + episode)
-        terminated = truncated = False
-        while not (terminated or truncated):
-            observation, _, terminated, truncated, info = env.step(policy(observation))
-        episodic_return = np.asarray(info["episode"]["r"]).item()  # a sum of numbers or of arrays
-        results.append((episodic_return, int(info["episode"]["l"])))
-    env.close()
-    if args.video:
-        (folder / "rl-video-episode-0.mp4").replace(args.video / f"{name}.mp4")
-        folder.rmdir()
+    with closing(env):
+        for episode in range(number):
+            observation, _ = env.reset(seed=seed + episode)
+            terminated = truncated = False
+            while not (terminated or truncated):
+                observation, _, terminated, truncated, info = env.step(policy(observation))
+            record = info["episode"]  # the return is a sum of numbers or of arrays
+            results.append((np.asarray(record["r"]).item(), int(record["l"])))
     return results
 
 
-def play_all(tasks, args):
+def play_all(play, tasks, args):
     """Yield the results of play(run, noises, rates, args) for all tasks, in their order."""
     with tqdm(tasks, unit="condition", disable=None) as bar:
         if args.jobs == 1 or args.render:
@@ -302,13 +322,11 @@ def works(code):
     return not subprocess.run([sys.executable, "-c", code], capture_output=True).returncode
 
 
-def prepare_video(folder):
-    """Make the folder; let MuJoCo draw without a display, with the first library that works."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        fail(f"--video: cannot write to {folder}: {error}")
+def draw_without_display():
+    """Let MuJoCo draw without a display, with the first library that works.
+
+    dm_control reads MUJOCO_GL when it is imported, so this comes before any environment.
+    """
     if os.environ.get("MUJOCO_GL") or works(DISPLAY):
         return
     for library in ("egl", "osmesa"):
@@ -321,16 +339,30 @@ def prepare_video(folder):
     )
 
 
+def make_folder(folder):
+    """Make the folder of the videos."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        fail(f"--video: cannot write to {folder}: {error}")
+
+
 def show(runs, conditions, args):
     """Play one episode of each condition in a window or into a video; store nothing else."""
     tasks = [(run, *condition) for run in runs for condition in conditions.values()]
-    try:
-        results = play_all(tasks, replace(args, episodes=1))
-        for (run, *condition), [(episodic_return, length)] in zip(tasks, results, strict=True):
-            tested = noise_slug(*condition) or "clean"
-            print(f"{run.folder.name}, {tested}: return {episodic_return:.1f}, {length} steps")
-    except Exception as error:  # of any library that draws
-        fail(f"cannot draw: {reason(error)}")
+    failures = []
+    for (run, *condition), result in zip(tasks, play_all(draw, tasks, args), strict=True):
+        name = f"{run.folder.name}, {noise_slug(*condition) or 'clean'}"
+        if isinstance(result, str):
+            failures.append(f"{name}: {result}")
+            continue
+        episodic_return, length = result
+        print(f"{name}: return {episodic_return:.1f}, {length} steps")
+    for failure in failures:
+        print(f"error: cannot draw {failure}", file=sys.stderr)
+    if failures:
+        raise SystemExit(1)
 
 
 def main(args):
@@ -348,12 +380,14 @@ def main(args):
     runs = find_runs(args.runs)
     storing = args.seed == Args.seed
     stored = {run: read_stored(run) if storing else {} for run in runs}
-    for run in runs:
-        check(run, conditions)
     if args.video:
         if len({run.folder.name for run in runs}) < len(runs):
             fail("--video: two of these runs have the same name, and so would their videos")
-        prepare_video(args.video)
+        draw_without_display()
+    for run in runs:
+        check(run, conditions)
+    if args.video:
+        make_folder(args.video)
     if args.video or args.render:
         show(runs, conditions, args)
         return
@@ -364,7 +398,7 @@ def main(args):
         if len(stored[run].get(key, [])) < args.episodes:
             todo.append((run, key))
     tasks = [(run, *conditions[key]) for run, key in todo]
-    for (run, key), results in zip(todo, play_all(tasks, args), strict=True):
+    for (run, key), results in zip(todo, play_all(play, tasks, args), strict=True):
         stored[run][key] = results
         if storing:
             store(run, key, results)

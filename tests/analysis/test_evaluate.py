@@ -430,6 +430,49 @@ def test_videos_of_runs_of_one_name(runs, tmp_path, capsys):
     refused(args, "the same name", tmp_path, capsys)
 
 
+def register(tmp_path, name, code):
+    """A module of one's own with a pendulum, which is Mine-v0."""
+    pendulum = "gymnasium.envs.mujoco.inverted_pendulum_v5:InvertedPendulumEnv"
+    register = f"import gymnasium as gym\ngym.register('Mine-v0', '{pendulum}')\n"
+    (tmp_path / f"{name}.py").write_text(register + code)
+
+
+def test_how_to_draw_is_settled_before_environments_are_imported(runs, tmp_path):
+    """As dm_control does, this one reads MUJOCO_GL when it is imported."""
+    register(tmp_path, "early", "import os\nos.environ['MUJOCO_GL']\n")
+    run_dir = one(runs, "PPO")
+    other_environment(run_dir, "early:Mine-v0")
+    result = run(run_dir, "--video", tmp_path / "videos", cwd=tmp_path)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert len(list((tmp_path / "videos").iterdir())) == 1
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_run_that_cannot_be_drawn_is_skipped_and_named(runs, tmp_path, jobs):
+    code = """
+class Blind(gym.Wrapper):
+    frames = 0
+
+    def render(self):
+        self.frames += 1
+        if self.frames == 4:
+            raise RuntimeError("nothing to see")
+        return self.env.render()
+
+gym.register("Blind-v0", lambda **given: Blind(gym.make("InvertedPendulum-v5", **given)))
+"""
+    register(tmp_path, "blind", code)
+    first, second = sorted(runs.glob("*ppo_continuous_noisy*"))
+    other_environment(first, "blind:Blind-v0")
+    videos = tmp_path / "videos"
+    for _ in range(2):  # the second time, nothing is left of the first
+        result = run(first, second, "--video", videos, "--jobs", jobs, cwd=tmp_path)
+        assert result.returncode == 1
+        assert result.stderr == f"error: cannot draw {first.name}, clean: nothing to see\n"
+        assert result.stdout.startswith(f"{second.name}, clean: return")
+        assert list(videos.iterdir()) == [videos / f"{second.name}__clean.mp4"]
+
+
 def test_without_an_opengl_library(runs, tmp_path):
     """PyOpenGL is told to load a library that does not exist."""
     run_dir = one(runs, "PPO")
