@@ -1,4 +1,4 @@
-"""The runs of `./benchmark.sh choose`: their folders say what they returned, choose.py what is due.
+"""The runs of `./benchmark.sh choose`: their folders say what they returned, halving what is due.
 
 The run folders are the only state. Whatever was killed, and whichever executor goes on, the same
 command computes from the finished runs where each choice stands.
@@ -15,8 +15,9 @@ from typing import NamedTuple
 
 from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED, read_run
 from analysis.statistics import holm
+from analysis.verdicts import detectable_shift
 from sweep import halving
-from sweep.grid import Run, cell, cells, fail, make_run, result
+from sweep.grid import NOISES, RATES, Run, cell, cells, fail, make_run, result
 
 # What a run takes on one core until the finished ones tell: docs/sweeps.md
 STEPS_PER_SECOND = {"sac": 150, "td3": 265, "ppo": 5700}  # in small MuJoCo environments
@@ -60,6 +61,8 @@ def follow(args, algorithm, env_id):
     last_seed = sum(seeds for _, seeds in schedule)
     if last_seed >= FIRST_CONFIRMATION_SEED:
         fail(f"--budget {budget} is too large: the best noises would run with {last_seed} seeds")
+    if not args.noises:
+        check_others(args, algorithm, env_id)
     cell_of = {halving.BASELINE: ([], [])} | noises
     runs, returns = {}, {}
     while True:
@@ -81,6 +84,24 @@ def follow(args, algorithm, env_id):
     core_hours = left * seconds / 3600
     name = f"{algorithm.upper()} on {env_id}"
     return Choice(name, algorithm, env_id, schedule, args.confirm, state, runs, returns, core_hours)
+
+
+def check_others(args, algorithm, env_id):
+    """Exit if the folder holds a search among all of the paper's noises.
+
+    They were the default once. With today's list a search would mix with theirs.
+    """
+    ours = cells(args, algorithm, env_id)
+    for noise, rate in itertools.product(NOISES, args.noise_rates or RATES):
+        found = cell([(noise, rate)])
+        if found in ours:
+            continue
+        if result(make_run(args, algorithm, env_id, *found, seed=1))[0]:
+            fail(
+                f"{args.runs_dir} holds a choice among other noises, one of them "
+                f"{halving.spelled(as_text(found))}: go on with it (--noises paper tries all 90), "
+                "or choose another --runs-dir"
+            )
 
 
 def runs_of(found):
@@ -118,13 +139,14 @@ def as_text(found):
 def read_return(run, seed):
     """Return what a finished run counts for.
 
-    That is the mean over its last tests in the search, and its last test in the confirmation.
+    That is halving.score in the search, and its last test in the confirmation.
     """
     row = read_run(run.folder)
     if row["status"] != "finished":
         fail(f"{run.folder} cannot be used ({row['reason']}); delete it to run it again")
-    count = 1 if seed >= FIRST_CONFIRMATION_SEED else halving.LAST_TESTS
-    return fmean(row["returns"][-count:])
+    if seed >= FIRST_CONFIRMATION_SEED:
+        return row["returns"][-1]
+    return halving.score(row["steps"], row["returns"])
 
 
 def wall_time(run):
@@ -138,7 +160,7 @@ def wall_time(run):
 def plan(found):
     """Return lines that say, before a batch starts, what is due and what all of it will take."""
     if any(choice.state.due for choice in found):
-        return [*map(describe, found), total(found)]
+        return [*map(describe, found), total(found), reach(found)]
     return []
 
 
@@ -152,6 +174,17 @@ def total(found):
     return (
         f"{search + confirm} runs in all, {search} to search and {confirm} to confirm; "
         f"{finished} are done, about {hours} core-hours are left"
+    )
+
+
+def reach(found):
+    """Say what gain the confirmations of all choices can show."""
+    seeds = found[0].confirm
+    gain = detectable_shift(seeds, seeds, halving.LEVEL / len(found))
+    together = f", corrected for {len(found)} verdicts" if len(found) > 1 else ""
+    return (
+        f"{seeds} fresh seeds confirm a true gain of {gain:.1f} standard deviations over seeds "
+        f"with 80 % power{together}"
     )
 
 

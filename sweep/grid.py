@@ -41,6 +41,18 @@ NOISES = [  # as the paper's authors ran them: dropout keeps 90 %, mixup remembe
     "RandomUniformScaleReward(0.5, 1.5)",
     "RandomUniformScaleReward(0.8, 1.2)",
 ]
+# What choose tries by default, and why: docs/sweeps.md
+CHOOSE_NOISES = [
+    "RandomUniformNoisyObservation(-0.001, 0.001)",
+    "RandomUniformScaleObservation(0.8, 1.2)",
+    "RandomMixupObservation(0.5, recursive=True)",
+    "RandomNormalNoisyReward(1.0)",
+    "RandomUniformNoisyReward(-0.001, 0.001)",
+    "RandomUniformScaleReward(0.5, 1.5)",
+    "RandomEarlyTermination(50)",
+    "RandomNormalNoisyAction(0.1)",
+]
+CHOOSE_RATES = [0.05, 1.0]
 # The paper shows bars for several beta and names none of them: these are ours.
 ABLATION = [(f"RandomUniformScaleReward({2 - b:.1f}, {b})", 0.05) for b in (1.1, 1.2, 1.5, 1.8, 2)]
 ABLATION += [
@@ -105,7 +117,7 @@ def parse_args(view, caller, argv):
     parser.add_argument("--combine", action="store_true")
     parser.add_argument("--exclude", nargs="+", type=entry, default=[])
     parser.add_argument("--budget", type=whole_number)
-    parser.add_argument("--confirm", type=whole_number, default=10)
+    parser.add_argument("--confirm", type=whole_number, default=25)
     split = argv.index("--") if "--" in argv else len(argv)
     words, extra = argv[:split], argv[split + 1 :]
     given = {word.partition("=")[0] for word in words if word.startswith("--")}
@@ -300,8 +312,10 @@ def preset_pairs(preset, algorithm, env_id):
     """Return a preset's (noise, rate) pairs for one algorithm and environment."""
     if preset == "demo":
         return [("RandomEarlyTermination(50)", 1.0)]  # the paper's best for PPO on Pusher
-    if preset in ("paper", "choose"):
+    if preset == "paper":
         return list(itertools.product(NOISES, RATES))
+    if preset == "choose":
+        return list(itertools.product(CHOOSE_NOISES, CHOOSE_RATES))
     if preset == "ablation":
         return ABLATION
     if preset == "best":
@@ -332,11 +346,13 @@ def canonical(noises, rates):
 
 def cells(args, algorithm, env_id):
     """Return the noises and the rates of every noisy cell of the grid, in the order given."""
-    pairs = preset_pairs(args.preset, algorithm, env_id)
+    of_the_paper = args.noises == [entry("paper")]
+    given = [] if of_the_paper else args.noises
+    pairs = preset_pairs("paper" if of_the_paper else args.preset, algorithm, env_id)
     entries, rates = [[pair] for pair in pairs], []
-    if args.noises or args.noise_rates:
+    if given or args.noise_rates:
         names = dict.fromkeys(noise for noise, _ in pairs)
-        entries = args.noises or [[(noise, None)] for noise in names]
+        entries = given or [[(noise, None)] for noise in names]
         rates = args.noise_rates or list(dict.fromkeys(own for _, own in pairs))
     if args.combine:
         entries = entries + [a + b for a, b in itertools.combinations(entries, 2)]

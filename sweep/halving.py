@@ -25,7 +25,7 @@ from analysis.verdicts import interval, p_value, percent, power
 
 LEVEL = 0.05  # of a verdict, two-sided, over all verdicts of one command
 BASELINE = ("", "0.0")
-LAST_TESTS = 3  # a run's score in the search is the mean over so many of its last tests
+SCORED = 0.15  # a run's score in the search is the mean of its tests in this last part of its steps
 
 
 class Round(NamedTuple):
@@ -65,15 +65,17 @@ class Comparison(NamedTuple):
 def schedule(noises, budget):
     """Return the size of every round: [(noises, further seeds for each of them)].
 
-    As in Karnin et al.: ceil(log2 n) rounds share the budget equally, and each halves the noises.
-    The budget, in runs, is a target: every noise gets at least one seed in every round.
+    As in Karnin et al., each of ceil(log2 n) rounds halves the noises. There the rounds share the
+    budget equally; here in proportion to the square root of their number of noises, because a good
+    noise is lost in the first rounds more often than in the last (tools/simulate_choose.py). The
+    budget, in runs, is a target: every noise gets at least one seed in every round.
     """
-    rounds = math.ceil(math.log2(noises))
-    sizes = []
-    for _ in range(rounds):
-        sizes.append((noises, max(1, budget // (rounds * noises))))
+    numbers = []
+    while noises > 1:
+        numbers.append(noises)
         noises = math.ceil(noises / 2)
-    return sizes
+    whole = sum(map(math.sqrt, numbers))
+    return [(n, max(1, round(budget / whole / math.sqrt(n)))) for n in numbers]
 
 
 def number_of_runs(noises, budget, confirm):
@@ -103,6 +105,16 @@ def advance(noises, budget, confirm, returns):
         noises = survivors
     seeds = range(FIRST_CONFIRMATION_SEED, FIRST_CONFIRMATION_SEED + confirm)
     return State(rounds, noises, seeds, missing([*noises, BASELINE], seeds, returns))
+
+
+def score(steps, returns):
+    """Return a run's score in the search: the mean of its tests in the last 15 % of its steps.
+
+    steps (tests,): those of its tests in ascending order, returns (tests,): what they returned. The
+    last test always counts.
+    """
+    steps, returns = np.asarray(steps), np.asarray(returns)
+    return float(returns[steps[-1] - steps < SCORED * steps[-1]].mean())
 
 
 def missing(noises, seeds, returns):

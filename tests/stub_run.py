@@ -23,14 +23,14 @@ EPISODES = 10  # the scripts' default
 
 
 def episodes_of(algorithm, env_id, noise, rates, seed):
-    """Return the returns of four tests of a run, a pure function of what it is: (tests, episodes).
+    """Return the returns of ten tests of a run, a pure function of what it is: (tests, episodes).
 
     Every noise has a mean of its own, 100 +- 30; every episode is drawn around it.
     """
     kind = [algorithm, env_id, noise, rates]
     score = 100 + (random.Random(repr(kind)).gauss(0, 30) if noise else 0)
     rng = random.Random(repr([*kind, seed]))
-    return [[score + rng.gauss(0, 5) for _ in range(EPISODES)] for _ in range(4)]
+    return [[score + rng.gauss(0, 5) for _ in range(EPISODES)] for _ in range(10)]
 
 
 def tests_of(*run):
@@ -65,7 +65,7 @@ def train(argv):
     rows = ["step,episode,episodic_return,episodic_length"]
     for test, episodes in enumerate(tests, start=1):
         for episode, value in enumerate(episodes):
-            rows.append(f"{test * args.total_timesteps // 4},{episode},{value},100")
+            rows.append(f"{test * args.total_timesteps // 10},{episode},{value},100")
     (folder / "eval.csv").write_text("\n".join(rows) + "\n")
     result = {"total_timesteps": args.total_timesteps, "wall_time_seconds": 36.0}
     result["final_return_mean"] = fmean(tests[-1])
