@@ -954,7 +954,10 @@ def test_a_second_sweep_waits_for_the_runs_of_the_first(tmp_path, stub):
         ("choose --algos ppo", "choose needs --algos and --envs"),
         ("choose --envs Hopper-v5", "choose needs --algos and --envs"),
         (f"{C} --seeds 1-3", "leave out --seeds"),
-        (f"{C} --noises paper --budget 89", "--budget must be at least 90, a run for each noise, not 89"),
+        (
+            f"{C} --noises paper --budget 89",
+            "--budget must be at least 90, a run for each noise, not 89",
+        ),
         (f"{C} --budget 100000", "--budget 100000 is too large: the best noises would run with"),
         (f"{C} --confirm 3", "--confirm must be at least 4, not 3: with fewer seeds no difference"),
         (f"{C} --envs Hopper Pusher-v5 --confirm 4", "--confirm must be at least 5, not 4: "),
