@@ -427,7 +427,7 @@ def test_a_second_choice_takes_the_same_fresh_seeds(tmp_path):
     words = f"--algos | ppo | --envs | Pendulum-v1 | --noises | {A}@1 | --confirm | "
     assert [len(batch) for batch in batches(arguments(words + "4", tmp_path))] == [8]
     [more] = batches(arguments(words + "6", tmp_path))
-    assert {name.rpartition("__")[2] for name in more} == {"1005", "1006"}
+    assert {re.search(r"_s(\d+)_", name)[1] for name in more} == {"1005", "1006"}
 
 
 def test_another_choice_keeps_the_lines_of_the_first(tmp_path):
