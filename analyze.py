@@ -14,6 +14,7 @@ https://arxiv.org/abs/2305.02882; IQM and probability of improvement are those o
 """
 
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import dataclass, replace
@@ -22,13 +23,26 @@ from pathlib import Path
 import tyro
 
 from analysis.figures import figures, write_figure
-from analysis.formatting import text_table, write_table
+from analysis.formatting import text_table, wrapped, write_table
 from analysis.paper import read_paper
 from analysis.report import write_report
 from analysis.robustness import read_robustness, robustness_sentences, robustness_tables
 from analysis.runs import left_out, make_studies, read_choice, read_runs
 from analysis.tables import family_notes, make_tables, table_of
 from analysis.verdicts import sentences, tally
+
+# Columns that a terminal may have room for, the most important ones first
+MISSING_IN_SHORT = ["status", "reason", "seeds", "environment", "noise", "noise_rate", "run"]
+BEST_IN_SHORT = ["algorithm", "environment", "noise", "noise_rate", "improvement_percent"]
+BEST_IN_SHORT += [
+    "p_adjusted",
+    "p_luck",
+    "baseline_mean",
+    "baseline_std",
+    "noisy_mean",
+    "noisy_std",
+]
+BEST_IN_SHORT += ["n", "n_baseline"]
 
 
 @dataclass
@@ -112,21 +126,43 @@ def write_results(out, verdicts, tables, studies, overview, problems, notes):
     write_report(out, verdicts, tables, drawn, overview, problems, notes)
 
 
+def terminal_width():
+    """Return the number of columns of the terminal, or 0 for a file or a pipe."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
+
+
+def in_short(table, columns, rows=None):
+    """Return a table with some of its columns, and its first rows."""
+    return replace(table, frame=table.frame[columns][:rows], only_csv=())
+
+
 def print_results(out, verdicts, tables, overview, problems, notes):
     """Print the verdicts, the main table, and what to know about them."""
+    width = terminal_width()
+
+    def say(text):
+        print(wrapped(text, width))
+
     for line in shortened(verdicts):
-        print(line)
+        say(line)
     if "robustness_score" in tables:
         for line in robustness_sentences(tables["robustness_score"].frame):
-            print(line)
+            say(line)
     best = tables["best"]
-    print(f"\n{overview}\n\nBest noise tried (may be worse than none)\n")
-    print(f"{text_table(best)}\n\n{best.caption}\n")
+    print()
+    say(overview)
+    print("\nBest noise tried (may be worse than none)\n")
+    print(text_table(in_short(best, BEST_IN_SHORT), width))
+    print(f"\nMore columns: {out / 'best.csv'}\n")
+    say(best.caption)
+    print()
     for note in family_notes(tables["statistics"].frame) + notes:
-        print(f"note: {note}")
+        say(f"note: {note}")
     if problems:
-        first = replace(tables["missing"], frame=tables["missing"].frame.head(20))
-        print(f"\nWARNING: {problems}\n{text_table(first)}")
+        first = in_short(tables["missing"], MISSING_IN_SHORT, rows=20)
+        print()
+        say(f"WARNING: {problems}")
+        print(text_table(first, width))
         print(f"All of them: {out / 'missing.csv'}")
     print(f"\nOpen {out / 'report.html'}")
 
@@ -148,7 +184,8 @@ def main(args):
     studies, notes = make_studies(runs)
     if not studies:
         if len(missing):
-            print(text_table(table_of("missing", missing)))
+            short = in_short(table_of("missing", missing), MISSING_IN_SHORT)
+            print(text_table(short, terminal_width()))
         no_finished_run(args.runs_dir)
     robustness, unreadable = read_robustness(args.runs_dir, runs)
     notes += unreadable
@@ -170,7 +207,7 @@ def main(args):
 
 if __name__ == "__main__":
     try:
-        main(tyro.cli(Args))
+        main(tyro.cli(Args, description=__doc__))
         sys.stdout.flush()
     except BrokenPipeError:  # `| head` has read enough; all files are written
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

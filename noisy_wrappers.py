@@ -828,8 +828,8 @@ def _pair(noises: Sequence[str], rates: Sequence[float | str]) -> list[tuple[Noi
         raise ValueError("a noise rate without noise: name a noise, or leave the rate out")
     if len(rates) not in (1, len(noises)):
         raise ValueError(
-            f"give one noise rate for all noises or one for each: there are {len(noises)} noises "
-            f"and {len(rates)} noise rates"
+            "give one noise rate for all noises, or one for each "
+            f"(noises: {len(noises)}, noise rates: {len(rates)})"
         )
     canonical = [_spelled(_schedule(rate)) for rate in rates]
     if len(canonical) == 1:

@@ -187,7 +187,7 @@ def heatmap_figure(study, summary):
     grid = rows.pivot_table(index="noise", columns="noise_rate", values="improvement_percent")
     fig, ax, limit = heatmap(grid[sorted(grid.columns, key=rate_order)])
     ax.set_xlabel("noise rate")
-    ax.set_title(f"{study.algorithm} ({span(rows['n'])} seeds)")
+    ax.set_title(f"{study.algorithm} (seeds: {span(rows['n'])})")
     caption = f"{study.algorithm}: improvement of the final mean return over the baseline, mean "
     caption += f"over environments ({span(rows.groupby(['noise', 'noise_rate']).size())} in a "
     caption += f"cell); the colours end at \u00b1 {limit} %."
@@ -267,7 +267,7 @@ def robustness_heatmap(algorithm, environment, rows, clean):
         label.set(ha="right", rotation_mode="anchor")
     ax.set_title(f"{algorithm} on {environment}: trained with (rows), tested with (columns)")
     caption = (
-        f"{algorithm} on {environment} ({span(rows['n'])} seeds): mean return under the noise "
+        f"{algorithm} on {environment} (seeds: {span(rows['n'])}): mean return under the noise "
     )
     caption += "of the column, of policies trained with the noise of the row, as its difference "
     caption += "from the clean return of policies trained without noise, in percent of that. "

@@ -1,6 +1,7 @@
 """How results look as text: numbers, and tables in a terminal, in Markdown and in LaTeX."""
 
 import re
+import textwrap
 import zlib
 from dataclasses import dataclass, field
 
@@ -92,10 +93,23 @@ def shown(table):
     return text.rename(columns=lambda column: column.replace("_", " ").replace("percent", "%"))
 
 
-def text_table(table):
-    """Format a table for the terminal."""
+def text_table(table, width=0):
+    """Format a table for a terminal of this width (0: any), without the last columns if need be."""
     text = shown(table)
-    return tabulate(text.values, text.columns, disable_numparse=True) if len(text) else "(empty)"
+    if text.empty:
+        return "(empty)"
+    while True:
+        lines = tabulate(text.values, text.columns, disable_numparse=True)
+        if not width or text.shape[1] == 1 or max(map(len, lines.splitlines())) <= width:
+            return lines
+        text = text.iloc[:, :-1]
+
+
+def wrapped(text, width=0):
+    """Break a paragraph into lines of this width (0: any) between words."""
+    if not width:
+        return text
+    return textwrap.fill(text, width, break_long_words=False, break_on_hyphens=False)
 
 
 def write_table(out, table):

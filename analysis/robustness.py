@@ -20,7 +20,7 @@ import pandas as pd
 from analysis.formatting import P_VALUE, WHOLE, Table
 from analysis.runs import BASELINE, KEYS, order, rate_text
 from analysis.statistics import contrast, holm, improvement_percent, mann_whitney, mean_std
-from analysis.verdicts import DETECTABLE, LEVEL, p_value
+from analysis.verdicts import DETECTABLE, LEVEL, counted, p_value
 
 FILES = ("robustness.csv", "robustness.csv.gz")
 HEADER = ["noise", "noise_rate", "episode", "episodic_return", "episodic_length"]
@@ -296,7 +296,7 @@ def robustness_sentences(scores):
             verdict = f"{'' if row.p_holm <= LEVEL else 'perhaps '}{more} robust to new noise"
         limit = ""
         if row.smallest_p > LEVEL:
-            limit = f"; {row.n} seeds against {row.n_baseline} cannot show any"
+            limit = f"; {counted(row.n, 'seed')} against {row.n_baseline} cannot show any"
         elif row.p > LEVEL and row.detectable > 0:
             limit = f"; a difference of {row.detectable:.0f} would have been seen (80 % power)"
         corrected = p_value(row.p_holm).removeprefix("= ")

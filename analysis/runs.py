@@ -61,6 +61,9 @@ def read_config(folder):
         "matmul precision": config.get("matmul_precision"),
         "git commit": commit[:10] + commit[40:],
     }
+    for name, value in (("algorithm", config["algorithm"]), ("env_id", args["env_id"])):
+        if not isinstance(value, str):
+            raise ValueError(f"config.json: {name} is {value!r}")
     settings = {name: value for name, value in args.items() if name not in NOT_SETTINGS}
     return {
         "base": config["algorithm"],

@@ -34,7 +34,7 @@ from analysis.statistics import (
     probability_of_improvement,
     steps_to_reach,
 )
-from analysis.verdicts import power, verdict
+from analysis.verdicts import counted, power, verdict
 
 COLUMNS = {
     "summary": """algorithm environment noise noise_rate n mean std n_baseline baseline_mean
@@ -313,7 +313,7 @@ def family_notes(statistics):
         best = best.sort_index()
         for (size, smallest), same in best.groupby(keys, sort=False):
             where = f"{algorithm}, {', '.join(same['environment'])}"
-            seeds = f"{min(same['n'].min(), same['n_baseline'].min()):.0f} seeds"
+            seeds = counted(min(same["n"].min(), same["n_baseline"].min()), "seed")
             needed = ceil(round(size * smallest / 0.05, 9))
             if smallest > 0.05:
                 notes.append(

@@ -113,6 +113,11 @@ def interval(low, high):
     return f"[{low:.1f}, {high:.1f}]"
 
 
+def counted(number, word):
+    """Spell how many there are: "1 seed", "5 seeds"."""
+    return f"{number:.0f} {word}" + ("" if number == 1 else "s")
+
+
 def p_value(p):
     """Spell a p-value for a sentence: "= 0.04", or "< 0.001"."""
     return f"= {p:.2g}" if p >= 0.001 else "< 0.001"
@@ -164,9 +169,7 @@ def evidence(row):
 def reach(row):
     """Say what the seeds of a row without a clear difference could have shown, or ""."""
     n, m = int(row["n"]), int(row["n_baseline"])
-    seeds = f"{n} seeds" if n == m else f"{n} seeds against {m}"
-    if n == m == 1:
-        seeds = "one seed"
+    seeds = counted(n, "seed") if n == m else f"{counted(n, 'seed')} against {m}"
     parts = []
     if row["smallest_p"] > LEVEL:
         parts.append(f"{seeds} cannot show any (smallest possible p: {row['smallest_p']:.2g})")

@@ -1101,6 +1101,60 @@ def test_a_reader_that_stops_early_is_no_error(tmp_path):
     assert done.stderr == "" and done.returncode == 0
 
 
+@pytest.mark.parametrize("width", [70, 100, 140])
+def test_what_is_printed_fits_the_terminal(width, tmp_path, capsys, monkeypatch):
+    long = "RandomNormalNoisyObservation(1.0)"
+    for seed in range(1, 4):
+        write_run(tmp_path, [1.0, seed], seed=seed)
+        write_run(tmp_path, [1.0, seed], noise=long, rate=1.0, seed=seed)
+    write_run(tmp_path, [1.0, 5.0], noise=long, rate=1.0, seed=4, finished=False)
+    monkeypatch.setattr(analyze, "terminal_width", lambda: width)
+    monkeypatch.chdir(tmp_path)
+    analyze.main(analyze.Args(runs_dir=Path(".")))
+    lines = capsys.readouterr().out.splitlines()
+    assert width - 20 < max(map(len, lines)) <= width
+    [head] = [line for line in lines if line.startswith("algorithm  ")]
+    assert ("improvement %" in head) == (width > 70)
+    assert ("noisy" in head) == (width > 100)
+
+
+def test_a_file_gets_whole_lines(tmp_path):
+    """`grep`, and `head -n 1` of the demo, take lines for sentences."""
+    for seed in range(1, 5):
+        write_run(tmp_path, [1.0, seed], seed=seed)
+        write_run(tmp_path, [1.0, seed], noise=SCALE, rate=0.5, seed=seed)
+    command = [sys.executable, analyze.__file__, "--runs-dir", tmp_path]
+    first = subprocess.run(command, capture_output=True, text=True).stdout.splitlines()[0]
+    assert len(first) > 120 and first.endswith(".")
+
+
+def test_help_shows_the_commands():
+    command = [sys.executable, analyze.__file__, "--help"]
+    text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert "python analyze.py --runs-dir runs/demo --out somewhere" in text
+
+
+def test_one_seed_is_no_plural(tmp_path, capsys):
+    write_run(tmp_path, [1.0, 2.0])
+    write_run(tmp_path, [1.0, 2.0], noise=SCALE, rate=0.5)
+    analyze.main(analyze.Args(runs_dir=tmp_path))
+    printed = capsys.readouterr().out
+    assert "SAC, Hopper-v5: with 1 seed no difference can be significant" in printed
+    for text in (printed, (tmp_path / "results" / "report.html").read_text()):
+        assert not re.search(r"\b1 (seed|noise|run|comparison)s\b", text)
+
+
+@pytest.mark.parametrize("name", ["algorithm", "env_id"])
+def test_a_run_without_a_name_of_its_kind_is_corrupt(name, tmp_path, capsys):
+    write_run(tmp_path, [1.0, 2.0])
+    path = write_run(tmp_path, [1.0, 2.0], seed=2) / "config.json"
+    config = json.loads(path.read_text())
+    (config if name in config else config["args"])[name] = None
+    path.write_text(json.dumps(config))
+    analyze.main(analyze.Args(runs_dir=tmp_path))
+    assert f"config.json: {name} is None" in capsys.readouterr().out
+
+
 def test_one_baseline_run_is_enough_for_a_report(tmp_path, capsys):
     write_run(tmp_path / "runs", [1.0, 2.0])
     tables = run(tmp_path)

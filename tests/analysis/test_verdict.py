@@ -82,7 +82,7 @@ def test_three_seeds_cannot_show_anything():
     assert "p = 0.1; 3 seeds cannot show any (smallest possible p: 0.1)" in text
     _, said = judge([10.0], {"0.10": [5.0]})
     [text] = said["sentence"]
-    assert "difference: -50 %, p = 1; one seed cannot show any (smallest possible p: 1)." in text
+    assert "difference: -50 %, p = 1; 1 seed cannot show any (smallest possible p: 1)." in text
     _, said = judge([10.0, 11, 12], {"0.10": [9.0, 10]})
     [text] = said["sentence"]
     assert "2 seeds against 3 cannot show any (smallest possible p: 0.2)" in text
