@@ -125,13 +125,14 @@ def is_run(folder):
 
 
 def read_runs(runs_dir):
-    """Read all run folders; `status` is finished, unfinished, corrupt or duplicate.
+    """Read all run folders; `status` is finished, unfinished, corrupt, duplicate or failed.
 
     For the algorithms and environments in the choice.csv of `./benchmark.sh choose`, `phase` is
     search or confirmation, by the seed; for others it is empty.
     """
     runs_dir = Path(runs_dir)
     rows = [read_run(folder) for folder in sorted(runs_dir.iterdir()) if is_run(folder)]
+    rows += failed_without_a_folder(runs_dir)
     runs = pd.DataFrame(rows, columns=RUN_COLUMNS, dtype=object)
     runs["phase"] = ""
     choice = read_choice(runs_dir)
@@ -146,6 +147,18 @@ def read_runs(runs_dir):
     twice = (runs["status"] == "finished") & runs.duplicated(["status", *KEYS, "seed"])
     runs.loc[twice, ["status", "reason"]] = ["duplicate", "same configuration and seed as another"]
     return runs
+
+
+def failed_without_a_folder(runs_dir):
+    """Return the runs of a sweep that failed before they wrote anything: only their logs tell."""
+    rows = []
+    for path in sorted(runs_dir.glob("logs/*__*.log")):
+        # benchmark.sh frames a run's output by lines with "#"; "(" begins notes below a traceback
+        lines = path.read_text(errors="replace").splitlines()
+        told = [line for line in lines if line.strip() and not line.startswith(("# ", "("))]
+        if not (runs_dir / path.stem).exists() and told:
+            rows.append({"run": path.stem, "status": "failed", "reason": told[-1].strip()})
+    return rows
 
 
 def read_choice(runs_dir):

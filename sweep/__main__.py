@@ -218,6 +218,9 @@ def main(view, caller, argv):
         print(*choose.conclusion(choices, args.runs_dir), sep="\n")
     elif choices:
         print(*choose.standing(choices), sep="\n")
+    if over and any(p.state == "done" for p in progresses):
+        print(f"See the curves with: tensorboard --logdir {args.runs_dir}")
+        print(f"Make tables and figures with: python analyze.py --runs-dir {args.runs_dir}")
     return int(over and any(p.state != "done" for p in progresses))
 
 

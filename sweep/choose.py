@@ -73,6 +73,7 @@ def follow(args, algorithm, env_id):
             runs[noise, rate, seed] = run
             if result(run)[0]:
                 finished[noise, rate, seed] = read_return(run, seed)
+        check_frequencies(runs[key] for key in [*returns, *finished])
         if not finished:
             break
         returns |= finished
@@ -147,6 +148,20 @@ def read_return(run, seed):
     if seed >= FIRST_CONFIRMATION_SEED:
         return row["returns"][-1]
     return halving.score(row["steps"], row["returns"])
+
+
+def check_frequencies(runs):
+    """Exit if finished runs were not all tested equally often: their scores do not compare."""
+    found = {}
+    for run in runs:
+        made_with = json.loads((run.folder / "config.json").read_text())["args"]
+        found.setdefault(made_with.get("eval_frequency"), run.folder)
+    if len(found) > 1:
+        (every, one), (other, another), *_ = found.items()
+        fail(
+            f"{one} was tested every {every} steps and {another} every {other}: choose another "
+            f"--runs-dir, or delete the runs of one kind"
+        )
 
 
 def wall_time(run):

@@ -47,6 +47,7 @@ def train(argv):
     parser.add_argument("--total-timesteps", type=int, required=True)
     parser.add_argument("--runs-dir", required=True)
     parser.add_argument("--gamma", type=float, default=0.99)
+    parser.add_argument("--eval-frequency", type=int, default=100)
     args = parser.parse_args(argv)
     args.noise_rate = [rate if ":" in rate else float(rate) for rate in args.noise_rate]
     exp_name = args.script.removesuffix(".py")
