@@ -30,7 +30,7 @@ import stub_run
 import tyro
 
 from sweep import choose
-from sweep.grid import check, parse_args
+from sweep.grid import GIVEN_BY_THE_GRID, check, parse_args, script_options
 
 ROOT = Path(__file__).parents[2]
 PATH = f"{os.environ['PATH']}:/usr/sbin:/sbin"
