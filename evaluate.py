@@ -23,6 +23,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import traceback
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
@@ -191,8 +192,9 @@ def draw(run, noises, rates, args):
         env, policy = load(run, "human")
         [result] = play_episodes(make_noisy(env, noises, rates), policy, 1, args.seed)
         return result
-    except Exception as error:  # of any library that draws
-        return reason(error)
+    except Exception as error:  # of any library that draws, or of the environment
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        return f"{type(error).__name__}: {reason(error)} ({place.filename}, line {place.lineno})"
 
 
 def record(run, noises, rates, args):

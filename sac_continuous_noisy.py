@@ -389,6 +389,8 @@ def fail_on(errors, message, code=2):
     try:
         yield
     except errors as error:
+        hidden = isinstance(error.__context__, OSError)  # by torch.save: the disk is full, say
+        error = error.__context__ if hidden else error
         reason = " ".join(str(error).split()) or type(error).__name__
         fail(f"{message}: {reason}", code)
     except Exception as error:  # of the environment, say: its traceback is what the user needs
