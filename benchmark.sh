@@ -161,9 +161,12 @@ fi
 export PYTHON
 # An environment of the user's own lies where the command was given
 [ "$caller" = "$(pwd -P)" ] || export PYTHONPATH="${PYTHONPATH:+$PYTHONPATH:}$caller"
-"$PYTHON" -c "import sys, importlib.util as u; sys.exit(not all(map(u.find_spec, sys.argv[1:])))" \
-  gymnasium mujoco torch tyro tensorboard 2>/dev/null ||
-  fail "'$PYTHON' lacks a package: set PYTHON, or install requirements.txt into .venv"
+lacking=$("$PYTHON" -c "import sys, importlib.util as u
+print(*[name for name in sys.argv[1:] if not u.find_spec(name)], sep=', ')" \
+  gymnasium mujoco torch tyro tensorboard 2>/dev/null) ||
+  fail "'$PYTHON' is no Python 3: set PYTHON, or install requirements.txt into .venv"
+[ -z "$lacking" ] ||
+  fail "'$PYTHON' lacks $lacking: set PYTHON, or install requirements.txt into .venv"
 
 show() { "$PYTHON" -m sweep "$1" "$caller" ${grid[@]+"${grid[@]}"}; }
 if [ $view = status ]; then

@@ -25,7 +25,16 @@ from datetime import timedelta
 from pathlib import Path
 from typing import NamedTuple
 
-from sweep.grid import check, check_extra, command_line, grid, parse_args, result, runs_in
+from sweep.grid import (
+    check,
+    check_extra,
+    check_rollouts,
+    command_line,
+    grid,
+    parse_args,
+    result,
+    runs_in,
+)
 
 STOPPED = (129, 130, 138, 143)  # exit statuses of a run that was told to stop, by signal
 END = re.compile(r"# .* exit=(\d+)")
@@ -138,8 +147,10 @@ def show_list(args, runs):
             print(f"warning: {damage}", file=sys.stderr)
         else:
             states.append("todo")
-    if args.extra and "todo" in states:
-        check_extra(runs)
+    if "todo" in states:
+        check_rollouts(runs)
+        if args.extra:
+            check_extra(runs)
     for run, state in zip(runs, states, strict=True):
         folder = f"{run.folder.parent}/{run.folder.name}"  # with a slash, for --runs-dir . too
         print(folder, state, command_line(run), sep="\t")

@@ -140,6 +140,8 @@ def unknown_option(name):
     known = {f"--{option}" for script in scripts for option in defaults(script.name)}
     if name in known:
         return f"{name} is an option of the scripts: put it at the end, after --"
+    if name in EXECUTOR_OPTIONS:  # benchmark.sh reads it, unless it is written with a value
+        return f"{name} takes no value"
     near = difflib.get_close_matches(name, [*GRID_OPTIONS, *EXECUTOR_OPTIONS, *known], n=1)
     if not near:
         return f"unknown option {name}; ./benchmark.sh --help lists them"
@@ -476,6 +478,17 @@ def command_line(run):
     if ":" in run.kind[1] and "PYTHONPATH" in os.environ:  # where the environment's module lies
         words = ["env", f"PYTHONPATH={os.environ['PYTHONPATH']}", *words]
     return shlex.join(words)
+
+
+def check_rollouts(runs):
+    """Exit if runs are shorter than one rollout of PPO, which would fail one by one."""
+    for run in runs:
+        rollout = run.options.get("num-steps")
+        if isinstance(rollout, int) and run.total_timesteps < rollout:
+            fail(
+                f"--total-timesteps must be at least {rollout} for PPO (its --num-steps), not "
+                f"{run.total_timesteps}"
+            )
 
 
 def check_extra(runs):

@@ -604,7 +604,7 @@ def test_a_line_runs_when_pasted_into_a_shell(tmp_path):
 # CHOOSE
 
 CHOOSE = ["choose", "--algos", "ppo", "--envs", "Pendulum-v1", "--noise-rates", "1", "--confirm"]
-CHOOSE += ["4", "--budget", "6", "--total-timesteps", "1000", "--noises", A]
+CHOOSE += ["4", "--budget", "6", "--total-timesteps", "4000", "--noises", A]
 CHOOSE += ["RandomDropoutObservation(0.9)", "RandomMixupObservation(0.5)"]
 
 
@@ -994,6 +994,11 @@ def test_a_second_sweep_waits_for_the_runs_of_the_first(tmp_path, stub):
         ("demo --executor cloud", "unknown executor 'cloud'; choose local, parallel or slurm"),
         ("demo --jobs 0", "--jobs must be a number greater than 0, not '0'"),
         ("demo --jobs", "--jobs needs a value"),
+        ("demo --dry-run=1", "--dry-run takes no value"),
+        (
+            "demo --total-timesteps 2e3",
+            "--total-timesteps must be at least 2048 for PPO (its --num-steps), not 2000",
+        ),
         ("demo --sshlogin host", "--sshlogin and --remote-dir belong to --executor parallel"),
         ("demo -- --help", "--help after the -- would start nothing"),
         ("demo -- --seed 2", "--seed is part of the grid: use --seeds, before the --"),
@@ -1015,6 +1020,22 @@ def test_bad_input(args, message, tmp_path):
     lines = [line for line in result.err.splitlines() if not line.endswith("to do")]
     assert len(lines) == (11 if "unknown name" in message else 1)
     assert not result.out and not list(tmp_path.iterdir())
+
+
+def test_what_an_interpreter_lacks_is_named(tmp_path):
+    (tmp_path / "tyro.py").touch()
+    python = tmp_path / "python"  # without the packages that are installed beside it, but for tyro
+    python.write_text(f'#!/bin/sh\nPYTHONPATH={tmp_path} exec {sys.executable} -S "$@"\n')
+    python.chmod(0o755)
+    for interpreter, message in {
+        python: f"'{python}' lacks gymnasium, mujoco, torch, tensorboard: set PYTHON, or",
+        tmp_path / "nothing": f"'{tmp_path}/nothing' is no Python 3: set PYTHON, or",
+    }.items():
+        result = run(
+            "demo", "--runs-dir", tmp_path / "runs", env=ENV | {"PYTHON": str(interpreter)}
+        )
+        assert (result.code, result.out) == (2, "")
+        assert result.err == f"error: {message} install requirements.txt into .venv\n"
 
 
 @pytest.mark.parametrize(("executor", "program"), [("parallel", "parallel"), ("slurm", "sbatch")])
