@@ -6,29 +6,38 @@ p-values are corrected with Holm's method over them. The seeds from 11 on are an
 """
 
 import json
-import sys
-from pathlib import Path
 
-import jinja2
 import numpy as np
 import pandas as pd
+from common import (
+    DATA,
+    RESULTS,
+    cells,
+    compare_rows,
+    markdown,
+    plain,
+    read_returns,
+    render,
+    sample,
+    spell,
+    standard_error,
+    uncorrected,
+    welch,
+    welch_interval,
+)
 from scipy import stats
-from tabulate import tabulate
 
-RESULTS = Path(__file__).resolve().parent.parent
-DATA = RESULTS / "data"
-sys.path.insert(0, str(RESULTS.parent))
-from analysis.luck import (  # noqa: E402
+from analysis.luck import (
     CONSISTENT_PERCENT,
     DRAWS,
     draw_improvements,
     p_value,
 )
-from analysis.paper import PAPER_CONFIGURATIONS, PAPER_SEEDS, read_paper, with_luck  # noqa: E402
-from analysis.runs import KEYS, make_studies, read_runs  # noqa: E402
-from analysis.statistics import contrast, holm, improvement_percent, mann_whitney, wins  # noqa: E402
-from analysis.tables import make_tables  # noqa: E402
-from analysis.verdicts import power as finds  # noqa: E402
+from analysis.paper import PAPER_CONFIGURATIONS, PAPER_SEEDS, read_paper, with_luck
+from analysis.runs import make_studies, read_runs
+from analysis.statistics import contrast, holm, improvement_percent, mann_whitney, wins
+from analysis.tables import make_tables
+from analysis.verdicts import power as finds
 
 FIXED_SEEDS = range(1, 11)
 FRESH_SEEDS = range(11, 31)
@@ -87,31 +96,6 @@ FAR_ABOVE = 3000  # of PPO on HalfCheetah; chosen after seeds 1 to 10 were seen
 # ------------------------------------------------------------------------------------------ reading
 
 
-def plain(table):
-    """Name environments without their version, as in "Hopper"."""
-    return table.assign(environment=table["environment"].str.split("-").str[0])
-
-
-def read_returns(folder):
-    """Return one row per finished run: its configuration, seed, test and training return.
-
-    `error` is the variance that the test's few episodes give the test return.
-    """
-    runs = read_runs(folder).query("status == 'finished'").copy()
-    results = [json.loads((folder / run / "result.json").read_text()) for run in runs["run"]]
-    runs["test"] = [result["final_return_mean"] for result in results]
-    runs["training"] = [result["train_return_mean_last_100"] for result in results]
-    runs["error"] = [test_error(folder / run) for run in runs["run"]]
-    return plain(runs)[[*KEYS, "seed", "test", "training", "error"]]
-
-
-def test_error(run):
-    """Return the variance of the mean over the episodes of a run's last test."""
-    table = pd.read_csv(run / "eval.csv")
-    returns = table.loc[table["step"] == table["step"].max(), "episodic_return"]
-    return returns.var(ddof=1) / len(returns)
-
-
 def fixed_beforehand(runs, chosen):
     """Keep the runs of the comparisons that were fixed beforehand.
 
@@ -133,38 +117,10 @@ def cleanrl(returns):
 # --------------------------------------------------------------------------------------- statistics
 
 
-def sample(runs, column):
-    """Describe the runs of each environment: mean, sample standard deviation and number."""
-    groups = runs.groupby("environment")[column]
-    return pd.DataFrame({"mean": groups.mean(), "std": groups.std(ddof=1), "n": groups.size()})
-
-
 def variance_share(runs):
     """Return the percent of the variance between seeds that the test's few episodes make."""
     groups = runs.groupby("environment")
     return 100 * groups["error"].mean() / groups["test"].var(ddof=1)
-
-
-def standard_error(*samples):
-    """Return the standard error of the samples' means, added or subtracted."""
-    return np.sqrt(sum(x["std"] ** 2 / x["n"] for x in samples))
-
-
-def welch_interval(x, y):
-    """Return the 95 % interval of the difference of the samples' means, row by row."""
-    parts = np.array([z["std"] ** 2 / z["n"] for z in (x, y)])
-    df = parts.sum(axis=0) ** 2 / (parts**2 / [z["n"] - 1 for z in (x, y)]).sum(axis=0)
-    half = stats.t.ppf(0.975, df) * standard_error(x, y)
-    difference = x["mean"] - y["mean"]
-    return difference - half, difference + half
-
-
-def welch(x, y):
-    """Compare samples row by row: the difference in standard errors, and Welch's p."""
-    y = y.loc[x.index]
-    values = [z[name].to_numpy(float) for z in (x, y) for name in ("mean", "std", "n")]
-    p = stats.ttest_ind_from_stats(*values, equal_var=False).pvalue
-    return (x["mean"] - y["mean"]) / standard_error(x, y), p
 
 
 def power(effect, std, n, other_std, other_n, level=0.05):
@@ -186,31 +142,10 @@ def power_of_levene(ratio, n):
 # ----------------------------------------------------------------------------------------- spelling
 
 
-def cells(form, *columns):
-    """Write one text for each row of the columns; a dash where a value does not exist."""
-    rows = zip(*columns, strict=True)
-    return ["\u2013" if pd.isna(row[0]) else form.format(*row) for row in rows]
-
-
-def spell(x):
-    """Write a sample as mean ± standard deviation, with a decimal for returns of two digits."""
-    digits = np.where(x["mean"].abs() >= 100, 0, 1)
-    return [f"{m:,.{d}f} ± {s:,.{d}f}" for m, s, d in zip(x["mean"], x["std"], digits, strict=True)]
-
-
 def spell_average(row):
     """Write a row of the paper's averages over environments: mean ± standard deviation."""
     average, std = row["average_improvement_percent"], row["std_improvement_percent"]
     return f"{average:+.0f} ± {std:.0f} %"
-
-
-def markdown(columns):
-    """Write columns, or a list of dicts, as a Markdown table; after numbers "p" comes "Holm"."""
-    table = pd.DataFrame(columns)
-    if "p" in table:
-        table["Holm"] = cells("{:.2g}", holm(table["p"].to_numpy(float)))
-        table["p"] = cells("{:.2g}", table["p"])
-    return tabulate(table.values, table.columns, "pipe", disable_numparse=True)
 
 
 # ------------------------------------------------------------------------------- the paper's tables
@@ -587,34 +522,6 @@ def speed(summary):
     )
 
 
-def compare_rows(name, x, y):
-    """Compare samples x and y of test returns: a row of a table, and its numbers.
-
-    They are the exact p, and the difference of the means, in percent and with its interval.
-    """
-    p, _ = mann_whitney(np.array(x)[:, None], np.array(y)[:, None])
-    mean, other = np.mean(x), np.mean(y)
-    percent = improvement_percent(mean, other)
-    low, high = stats.ttest_ind(x, y, equal_var=False).confidence_interval(0.95)
-    d = 0 if abs(other) >= 100 else 1  # decimals, as in spell
-    row = {
-        "": name,
-        "n": f"{len(x)}, {len(y)}",
-        "first": f"{mean:,.{d}f} ± {np.std(x, ddof=1):,.{d}f}",
-        "second": f"{other:,.{d}f} ± {np.std(y, ddof=1):,.{d}f}",
-        "difference [95 %]": f"{mean - other:+,.{d}f} [{low:,.{d}f}, {high:,.{d}f}]",
-        "of the second": f"{percent:+.1f} %",
-        "p": f"{p:.2g}",
-    }
-    numbers = {"p": p, "percent": percent, "difference": mean - other}
-    return row, numbers | {"low": low, "high": high}
-
-
-def uncorrected(rows):
-    """Write rows of compare_rows as a Markdown table, without a column for Holm's p."""
-    return markdown(pd.DataFrame(rows).rename(columns={"p": "p (exact)"}))
-
-
 def pusher(runs):
     """PPO on Pusher with early termination: the fixed seeds, the fresh ones, and truncation."""
     runs = runs.query("environment == 'Pusher' and noise_rate in ('0.00', '1.00')")
@@ -935,23 +842,6 @@ def numbers():
         "commits": commits(five_runs["run"]),
         "scale": reward_scale(),
     }
-
-
-def render(template, values):
-    """Return the text of a Jinja template in this folder with these values."""
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    filters = {
-        "p": lambda x: f"{x:.2g}",
-        "g": lambda x: f"{x:g}",
-        "whole": lambda x: f"{x:,.0f}",
-        "tenth": lambda x: f"{x:.1f}",
-        "signed": lambda x: f"{x:+.1f}",
-        "signed_whole": lambda x: f"{x:+,.0f}",
-    }
-    options = {"undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
-    environment = jinja2.Environment(loader=loader, keep_trailing_newline=True, **options)
-    environment.filters |= filters
-    return environment.get_template(template).render(values)
 
 
 def page():

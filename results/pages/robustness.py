@@ -13,9 +13,9 @@ from functools import cache
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
-from claims import (
+from claims import FAR_ABOVE
+from common import (
     DATA,
-    FAR_ABOVE,
     RESULTS,
     compare_rows,
     markdown,

@@ -3,6 +3,7 @@
 import json
 
 import claims
+import common
 import future_work
 import numpy as np
 import pandas as pd
@@ -12,9 +13,10 @@ import robustness
 from gymnasium.wrappers import NormalizeReward
 from scipy import stats
 
+from analysis.runs import read_runs
 from analysis.verdicts import detectable_shift
 
-RESULTS, DATA = claims.RESULTS, claims.DATA
+RESULTS, DATA = common.RESULTS, common.DATA
 
 
 def test_the_page_is_what_its_command_writes():
@@ -26,7 +28,7 @@ def test_the_page_is_what_its_command_writes():
 def test_the_choice_on_the_page_is_that_of_the_runs():
     """choice.csv follows from the run folders, and the winner from its last round."""
     found = future_work.choice()
-    runs = claims.read_returns(DATA / "choice")
+    runs = common.read_returns(DATA / "choice")
     fresh = runs[runs["seed"] > 1000]
     x, y = (fresh.loc[fresh["noise"] == noise, "test"] for noise in (found["winner"], ""))
     assert len(x) == len(y) == 10
@@ -94,8 +96,8 @@ def test_welch_is_scipys():
     rng = np.random.default_rng(0)
     runs = pd.DataFrame({"environment": ["a"] * 5 + ["b"] * 7, "test": rng.normal(size=12)})
     other = runs.assign(test=rng.normal(size=12))
-    x, y = claims.sample(runs, "test"), claims.sample(other, "test")
-    errors, p = claims.welch(x, y)
+    x, y = common.sample(runs, "test"), common.sample(other, "test")
+    errors, p = common.welch(x, y)
     for i, name in enumerate("ab"):
         pair = [table.loc[table["environment"] == name, "test"] for table in (runs, other)]
         expected = stats.ttest_ind(*pair, equal_var=False)
@@ -118,7 +120,7 @@ def test_the_share_of_the_test_in_the_variance(tmp_path):
     lines = ["step,episode,episodic_return,episodic_length", "10,0,9,1", "10,1,0,1", "10,2,5,1"]
     lines += ["20,0,1,1", "20,1,2,1", "20,2,3,1"]
     (tmp_path / "eval.csv").write_text("\n".join(lines) + "\n")
-    assert claims.test_error(tmp_path) == pytest.approx(1 / 3)
+    assert common.test_error(tmp_path) == pytest.approx(1 / 3)
     runs = pd.DataFrame({"environment": ["a", "a"], "test": [2.0, 4.0], "error": [1 / 3, 1 / 3]})
     assert claims.variance_share(runs)["a"] == pytest.approx(100 / 3 / 2)
 
@@ -163,7 +165,7 @@ def test_the_five_comparisons_stay_on_seeds_1_to_10():
 
 def test_the_sets_of_runs_are_whole():
     """The page names the seeds of each comparison; a run that is lost must not go unnoticed."""
-    runs = claims.read_returns(DATA / "runs")
+    runs = common.read_returns(DATA / "runs")
     few, cheetah = claims.FEW_SEEDS, [*claims.FIXED_SEEDS, *claims.CHEETAH_SEEDS]
     expected = [
         ("PPO", "HalfCheetah", "", "0.00", cheetah),
@@ -176,7 +178,7 @@ def test_the_sets_of_runs_are_whole():
     found = runs.groupby(keys)["seed"].apply(sorted)
     for *key, seeds in expected:
         assert found[tuple(key)] == list(seeds), key
-    assert sorted(claims.read_returns(DATA / "long")["seed"]) == [1, 2, 3]
+    assert sorted(common.read_returns(DATA / "long")["seed"]) == [1, 2, 3]
 
 
 def test_worse_noises_by_hand(monkeypatch):
@@ -253,7 +255,7 @@ def test_td3_at_full_length_is_compared_with_its_papers(monkeypatch):
     ours = {"mean": 4000, "std": 100, "n": 3}
     theirs = {"mean": 4015.6, "std": 415.4, "n": 5}
     samples = [pd.DataFrame(x, index=[0]) for x in (ours, theirs)]
-    low, high = (limit[0] for limit in claims.welch_interval(*samples))
+    low, high = (limit[0] for limit in common.welch_interval(*samples))
     assert f"4,000 ± 100 | 4,016 ± 415 | -16 [{low:,.0f}, {high:,.0f}]" in rows[0]
     assert found["the paper, v2, test"]["low"] == pytest.approx(100 * low / 4015.6)
     assert f"| 4.0 ± 1.0   | 4,058 ± {658.78 * np.sqrt(1.5):.0f} |" in rows[1]
@@ -281,14 +283,14 @@ def test_the_interval_of_a_difference_is_scipys():
     samples = [
         pd.DataFrame({"mean": [a.mean()], "std": [a.std(ddof=1)], "n": [len(a)]}) for a in (x, y)
     ]
-    low, high = claims.welch_interval(*samples)
+    low, high = common.welch_interval(*samples)
     expected = stats.ttest_ind(x, y, equal_var=False).confidence_interval(0.95)
     assert (low[0], high[0]) == pytest.approx((expected.low, expected.high))
 
 
 def test_noise_and_baseline_of_a_seed_share_their_commit():
     """So that no change of the code can be taken for an effect, in the comparisons fixed before."""
-    runs = claims.read_runs(DATA / "runs").query("algorithm == 'PPO' and seed <= 10")
+    runs = read_runs(DATA / "runs").query("algorithm == 'PPO' and seed <= 10")
     late = runs["noise"].isin([claims.NORMAL, claims.TRUNCATING, claims.MIXUP, claims.PLAIN_MIXUP])
     runs = runs[~late].assign(
         commit=[
