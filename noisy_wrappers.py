@@ -45,7 +45,7 @@ from gymnasium.envs.registration import find_highest_version, get_env_id, parse_
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "MAY_DIFFER_IN_A_RUN",

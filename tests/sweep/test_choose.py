@@ -356,7 +356,7 @@ def test_the_core_hours_announced(algorithm, env, seconds, tmp_path):
 
 def test_the_readme_says_what_it_takes_by_default():
     text = " ".join((Path(__file__).parents[2] / "README.md").read_text().split())
-    pattern = r"takes (\d+) runs .* about (\d+) hours for PPO and (\d+) for SAC in a small env"
+    pattern = r"takes (\d+) runs of a .*: about (\d+) core-hours with PPO and (\d+) with SAC in a"
     runs, *hours = map(int, re.search(pattern, text).groups())
     for algorithm, announced in zip(("ppo", "sac"), hours, strict=True):
         args = parse_args("list", "/", ["choose", "--algos", algorithm, "--envs", "Hopper-v5"])

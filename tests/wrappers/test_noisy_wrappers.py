@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 import zlib
+from pathlib import Path
 
 import gymnasium as gym
 import noisyenv.wrappers as noisyenv
@@ -2085,7 +2086,11 @@ def test_doctests():
 
 
 def test_public_names():
-    assert re.fullmatch(r"\d+\.\d+\.\d+", noisy_wrappers.__version__)
+    version = noisy_wrappers.__version__
+    assert re.fullmatch(r"\d+\.\d+\.\d+", version)
+    root = Path(noisy_wrappers.__file__).parent
+    assert f"\nversion: {version}\n" in (root / "CITATION.cff").read_text()
+    assert f"\n## [{version}] - " in (root / "CHANGELOG.md").read_text()
     for name in noisy_wrappers.__all__:
         assert getattr(noisy_wrappers, name).__doc__
     assert set(WRAPPERS) < set(noisy_wrappers.__all__)
