@@ -59,7 +59,7 @@ class Args:
     checkpoint_frequency: int = 50_000  # environment steps between two checkpoints
     noise: tuple[str, ...] = ()  # noises of the training environment; without any: the baseline
     noise_rate: tuple[float | str, ...] = ()  # probability of each noise, or start:end of it
-    eval_frequency: int | None = None  # steps between tests (default 50,000 or less; 0: at the end)
+    eval_frequency: int | None = None  # steps between tests; None: at most 50,000; 0: at the end
     eval_episodes: int = 10  # episodes in each test
 
     cuda: bool = False  # train on a GPU (not tested on one yet); these networks are small
