@@ -27,7 +27,7 @@ from analysis.formatting import text_table, wrapped, write_table
 from analysis.paper import read_paper
 from analysis.report import write_report
 from analysis.robustness import read_robustness, robustness_sentences, robustness_tables
-from analysis.runs import left_out, make_studies, read_choice, read_runs
+from analysis.runs import STUDY, left_out, make_studies, read_choice, read_runs
 from analysis.tables import family_notes, make_tables, table_of
 from analysis.verdicts import sentences, tally
 
@@ -92,7 +92,7 @@ def no_finished_run(runs_dir):
 
 def shortened(verdicts, lines=15):
     """Yield the sentences of each algorithm and environment, or the first ones and a tally."""
-    groups = verdicts.groupby(["algorithm", "environment"], sort=False)
+    groups = verdicts.groupby([*STUDY, "scope", "environment"], sort=False)
     if len(groups) == 0:
         yield "There is no noise to compare with a baseline yet."
     for _, group in groups:
@@ -107,7 +107,7 @@ def overview_of(runs, studies):
     parts = [f"Finished runs: {(runs['status'] == 'finished').sum()}."]
     for study in studies:
         parts.append(
-            f"{study.algorithm}: {study.steps[-1]:,} steps, seeds: {len(study.seeds)}, "
+            f"{study.name}: {study.steps[-1]:,} steps, seeds: {len(study.seeds)}, "
             f"environments: {len(study.environments)}, "
             f"noise configurations: {len(study.returns) - 1}."
         )

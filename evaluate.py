@@ -37,7 +37,7 @@ from gymnasium.wrappers import RecordVideo
 from tabulate import tabulate
 from tqdm import tqdm
 
-from analysis.runs import is_run, labels, read_config
+from analysis.runs import differing_settings, is_run, read_config, study_name
 from noisy_wrappers import (
     NotFiniteError,
     canonical_env_id,
@@ -76,11 +76,11 @@ class Run(NamedTuple):
     """A finished run, as analysis.runs.read_config reads and names it."""
 
     folder: Path
-    base: str  # the algorithm
+    algorithm: str
     environment: str
     noise: str
     noise_rate: str
-    settings: str  # the other arguments, as JSON
+    arguments: str  # the others, as JSON
 
 
 def fail(message, code=2):
@@ -149,7 +149,7 @@ def read_conditions(args):
 
 def load(run, render_mode=None):
     """Return a run's clean environment and its policy, NumPy to NumPy."""
-    name = f"{run.base}_continuous_noisy".lower()
+    name = f"{run.algorithm}_continuous_noisy".lower()
     try:
         script = importlib.import_module(name)
     except ImportError as error:
@@ -158,7 +158,7 @@ def load(run, render_mode=None):
         canonical_env_id(run.environment)  # imports its module
     except ValueError as error:
         fail(error)
-    steps = json.loads(run.settings).get("max_episode_steps")
+    steps = json.loads(run.arguments).get("max_episode_steps")
     drawn = {"render_mode": render_mode} if render_mode else {}  # not every class takes it
     env = script.make_env(run.environment, max_episode_steps=steps, **drawn)
     try:
@@ -286,10 +286,11 @@ def write_stored(run, stored):
 
 def algorithms(runs):
     """Name the runs' algorithms as analyze.py does: where settings differ, the name says which."""
-    table = pd.DataFrame(runs).assign(phase="")
-    for base, group in table.groupby("base"):
-        table.loc[group.index, "algorithm"] = labels(base, group)
-    return table["algorithm"]
+    table = pd.DataFrame(runs).assign(status="finished", name="")
+    for algorithm, group in table.groupby("algorithm"):
+        names = [study_name(algorithm, settings) for settings in differing_settings(group)]
+        table.loc[group.index, "name"] = names
+    return table["name"]
 
 
 def print_table(runs, conditions, stored, episodes):

@@ -37,7 +37,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -100,6 +100,8 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         opportunities: how often the noise might have acted (episodes for early termination).
         times_applied: how often it did.
     """
+
+    kind: ClassVar[str]  # what it perturbs: "observation", "reward", "action" or "dynamics"
 
     def __init__(self, env: Env, noise_rate: float | str, **parameters: Any):
         """Raise ValueError unless noise_rate is in [0, 1] or "start:end" of two such rates."""
@@ -209,6 +211,8 @@ class ObservationNoise(NoiseWrapper):
     clipped to their dtype. The space is widened to what noise can reach. The observation of
     ``reset()`` is perturbed like any other.
     """
+
+    kind = "observation"
 
     def __init__(self, env: Env, noise_rate: float | str, **parameters: Any):
         """Raise ValueError unless observations are a Box of numbers that are no categories."""
@@ -437,6 +441,8 @@ class RewardNoise(NoiseWrapper):
     The reward may be an array of one number; perturbed it is a float.
     """
 
+    kind = "reward"
+
     def step(self, action: Any) -> Step:
         """Step the environment and perturb the reward with probability p."""
         observation, reward, terminated, truncated, info = self.env.step(action)
@@ -532,6 +538,8 @@ class RandomEarlyTermination(NoiseWrapper):
     [(False, False, {}), (True, False, {'noise': ('RandomEarlyTermination',)})]
     """
 
+    kind = "dynamics"
+
     def __init__(
         self,
         env: Env,
@@ -605,6 +613,8 @@ class RandomNormalNoisyAction(NoiseWrapper):
     -0.350
     """
 
+    kind = "action"
+
     def __init__(self, env: Env, noise_rate: float | str, scale: float, *, loc: float = 0.0):
         """Raise ValueError unless scale >= 0, both are finite and actions are a Box of floats."""
         self.scale = _number("scale", scale, low=0)
@@ -645,8 +655,8 @@ WRAPPERS: dict[str, type[NoiseWrapper]] = {
         RandomNormalNoisyAction,
     )
 }
-# What changes the dynamics acts before an episode's statistics are recorded, in this order.
-_DYNAMICS: tuple[type[NoiseWrapper], ...] = (RandomEarlyTermination, RandomNormalNoisyAction)
+# Noise of these kinds acts before an episode's statistics are recorded, in this order.
+_BEFORE_STATISTICS = ("dynamics", "action")
 # What gives away Gymnasium's RecordEpisodeStatistics and Stable-Baselines3's Monitor.
 _OF_RECORDERS = ("return_queue", "get_episode_rewards")
 _RECORDED = (
@@ -848,8 +858,9 @@ def _listed(name: str, values: Any, example: str) -> list[Any]:
 
 def _place(pair: tuple[Noise, float | str]) -> int:
     """Return where make_noisy puts a noise: what changes the dynamics comes first."""
-    wrapper = pair[0].wrapper
-    return _DYNAMICS.index(wrapper) if wrapper in _DYNAMICS else len(_DYNAMICS)
+    kind = pair[0].wrapper.kind
+    before = kind in _BEFORE_STATISTICS
+    return _BEFORE_STATISTICS.index(kind) if before else len(_BEFORE_STATISTICS)
 
 
 def canonical_noises(
@@ -906,12 +917,12 @@ def make_noisy(
     if recorded and any(noise.wrapper is RandomEarlyTermination for noise, _ in pairs):
         raise ValueError(_RECORDED_BENEATH_EARLY_TERMINATION)
     for noise, rate in pairs:
-        if noise.wrapper in _DYNAMICS:
+        if noise.wrapper.kind in _BEFORE_STATISTICS:
             env = noise(env, rate)
     if record_statistics:
         env = RecordEpisodeStatistics(env)
     for noise, rate in pairs:
-        if noise.wrapper not in _DYNAMICS:
+        if noise.wrapper.kind not in _BEFORE_STATISTICS:
             env = noise(env, rate)
     return env
 

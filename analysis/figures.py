@@ -8,11 +8,13 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from analysis.configurations import BASELINE, rate_order
 from analysis.formatting import MERGED, slug
-from analysis.runs import BASELINE, rate_order
+from analysis.runs import STUDY, rows_of, study_name
 
-matplotlib.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
-matplotlib.rcParams["svg.hashsalt"] = "noisy"  # equal figures are equal files
+STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
+STYLE["svg.hashsalt"] = "noisy"  # equal figures are equal files
+matplotlib.rcParams.update(STYLE)
 WIDTH, HEIGHT = 10, 5.5  # inches of every figure; one with many rows is higher
 viridis = matplotlib.colormaps["viridis"]  # ordered by lightness, so it reads in grey
 TOP = 10  # configurations in the interval plot
@@ -22,20 +24,21 @@ def figures(studies, tables):
     """Yield (name, figure, caption) for every figure, in the order of the report."""
     statistics = tables["statistics"].frame
     for study in studies:
-        tested = statistics[(statistics["algorithm"] == study.algorithm) & statistics["p"].notna()]
-        summary = tables[f"summary_{study.base}"].frame
-        summary = summary[summary["algorithm"] == study.algorithm]
+        tested = statistics[rows_of(statistics, study.key) & statistics["p"].notna()]
+        summary = tables[f"summary_{study.algorithm}"].frame
+        summary = summary[rows_of(summary, study.key)]
         if tested["improvement_iqm_percent"].notna().any():
             yield interval_figure(study, tested)
-        noises = sorted({noise for noise, _ in study.returns if noise})
+        noises = sorted({config.noise for config in study.returns if not config.is_baseline})
         if tested["improvement_iqm_percent"].notna().any() and len(noises) > 1:
             yield heatmap_figure(study, summary)
         for noise in noises or [""]:
             yield curves_figure(study, noise)
-        for wrapper in sorted({noise.split("(")[0] for noise in noises}):
-            variants = [n for n in noises if n.split("(")[0] == wrapper and " + " not in n]
+        single = [config for config in study.returns if len(config.noises) == 1]
+        for wrapper in sorted({config.wrappers[0] for config in single}):
+            variants = sorted({config.noise for config in single if config.wrappers == [wrapper]})
             if len(variants) > 1:
-                yield ablation_figure(study, summary, variants)
+                yield ablation_figure(study, summary, wrapper, variants)
     if "robustness" in tables:
         yield from robustness_figures(tables["robustness"].frame)
 
@@ -79,14 +82,14 @@ def curves_figure(study, noise):
 
     There is a panel for each environment in which this noise was tried.
     """
-    configs = [config for config in study.returns if config[0] in ("", noise)]
-    noisy = [config[0] == noise for config in configs]
+    configs = [config for config in study.returns if config.noise in ("", noise)]
+    noisy = [config.noise == noise for config in configs]
     counts = np.stack([np.isfinite(study.final(config)).sum(axis=0) for config in configs])
     tried = np.flatnonzero(counts[noisy].any(axis=0))
     labels = []
-    for (name, rate), n in zip(configs, counts[:, tried], strict=True):
-        seeds = span(n[n > 0])  # in the panels that have the line
-        labels.append(f"rate {rate} (n = {seeds})" if name else f"no noise (n = {seeds})")
+    for config, n in zip(configs, counts[:, tried], strict=True):
+        name = "no noise" if config.is_baseline else f"rate {config.noise_rate}"
+        labels.append(f"{name} (n = {span(n[n > 0])})")  # in the panels that have the line
     fig, axes, add_legend = panels([study.environments[e] for e in tried], labels)
     unit, word = (1e6, "millions") if study.steps[-1] >= 1e6 else (1e3, "thousands")
     x, every = study.steps / unit, max(1, len(study.steps) // 8)
@@ -98,16 +101,16 @@ def curves_figure(study, noise):
         color, line, marker = line_style(i, len(configs))
         width = 1.8 if config == BASELINE else 1.1
         marks = {"marker": marker, "markevery": (min(i, every - 1), every), "markersize": 4.5}
-        ax.plot(x, mean, line, color=color, linewidth=width, label=config[1], **marks)
+        ax.plot(x, mean, line, color=color, linewidth=width, label=config.noise_rate, **marks)
         ax.fill_between(x, mean - std, mean + std, color=color, alpha=0.07, linewidth=0)
         ax.set_xlabel(f"training steps ({word})")
     add_legend()
-    title = f"{study.algorithm}, {noise or 'no noise'}"
+    title = f"{study.name}, {noise or 'no noise'}"
     caption = f"{title}: learning curves, mean over n seeds, shaded \u00b1 one standard deviation."
     return f"curves_{slug(title)}", fig, caption
 
 
-def ablation_figure(study, summary, noises):
+def ablation_figure(study, summary, wrapper, noises):
     """Draw bars of the final return: a wrapper's parameters side by side, grouped by noise rate."""
     baseline = summary[summary["noise"] == ""]
     groups = [summary[summary["noise"] == noise] for noise in noises]
@@ -118,7 +121,8 @@ def ablation_figure(study, summary, noises):
     fig, axes, add_legend = panels(study.environments, labels)
     width = 0.8 / len(noises)
     for ax, env in zip(axes, study.environments, strict=True):
-        rows = baseline[baseline["environment"] == env].set_index("noise_rate").reindex(["0.00"])
+        rows = baseline[baseline["environment"] == env].set_index("noise_rate")
+        rows = rows.reindex([BASELINE.noise_rate])
         bars(ax, [-1], rows, 0.6, color="white", hatch="", label=labels[0])
         ax.axhline(rows["mean"].iloc[0], color="black", linewidth=0.6, linestyle=":")
         ax.axhline(0, color="black", linewidth=0.6)
@@ -131,10 +135,9 @@ def ablation_figure(study, summary, noises):
         ax.set_xticks([-1, *range(len(rates))], ["none", *rates])
         ax.set_xlabel("noise rate")
     add_legend()
-    wrapper = noises[0].split("(")[0]
-    caption = f"{study.algorithm}, {wrapper}: final test return by parameters and noise rate. "
+    caption = f"{study.name}, {wrapper}: final test return by parameters and noise rate. "
     caption += "Bars: mean over n seeds, whiskers \u00b1 one standard deviation; dotted: no noise."
-    return f"ablation_{slug(study.algorithm)}_{wrapper}", fig, caption
+    return f"ablation_{slug(study.name)}_{wrapper}", fig, caption
 
 
 def bars(ax, place, rows, width, **look):
@@ -187,11 +190,11 @@ def heatmap_figure(study, summary):
     grid = rows.pivot_table(index="noise", columns="noise_rate", values="improvement_percent")
     fig, ax, limit = heatmap(grid[sorted(grid.columns, key=rate_order)])
     ax.set_xlabel("noise rate")
-    ax.set_title(f"{study.algorithm} (seeds: {span(rows['n'])})")
-    caption = f"{study.algorithm}: improvement of the final mean return over the baseline, mean "
+    ax.set_title(f"{study.name} (seeds: {span(rows['n'])})")
+    caption = f"{study.name}: improvement of the final mean return over the baseline, mean "
     caption += f"over environments ({span(rows.groupby(['noise', 'noise_rate']).size())} in a "
     caption += f"cell); the colours end at \u00b1 {limit} %."
-    return f"heatmap_{slug(study.algorithm)}", fig, caption
+    return f"heatmap_{slug(study.name)}", fig, caption
 
 
 def interval_figure(study, statistics):
@@ -199,7 +202,7 @@ def interval_figure(study, statistics):
 
     Those of several environments together, or, where there are none, those of each.
     """
-    all_rows = statistics[statistics["environment"] == "all"]
+    all_rows = statistics[statistics["scope"] == "all"]
     together = len(all_rows) > 0
     rows = all_rows if together else statistics
     rows = rows[rows["environments"] == rows["environments"].max()]  # the same ones for all
@@ -224,24 +227,25 @@ def interval_figure(study, statistics):
     right.set_xlabel("probability of improvement")
     right.set_xlim(-0.02, 1.02)
     where = f"{rows['environments'].iloc[0]:.0f} environments" if together else "each alone"
-    caption = f"{study.algorithm}, {where}: improvement with 95 % intervals (none for n < 3); "
+    caption = f"{study.name}, {where}: improvement with 95 % intervals (none for n < 3); "
     caption += "dashed: no improvement."
     if len(rows) < of:
         caption += f" The {len(rows)} best of {of} are chosen on the seeds that are shown, so "
         caption += "they look better than they are."
-    return f"intervals_{slug(study.algorithm)}", fig, caption
+    return f"intervals_{slug(study.name)}", fig, caption
 
 
 def robustness_figures(table):
     """Yield (name, figure, caption) for every figure of robustness: heatmaps, then curves."""
-    for (algorithm, environment), rows in table.groupby(["algorithm", "environment"]):
+    for (*study, environment), rows in table.groupby([*STUDY, "environment"]):
         clean = rows[(rows["noise"] == "") & (rows["test_noise"] == "")]["mean"]
         if len(clean) and clean.iloc[0] != 0 and len(rows) > 1:
-            yield robustness_heatmap(algorithm, environment, rows, clean.iloc[0])
-    for (algorithm, noise), rows in table.groupby(["algorithm", "test_noise"]):
-        if noise and " + " not in noise and rows["test_rate"].nunique() >= 3:
-            clean = (table["algorithm"] == algorithm) & (table["test_noise"] == "")
-            yield robustness_curves(algorithm, noise, pd.concat([table[clean], rows]))
+            yield robustness_heatmap(study_name(*study), environment, rows, clean.iloc[0])
+    for (*study, noise), rows in table.groupby([*STUDY, "test_noise"]):
+        of_one_noise = pd.to_numeric(rows["test_rate"], errors="coerce").notna().all()
+        if noise and of_one_noise and rows["test_rate"].nunique() >= 3:
+            clean = rows_of(table, study) & (table["test_noise"] == "")
+            yield robustness_curves(study_name(*study), noise, pd.concat([table[clean], rows]))
 
 
 def robustness_heatmap(algorithm, environment, rows, clean):

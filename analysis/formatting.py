@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import pandas as pd
 from tabulate import tabulate
 
-from analysis.runs import rate_order
+from analysis.configurations import rate_order
 
 # Formats of numbers. z: no "-0"
 TENTH, WHOLE, PLAIN, SHARE, P_VALUE = "z,.1f", "z,.0f", "g", ".2f", ".2g"
@@ -74,8 +74,16 @@ def merged(title, parts, table, text):
 
 
 def shown(table):
-    """Return a frame as a person reads it: all text, related columns in one, rates side by side."""
+    """Return a frame as a person reads it: all text, related columns in one, rates side by side.
+
+    Settings and phase are shown where a row has any; a row of all environments says so.
+    """
     frame = table.frame.reset_index(drop=True).drop(columns=list(table.only_csv))
+    if "scope" in frame:
+        frame["environment"] = frame["environment"].mask(frame.pop("scope") == "all", "all")
+    for name in ("settings", "phase"):
+        if name in frame and (frame[name].isna() | frame[name].eq("")).all():
+            frame = frame.drop(columns=name)
     cells = {
         name: [spelled(name, value, table.formats.get(name, TENTH)) for value in frame[name]]
         for name in frame
@@ -87,7 +95,7 @@ def shown(table):
             text = text.drop(columns=list(parts[1:])).rename(columns={parts[0]: title})
     if table.name == "early_performance" and len(text):
         text["mean"] += " (" + text.pop("n") + ")"
-        keys = ["algorithm", "environment", "noise", "steps_millions"]
+        keys = [name for name in text if name not in ("noise_rate", "mean")]
         text = text.pivot(index=keys, columns="noise_rate", values="mean").fillna("\u2013")
         text = text[sorted(text.columns, key=rate_order)].reset_index()
     return text.rename(columns=lambda column: column.replace("_", " ").replace("percent", "%"))

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.runs import BASELINE
+from analysis.configurations import BASELINE
+from analysis.runs import STUDY, rows_of
 
 DRAWS = 10_000
 SEEDS_TO_RESAMPLE = 20  # with fewer seeds of the baseline, returns are taken as normal
@@ -105,7 +106,7 @@ def luck_of_study(study):
 
 
 def luck_of_paper(best, seeds, configurations):
-    """Draw the paper's sweep from its table of best noises: a dict of algorithm -> Luck.
+    """Draw the paper's sweep from its table of best noises: a dict of (algorithm, "", "") -> Luck.
 
     The standard deviation is the baseline's. That of the best noise is known, too, but belongs to a
     winner, which had luck with its seeds.
@@ -114,15 +115,15 @@ def luck_of_paper(best, seeds, configurations):
     `configurations` in every environment.
     """
     lucks = {}
-    for algorithm, rows in best.groupby("algorithm"):
-        rng, n = np.random.default_rng(0), seeds[algorithm]
+    for key, rows in best.groupby(STUDY):
+        rng, n = np.random.default_rng(0), seeds[key[0]]
         draws = [
             draw_improvements(
                 row.baseline_mean, row.baseline_std, n - 1, n, configurations * [n], rng
             )
             for row in rows.itertuples()
         ]
-        lucks[algorithm] = summarize(list(rows["environment"]), np.stack(draws))
+        lucks[key] = summarize(list(rows["environment"]), np.stack(draws))
     return lucks
 
 
@@ -132,10 +133,13 @@ def p_value(draws, observed):
 
 
 def add_luck_of_best(best, lucks):
-    """Add to a table of best noises what the best of as many useless configurations shows."""
+    """Add to a table of best noises what the best of as many useless configurations shows.
+
+    lucks: a dict of what the columns STUDY have -> Luck.
+    """
     best = best.assign(luck_median_percent=np.nan, luck_95_percent=np.nan, p_luck=np.nan)
     for row in best.itertuples():
-        draws = lucks[row.algorithm].best.get(row.environment)
+        draws = lucks[row.algorithm, row.settings, row.phase].best.get(row.environment)
         if draws is not None:
             best.loc[row.Index, "luck_median_percent"] = np.median(draws)
             best.loc[row.Index, "luck_95_percent"] = np.quantile(draws, 0.95)
@@ -149,25 +153,26 @@ def add_luck_of_consistent(good, bad, lucks):
     It is the probability that the highest average improvement of as many useless configurations is
     at least as high, and that the lowest is at least as low.
     """
-    rows = zip(good["algorithm"], good["average_improvement_percent"], strict=True)
-    good = good.assign(p_luck=[p_value(lucks[name].highest, value) for name, value in rows])
-    rows = zip(bad["algorithm"], bad["average_improvement_percent"], strict=True)
-    bad = bad.assign(p_luck=[p_value(-lucks[name].lowest, -value) for name, value in rows])
+    columns = [*STUDY, "average_improvement_percent"]
+    rows = good[columns].itertuples(index=False)
+    good = good.assign(p_luck=[p_value(lucks[*key].highest, value) for *key, value in rows])
+    rows = bad[columns].itertuples(index=False)
+    bad = bad.assign(p_luck=[p_value(-lucks[*key].lowest, -value) for *key, value in rows])
     return good, bad
 
 
 def luck_rows(lucks, best, good, bad):
-    """Yield one row per algorithm: what its tables have, and what they would have by luck.
+    """Yield one row per study: what its tables have, and what they would have by luck.
 
     The tables are those of best, consistent and consistently worse noise, with p_luck.
     """
-    for algorithm, luck in lucks.items():
+    for key, luck in lucks.items():
         p_best, p_good, p_bad = (
-            table.loc[table["algorithm"] == algorithm, "p_luck"] for table in (best, good, bad)
+            table.loc[rows_of(table, key), "p_luck"] for table in (best, good, bad)
         )
         if len(p_best) == 0:
             continue
-        row = {"algorithm": algorithm, "environments": len(p_best)}
+        row = dict(zip(STUDY, key, strict=True)) | {"environments": len(p_best)}
         row |= {"best_beyond_luck": (p_best <= LUCKY).sum(), "configurations": luck.configurations}
         if luck.configurations:
             row |= count_row("consistent", p_good, luck.consistent)

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from analysis.configurations import BASELINE, rate_text
 from analysis.luck import add_luck_of_best, add_luck_of_consistent, luck_of_paper, luck_rows
-from analysis.runs import BASELINE, KEYS, rate_text, split_version
+from analysis.runs import KEYS, rows_of, split_version
 
 PAPER_SEEDS = {"SAC": 5, "TD3": 5, "PPO": 10}
 PAPER_ENVIRONMENTS = 5
@@ -42,16 +43,17 @@ def read_paper(folder):
         if "noise_as_run" not in table:
             raise ValueError(f"{folder} has no tables of the paper (results/paper has them)")
         table["noise"] = table["noise_as_run"]
-        table["noise_rate"] = [rate_text([rate]) for rate in table["noise_rate"]]
-        tables[name] = table
+        rates = table["noise_rate"].astype(float)
+        table["noise_rate"] = [rate_text((rate, rate)) for rate in rates]
+        tables[name] = table.assign(settings="", phase="")
     return tables
 
 
 def compare_tables(paper, lengths, summary, best, consistency, good, bad, early):
     """Yield (name, table) for each table of `paper`, a dict from read_paper.
 
-    `lengths` has the steps of each algorithm: final returns after fewer steps than the paper's are
-    shown beside them, without a difference.
+    `lengths` has the steps of each study, by the values of its columns STUDY: final returns after
+    fewer steps than the paper's are shown beside them, without a difference.
     """
     luck = None
     if {"best", "consistent", "consistently_worse"} <= paper.keys():
@@ -86,26 +88,25 @@ def with_baseline_rows(paper):
     """Turn rows with noise and baseline side by side into rows of noise and rows of baseline."""
     noisy = paper.rename(columns={"noisy_mean": "mean", "noisy_std": "std"})
     baseline = paper.rename(columns={"baseline_mean": "mean", "baseline_std": "std"})
-    noise, rate = BASELINE
-    baseline = baseline.assign(noise=noise, noise_rate=rate)
+    baseline = baseline.assign(noise=BASELINE.noise, noise_rate=BASELINE.noise_rate)
     baseline = baseline.drop(columns=[name for name in LUCK if name in baseline])
     return pd.concat([noisy, baseline], ignore_index=True)
 
 
 def only_equal_steps(table, lengths):
-    """Take out the differences of algorithms that ran for other steps than the paper's."""
-    others = [algorithm for algorithm, steps in lengths.items() if steps != PAPER_STEPS]
-    table.loc[table["algorithm"].isin(others), "difference_se"] = np.nan
+    """Take out the differences of studies that ran for other steps than the paper's."""
+    others = [key for key, steps in lengths.items() if steps != PAPER_STEPS]
+    for key in others:
+        table.loc[rows_of(table, key), "difference_se"] = np.nan
     return table
 
 
 def matching_keys(table, names):
     """Return a tuple for each row: the values of `names` as ours and the paper's rows share them.
 
-    The algorithm is without its settings ("SAC [gamma=0.9]"), the environment without its version.
+    The environment is without its version.
     """
     shared = table[names].copy()
-    shared["algorithm"] = [name.split(" [")[0] for name in table["algorithm"]]
     if "environment" in names:
         shared["environment"] = [split_version(env)[0] for env in table["environment"]]
     if "steps_millions" in names:
@@ -120,15 +121,16 @@ def compare_table(ours, listed, paper, mean, std, number):
     shown only where the paper has them, too; `mean`, `std` and `number` name its columns. The
     difference is in standard errors: (ours - paper) / sqrt(std^2 / n + paper_std^2 / paper_n).
     """
-    names = [name for name in (*KEYS, "steps_millions") if name in paper]
+    keys = [name for name in (*KEYS, "steps_millions") if name in paper]
+    names = [name for name in keys if name not in ("settings", "phase")]
     ours = ours.assign(key=matching_keys(ours, names))
     paper = paper.assign(key=matching_keys(paper, names))
     shared = ours["key"].isin(paper["key"])
     if listed is None:
         ours["listed"] = shared
     else:  # a key unites settings and versions, only one of which may be listed
-        listed_rows = pd.MultiIndex.from_frame(listed[names])
-        ours["listed"] = pd.MultiIndex.from_frame(ours[names]).isin(listed_rows)
+        listed_rows = pd.MultiIndex.from_frame(listed[keys])
+        ours["listed"] = pd.MultiIndex.from_frame(ours[keys]).isin(listed_rows)
     ours = ours[ours["listed"] | shared]
     paper = paper.add_prefix("paper_").rename(columns={"paper_key": "key"})
     table = ours.merge(paper, on="key", how="outer")
@@ -137,7 +139,7 @@ def compare_table(ours, listed, paper, mean, std, number):
 
     in_ours, in_paper = table["listed"].eq(True), table["key"].isin(paper["key"])
     table["listed_by"] = np.select([in_ours & in_paper, in_ours], ["both", "ours"], "paper")
-    for name in names:
+    for name in keys:
         table[name] = table[name].fillna(table[f"paper_{name}"])
     if number == "environments":
         paper_n = PAPER_ENVIRONMENTS
@@ -146,6 +148,6 @@ def compare_table(ours, listed, paper, mean, std, number):
     variance = table[std] ** 2 / table[number] + table[f"paper_{std}"] ** 2 / paper_n
     difference = table[mean] - table[f"paper_{mean}"]
     table["difference_se"] = difference / np.sqrt(variance.where(variance > 0))
-    columns = [*names, "listed_by", number, mean, std, f"paper_{mean}", f"paper_{std}"]
+    columns = [*keys, "listed_by", number, mean, std, f"paper_{mean}", f"paper_{std}"]
     luck = [f"paper_{name}" for name in LUCK if f"paper_{name}" in table]
-    return table.sort_values(names, kind="stable")[[*columns, "difference_se", *luck]]
+    return table.sort_values(keys, kind="stable")[[*columns, "difference_se", *luck]]

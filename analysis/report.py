@@ -8,6 +8,7 @@ import jinja2
 from markupsafe import Markup, escape
 
 from analysis.formatting import shown
+from analysis.runs import STUDY
 from analysis.verdicts import tally
 
 SECTIONS = {
@@ -60,7 +61,7 @@ def write_report(out, verdicts, tables, drawn, overview, problems, notes):
     full = [s for s in sections.values() if s["tables"] or s["figures"]]
     pages.filters["breakable"] = breakable
     page = pages.get_template("report.html.jinja")
-    groups = verdicts.groupby(["algorithm", "environment"], sort=False)
+    groups = verdicts.groupby([*STUDY, "scope", "environment"], sort=False)
     verdicts = []
     for _, group in groups:
         lines = group[["verdict", "sentence"]].to_dict("records")

@@ -17,18 +17,20 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from analysis.configurations import BASELINE, Configuration
 from analysis.formatting import P_VALUE, WHOLE, Table
-from analysis.runs import BASELINE, KEYS, order, rate_text
+from analysis.runs import KEYS, STUDY, study_name
 from analysis.statistics import contrast, holm, improvement_percent, mann_whitney, mean_std
 from analysis.verdicts import DETECTABLE, LEVEL, counted, p_value
 
 FILES = ("robustness.csv", "robustness.csv.gz")
 HEADER = ["noise", "noise_rate", "episode", "episodic_return", "episodic_length"]
 CONDITION = ["test_noise", "test_rate"]
-CLEAN = BASELINE  # a condition is (noise, rate), as a configuration is
-RUN_COLUMNS = [*KEYS, "seed", *CONDITION, "mean", "cvar"]
+CLEAN = BASELINE  # a condition of a test is a Configuration, too
+RUN_COLUMNS = [*KEYS, "configuration", "seed", *CONDITION, "condition", "mean", "cvar"]
 COLUMNS = [*KEYS, *CONDITION, "tested_on", "n", "mean", "std", "change_percent", "cvar"]
-SCORE_COLUMNS = [*KEYS, "n", "n_baseline", "conditions", "score", "baseline_score"]
+SCORE_COLUMNS = [*STUDY, "scope", "environment", "noise", "noise_rate", "n", "n_baseline"]
+SCORE_COLUMNS += ["conditions", "score", "baseline_score"]
 SCORE_COLUMNS += ["difference", "difference_low", "difference_high", "p", "p_holm"]
 SCORE_COLUMNS += ["smallest_p", "detectable"]
 SCORE_COLUMNS += ["clean_change_percent", "cvar_score", "baseline_cvar_score"]
@@ -74,14 +76,15 @@ def read_robustness(runs_dir, runs):
         except (OSError, ValueError, EOFError) as error:
             notes.append(f"{run.run}: {paths[0].name} is left out: {' '.join(str(error).split())}")
             continue
-        config = [getattr(run, name) for name in KEYS]
+        keys = [getattr(run, name) for name in (*KEYS, "configuration", "seed")]
         for condition, returns in episodes.items():
-            rows.append((*config, run.seed, *condition, returns.mean(), cvar(returns)))
+            spelled = condition.noise, condition.noise_rate
+            rows.append((*keys, *spelled, condition, returns.mean(), cvar(returns)))
     return pd.DataFrame(rows, columns=RUN_COLUMNS), notes
 
 
 def read_episodes(path):
-    """Read one file: a dict of (noise, rate) -> returns of its episodes. Raises ValueError."""
+    """Read one file: a dict of Configuration -> returns of its episodes. Raises ValueError."""
     text = {"noise": str, "noise_rate": str}
     table = pd.read_csv(path, dtype=text, keep_default_na=False)
     if list(table.columns) != HEADER:
@@ -89,9 +92,8 @@ def read_episodes(path):
     returns = pd.to_numeric(table["episodic_return"])
     if not np.isfinite(returns).all() or not len(returns):
         raise ValueError("no episodes, or a return that is not finite")
-    rates = [rate_text(rate.split(" + ")) for rate in table["noise_rate"]]
-    groups = returns.groupby([table["noise"], rates], sort=False)
-    return {condition: group.to_numpy(float) for condition, group in groups}
+    groups = returns.groupby([table["noise"], table["noise_rate"]], sort=False)
+    return {Configuration.parse(*key): group.to_numpy(float) for key, group in groups}
 
 
 def cvar(returns):
@@ -99,22 +101,16 @@ def cvar(returns):
     return np.sort(returns)[: -(-len(returns) // 10)].mean()
 
 
-def wrappers(noise):
-    """Return the wrapper classes in a noise such as "A(1) + B(2)"."""
-    return {part.split("(")[0] for part in noise.split(" + ") if part}
-
-
 def is_unseen(condition, config):
     """Tell whether a test condition counts in the score of a training configuration."""
-    tested = wrappers(condition[0])
-    inert = {name for name in tested if name.endswith("Reward") or name == "RandomEarlyTermination"}
-    return bool(tested) and not inert and not tested & wrappers(config[0])
+    changes_behaviour = not condition.kinds & {"reward", "dynamics"}
+    new = set(condition.wrappers).isdisjoint(config.wrappers)
+    return not condition.is_baseline and changes_behaviour and new
 
 
 def is_seen(condition, config):
     """Tell whether a test condition consists of wrappers that were in training."""
-    tested = wrappers(condition[0])
-    return bool(tested) and tested <= wrappers(config[0])
+    return not condition.is_baseline and set(condition.wrappers) <= set(config.wrappers)
 
 
 def tested_on(condition, config):
@@ -123,33 +119,27 @@ def tested_on(condition, config):
         return "clean"
     if condition == config:
         return "the same noise"
-    if wrappers(condition[0]) & wrappers(config[0]):
+    if set(condition.wrappers) & set(config.wrappers):
         return "the same wrapper"
     return "new noise"
 
 
 def by_run(runs, config, value):
     """Arrange the runs of a configuration as a frame (seeds x conditions) of `value`."""
-    mine = runs[(runs["noise"] == config[0]) & (runs["noise_rate"] == config[1])]
-    return mine.pivot(index="seed", columns=CONDITION, values=value)
-
-
-def configurations(runs):
-    """List the training configurations, the baseline first."""
-    found = set(runs[["noise", "noise_rate"]].itertuples(index=False, name=None))
-    return sorted(found, key=order)
+    mine = runs[runs["configuration"] == config]
+    return mine.pivot(index="seed", columns="condition", values=value)
 
 
 def condition_rows(runs):
     """Yield one row per training configuration and test condition, in each environment."""
-    for (algorithm, environment), group in runs.groupby(["algorithm", "environment"]):
+    for key, group in runs.groupby([*STUDY, "environment"]):
         baseline = by_run(group, BASELINE, "mean").mean()
-        for config in configurations(group):
+        for config in sorted(set(group["configuration"])):
             means, cvars = by_run(group, config, "mean"), by_run(group, config, "cvar")
-            for condition in sorted(means.columns, key=order):
+            for condition in sorted(means.columns):
                 mean, std, n = mean_std(means[condition])
-                row = dict(zip(KEYS, (algorithm, environment, *config), strict=True))
-                row |= dict(zip(CONDITION, condition, strict=True))
+                row = dict(zip(KEYS, (*key, config.noise, config.noise_rate), strict=True))
+                row |= {"test_noise": condition.noise, "test_rate": condition.noise_rate}
                 row |= {"tested_on": tested_on(condition, config), "n": n, "mean": mean, "std": std}
                 row["cvar"] = cvars[condition].mean()
                 if config != BASELINE and condition in baseline:
@@ -160,7 +150,7 @@ def condition_rows(runs):
 def environment_scores(runs, config, counts):
     """Score a configuration and the baseline in one environment, or return None.
 
-    runs: those of one algorithm and environment. counts(condition, config) tells which conditions
+    runs: those of one study and environment. counts(condition, config) tells which conditions
     count. The result is a dict with arrays: `x` (seeds) and `y` (baseline seeds) are scores,
     `x_cvar` and `y_cvar` the same of the worst tenth of the episodes, `clean` (seeds) is the change
     of the clean return in percent; `x_conditions` and `y_conditions` are Series with the mean score
@@ -197,8 +187,8 @@ def score_rows(runs, counts=is_unseen):
 
     counts(condition, config) tells whether a test condition counts for a training configuration.
     """
-    for algorithm, group in runs.groupby("algorithm"):
-        for config in configurations(group):
+    for study, group in runs.groupby(STUDY):
+        for config in sorted(set(group["configuration"])):
             if config == BASELINE:
                 continue
             scores = {}
@@ -207,12 +197,12 @@ def score_rows(runs, counts=is_unseen):
                 if found:
                     scores[environment] = found
             if len(scores) > 1:
-                yield score_row(algorithm, "all", config, scores)
+                yield score_row(study, "all", "", config, scores)
             for environment, found in scores.items():
-                yield score_row(algorithm, environment, config, {environment: found})
+                yield score_row(study, "environment", environment, config, {environment: found})
 
 
-def score_row(algorithm, scope, config, scores):
+def score_row(study, scope, environment, config, scores):
     """Return one row of scores; environments count equally, whatever their number of seeds."""
     found = list(scores.values())
     cells = [part["x"] for part in found] + [part["y"] for part in found]
@@ -222,18 +212,22 @@ def score_row(algorithm, scope, config, scores):
         stacked(part["x"] for part in found), stacked(part["y"] for part in found)
     )
     worst = {
-        (environment, *condition): value
-        for environment, part in scores.items()
+        (name, condition): value
+        for name, part in scores.items()
         for condition, value in part["x_conditions"].items()
     }
-    environment, noise, rate = min(worst, key=worst.get)
-    where = f" on {environment}" if scope == "all" else ""
+    worst_place, worst_condition = min(worst, key=worst.get)
+    where = f" on {worst_place}" if scope == "all" else ""
 
     def average(name):
         return np.mean([np.mean(part[name]) for part in found])
 
     return {
-        **dict(zip(KEYS, (algorithm, scope, *config), strict=True)),
+        **dict(zip(STUDY, study, strict=True)),
+        "scope": scope,
+        "environment": environment,
+        "noise": config.noise,
+        "noise_rate": config.noise_rate,
         "n": min(len(part["x"]) for part in found),
         "n_baseline": min(len(part["y"]) for part in found),
         "conditions": min(len(part["x_conditions"]) for part in found),
@@ -248,7 +242,7 @@ def score_row(algorithm, scope, config, scores):
         "clean_change_percent": average("clean"),
         "worst_score": min(worst.values()),
         "baseline_worst_score": min(part["y_conditions"].min() for part in found),
-        "worst_condition": f"{noise} at {rate}{where}",
+        "worst_condition": f"{worst_condition.noise} at {worst_condition.noise_rate}{where}",
         "cvar_score": average("x_cvar"),
         "baseline_cvar_score": average("y_cvar"),
     }
@@ -265,8 +259,8 @@ def stacked(samples):
 
 def primary(scores):
     """Return which rows of scores are primary: of all environments, or of the only one."""
-    together = (scores["environment"] == "all").astype(bool)
-    keys = ["algorithm", "noise", "noise_rate"]
+    together = (scores["scope"] == "all").astype(bool)
+    keys = [*STUDY, "noise", "noise_rate"]
     return together | ~together.groupby([scores[name] for name in keys]).transform("any")
 
 
@@ -276,7 +270,7 @@ def robustness_tables(runs):
         return {}
     table = pd.DataFrame(condition_rows(runs), columns=COLUMNS)
     scores = pd.DataFrame(score_rows(runs), columns=SCORE_COLUMNS)
-    for _, family in scores[primary(scores)].groupby("algorithm"):
+    for _, family in scores[primary(scores)].groupby(STUDY):
         scores.loc[family.index, "p_holm"] = holm(family["p"].to_numpy(float))
     caption = "\n".join([CAPTIONS["robustness_score"], *robustness_sentences(scores)])
     tables = [
@@ -289,7 +283,8 @@ def robustness_tables(runs):
 def robustness_sentences(scores):
     """Yield one plain sentence for each training configuration: is it more robust?"""
     for row in scores[primary(scores)].itertuples():
-        where = "all environments together" if row.environment == "all" else row.environment
+        where = row.environment or "all environments together"
+        study = study_name(row.algorithm, row.settings, row.phase)
         verdict = "no clear difference in robustness to new noise"
         if row.p <= LEVEL:
             more = "more" if row.difference > 0 else "less"
@@ -301,7 +296,7 @@ def robustness_sentences(scores):
             limit = f"; a difference of {row.detectable:.0f} would have been seen (80 % power)"
         corrected = p_value(row.p_holm).removeprefix("= ")
         yield (
-            f"{row.algorithm} on {where}, trained with {row.noise} at rate {row.noise_rate}: "
+            f"{study} on {where}, trained with {row.noise} at rate {row.noise_rate}: "
             f"{verdict} (score {row.score:.0f} against {row.baseline_score:.0f} without noise in "
             f"training, p {p_value(row.p)}, Holm {corrected}; clean return "
             f"{row.clean_change_percent:+.0f} %){limit}."

@@ -1,7 +1,7 @@
 """Reading a folder of runs for analyze.py: which runs count, and which may be compared.
 
-A configuration is a pair (noise, noise_rate), both as text; runs that differ in any setting get
-different names of the algorithm. Only finished runs (those with a result.json) count.
+Runs that may be compared are a study: they have the same algorithm and settings and are of the same
+phase of a choice. Only finished runs (those with a result.json) count.
 """
 
 import json
@@ -14,41 +14,30 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from analysis.configurations import BASELINE, Configuration
 from noisy_wrappers import MAY_DIFFER_IN_A_TABLE
 
-KEYS = ["algorithm", "environment", "noise", "noise_rate"]
-BASELINE = ("", "0.00")  # a configuration is (noise, noise_rate), both as text
+STUDY = ["algorithm", "settings", "phase"]  # the columns that name a study: see study_name
+KEYS = [*STUDY, "environment", "noise", "noise_rate"]
 EVAL_HEADER = "step,episode,episodic_return,episodic_length\n"
 # Arguments that have columns of their own, or may differ; the steps of tests are intersected.
 NOT_SETTINGS = {"env_id", "seed", "noise", "noise_rate"} | MAY_DIFFER_IN_A_TABLE
-RUN_COLUMNS = ["run", "status", "reason", "base", "phase", *KEYS, "seed", "episodes", "total"]
-RUN_COLUMNS += ["settings", "versions", "steps", "returns"]
-CHOICE_COLUMNS = [*KEYS[:2], "phase", "round", *KEYS[2:], "seeds", "score", "survives"]
+RUN_COLUMNS = ["run", "status", "reason", *KEYS, "configuration", "seed", "episodes", "total"]
+RUN_COLUMNS += ["arguments", "versions", "steps", "returns"]
+CHOICE_COLUMNS = ["algorithm", "environment", "phase", "round", "noise", "noise_rate"]
+CHOICE_COLUMNS += ["seeds", "score", "survives"]
 FIRST_CONFIRMATION_SEED = 1001  # of `./benchmark.sh choose`: lower seeds are those of its search
 
 
-def rate_text(rates):
-    """Spell noise rates as the paper does: [] -> "0.00", [0.5, 1] -> "0.50 + 1.00".
-
-    A rate that changes during training, "1.0:0.0", becomes "1.00 to 0.00".
-    """
-    texts = []
-    for rate in rates:
-        ends = [float(end) for end in str(rate).split(":")]
-        texts.append(" to ".join(f"{r:.2f}" if round(r, 2) == r else f"{r:g}" for r in ends))
-    return " + ".join(texts) or BASELINE[1]
+def study_name(algorithm, settings="", phase=""):
+    """Name a study for people: "SAC", or "SAC [gamma=0.9, search]"."""
+    parts = [part for part in (settings, phase) if part]
+    return f"{algorithm} [{', '.join(parts)}]" if parts else algorithm
 
 
-def rate_order(text):
-    """Sort key of a text from rate_text: (start, end) of each rate, as numbers."""
-    ends = [[float(end) for end in rate.split(" to ")] for rate in text.split(" + ")]
-    return [(rate[0], rate[-1]) for rate in ends]
-
-
-def order(config):
-    """Sort key of a configuration: by noise, then by rates; the baseline comes first."""
-    noise, rate = config
-    return noise, rate_order(rate)
+def rows_of(table, key):
+    """Tell which rows of a table are about one study; `key` has the values of STUDY."""
+    return pd.MultiIndex.from_frame(table[STUDY]).isin([tuple(key)])
 
 
 def read_config(folder):
@@ -65,15 +54,17 @@ def read_config(folder):
         if not isinstance(value, str):
             raise ValueError(f"config.json: {name} is {value!r}")
     settings = {name: value for name, value in args.items() if name not in NOT_SETTINGS}
+    configuration = Configuration.read(args["noise"], args["noise_rate"])
     return {
-        "base": config["algorithm"],
+        "algorithm": config["algorithm"],
         "environment": args["env_id"],
-        "noise": " + ".join(args["noise"]),
-        "noise_rate": rate_text(args["noise_rate"]),
+        "noise": configuration.noise,
+        "noise_rate": configuration.noise_rate,
+        "configuration": configuration,
         "seed": int(args["seed"]),
         "episodes": int(args["eval_episodes"]),
         "total": int(args["total_timesteps"]),
-        "settings": json.dumps(settings, sort_keys=True),
+        "arguments": json.dumps(settings, sort_keys=True),
         "versions": versions,
     }
 
@@ -127,8 +118,9 @@ def is_run(folder):
 def read_runs(runs_dir):
     """Read all run folders; `status` is finished, unfinished, corrupt, duplicate or failed.
 
-    For the algorithms and environments in the choice.csv of `./benchmark.sh choose`, `phase` is
-    search or confirmation, by the seed; for others it is empty.
+    `settings` says what sets a run apart from others of its algorithm (differing_settings). For the
+    algorithms and environments in the choice.csv of `./benchmark.sh choose`, `phase` is search or
+    confirmation, by the seed; for others it is empty.
     """
     runs_dir = Path(runs_dir)
     rows = [read_run(folder) for folder in sorted(runs_dir.iterdir()) if is_run(folder)]
@@ -138,12 +130,12 @@ def read_runs(runs_dir):
     choice = read_choice(runs_dir)
     if choice is not None:
         chosen = set(zip(choice["algorithm"], choice["environment"], strict=True))
-        pairs = zip(runs["base"], runs["environment"], strict=True)
+        pairs = zip(runs["algorithm"], runs["environment"], strict=True)
         fresh = runs["seed"].fillna(0) >= FIRST_CONFIRMATION_SEED
         phases = np.where(fresh, "confirmation", "search")
         runs["phase"] = np.where([pair in chosen for pair in pairs], phases, "")
-    for base, group in runs.groupby("base"):
-        runs.loc[group.index, "algorithm"] = labels(base, group)
+    for _, group in runs.groupby("algorithm"):
+        runs.loc[group.index, "settings"] = differing_settings(group)
     twice = (runs["status"] == "finished") & runs.duplicated(["status", *KEYS, "seed"])
     runs.loc[twice, ["status", "reason"]] = ["duplicate", "same configuration and seed as another"]
     return runs
@@ -173,35 +165,45 @@ def read_choice(runs_dir):
     choice = pd.read_csv(path, dtype=text, keep_default_na=False)
     if list(choice.columns) != CHOICE_COLUMNS:
         raise ValueError(f"{path} does not have the columns {','.join(CHOICE_COLUMNS)}")
-    choice["noise_rate"] = [rate_text(rates.split(" + ")) for rates in choice["noise_rate"]]
+    pairs = zip(choice["noise"], choice["noise_rate"], strict=True)
+    choice["noise_rate"] = [Configuration.parse(*pair).noise_rate for pair in pairs]
     return choice
 
 
-def labels(base, group):
-    """Name each run's algorithm so that runs with different settings never share a row.
+def differing_settings(runs):
+    """Say what sets each run of an algorithm apart, so that unlike runs never share a row.
 
-    It is the plain name (SAC) unless runs differ in settings, or there is a newer version of the
-    environment, or noise was chosen; then it says what differs (SAC [total_timesteps=100000]).
+    It is empty unless finished runs differ in an argument, or there is a newer version of the
+    environment: then it is "gamma=0.9, environments v4", say. A run that is not finished also names
+    its arguments that no finished run has; it changes nothing for the others.
     """
-    settings = {text: json.loads(text) for text in set(group["settings"])}
-    differing = []
-    for name in sorted(set().union(*settings.values())):
-        if len({str(values.get(name)) for values in settings.values()}) > 1:
-            differing.append(name)
-    versions = [split_version(environment) for environment in group["environment"]]
-    newest = {name: "" for name, _ in versions}
-    for name, version in versions:
-        newest[name] = max(newest[name], version, key=lambda text: int(text or -1))
+    finished = runs[runs["status"] == "finished"]
+    finished = finished if len(finished) else runs
+    arguments = {text: json.loads(text) for text in set(runs["arguments"])}
+    names = sorted(set().union(*arguments.values()))
+    known = {
+        name: {str(arguments[text].get(name)) for text in set(finished["arguments"])}
+        for name in names
+    }
+    newest = newest_versions(runs["environment"]) | newest_versions(finished["environment"])
     result = []
-    for run in group.itertuples():
-        parts = [f"{name}={settings[run.settings].get(name)}" for name in differing]
-        env, version = split_version(run.environment)
-        if version != newest[env]:
+    for run in runs.itertuples():
+        own = {name: arguments[run.arguments].get(name) for name in names}
+        apart = [name for name in names if known[name] != {str(own[name])}]
+        parts = [f"{name}={own[name]}" for name in apart]
+        environment, version = split_version(run.environment)
+        if version != newest[environment]:
             parts.append(f"environments v{version}")
-        if run.phase:
-            parts.append(run.phase)
-        result.append(f"{base} [{', '.join(parts)}]" if parts else base)
+        result.append(", ".join(parts))
     return result
+
+
+def newest_versions(environments):
+    """Return {name: newest version} of environment ids: ["Hopper-v4"] -> {"Hopper": "4"}."""
+    newest = {}
+    for name, version in map(split_version, set(environments)):
+        newest[name] = max(newest.get(name, ""), version, key=lambda text: int(text or -1))
+    return newest
 
 
 def split_version(environment):
@@ -226,19 +228,21 @@ def missing_runs(runs):
     seeds. The search of `./benchmark.sh choose` gives few noises many seeds: nothing is missing.
     """
     rows = []
-    for algorithm, group in runs[runs["base"].notna()].groupby("algorithm"):
+    for study, group in runs[runs["algorithm"].notna()].groupby(STUDY):
         if group["phase"].iloc[0] == "search":
             continue
-        cells = group.groupby(KEYS[1:])["seed"].agg(set).to_dict()
-        baselines = {(env, *BASELINE) for env, _, _ in cells}
+        cells = group.groupby(["environment", "configuration"])["seed"].agg(set).to_dict()
+        baselines = {(environment, BASELINE) for environment, _ in cells}
         usual = [seeds for key, seeds in cells.items() if key not in baselines]
         if not usual:
             usual = list(cells.values())
         counts = Counter(seed for seeds in usual for seed in seeds)
         expected = {seed for seed, n in counts.items() if 2 * n >= len(usual)}
-        for key in sorted(cells.keys() | baselines, key=lambda key: (key[0], order(key[1:]))):
+        for key in sorted(cells.keys() | baselines):
+            environment, config = key
+            keys = (*study, environment, config.noise, config.noise_rate)
             for seed in sorted(expected - cells.get(key, set())):
-                rows.append((algorithm, *key, int(seed), "missing", "no run folder"))
+                rows.append((*keys, int(seed), "missing", "no run folder"))
     return pd.DataFrame(rows, columns=[*KEYS, "seed", "status", "reason"])
 
 
@@ -250,7 +254,7 @@ def left_out(runs):
     """
     out = pd.concat([runs[runs["status"] != "finished"], missing_runs(runs)], ignore_index=True)
     rows = []
-    nameless = out["run"].where(out["base"].isna())
+    nameless = out["run"].where(out["algorithm"].isna())
     keys = [out["status"], *(out[name] for name in KEYS), nameless.fillna("")]
     for (status, *config, _), group in out.groupby(keys, sort=False, dropna=False):
         rows.append(
@@ -290,12 +294,22 @@ class Study:
     """The finished runs that may be compared: one algorithm with one set of settings."""
 
     algorithm: str
-    base: str
+    settings: str  # what sets it apart from other studies of the algorithm
     phase: str  # of `./benchmark.sh choose`: search, confirmation, or empty
     environments: list
     seeds: list
     steps: np.ndarray  # the evaluation steps that all runs share
-    returns: dict  # (noise, noise_rate) -> array (steps x seeds x envs), NaN where there is no run
+    returns: dict  # Configuration -> array (steps x seeds x envs), NaN where there is no run
+
+    @property
+    def key(self):
+        """What tells it from other studies, as the columns STUDY do."""
+        return self.algorithm, self.settings, self.phase
+
+    @property
+    def name(self):
+        """Its name for people."""
+        return study_name(*self.key)
 
     def final(self, config):
         """Return the (seeds x envs) array of final test returns."""
@@ -306,41 +320,42 @@ def make_studies(runs):
     """Arrange the finished runs into a list of Study, and list in words what had to be cut."""
     studies, notes = [], []
     finished = runs[runs["status"] == "finished"]
-    for algorithm, group in finished.groupby("algorithm"):
+    for key, group in finished.groupby(STUDY):
+        name = study_name(*key)
         grids = list({steps.tobytes(): steps for steps in group["steps"]}.values())
         grid = reduce(np.intersect1d, grids)
         longest = max(map(len, grids))
         if len(grid) < longest:
             notes.append(
-                f"{algorithm}: runs differ in their evaluation steps; curves are cut to the "
+                f"{name}: runs differ in their evaluation steps; curves are cut to the "
                 f"{len(grid)} steps that all share (of up to {longest})"
             )
         envs, seeds = sorted(set(group["environment"])), sorted(set(group["seed"]))
-        configs = {*zip(group["noise"], group["noise_rate"], strict=True), BASELINE}
+        configs = {*group["configuration"], BASELINE}
         shape = (len(grid), len(seeds), len(envs))
-        returns = {config: np.full(shape, np.nan) for config in sorted(configs, key=order)}
+        returns = {config: np.full(shape, np.nan) for config in sorted(configs)}
         for run in group.itertuples():
             place = seeds.index(run.seed), envs.index(run.environment)
             shared = np.isin(run.steps, grid)
-            returns[run.noise, run.noise_rate][:, *place] = run.returns[shared]
-        base, phase = group[["base", "phase"]].iloc[0]
-        for env, values in zip(envs, returns[BASELINE][-1].T, strict=True):
-            if np.isnan(values).all() and phase != "search":
-                notes.append(f"{algorithm}: no finished baseline on {env}, so no improvement there")
-        notes += version_notes(algorithm, group["versions"])
-        studies.append(Study(algorithm, base, phase, envs, seeds, grid, returns))
+            returns[run.configuration][:, *place] = run.returns[shared]
+        study = Study(*key, envs, seeds, grid, returns)
+        for env, values in zip(envs, study.final(BASELINE).T, strict=True):
+            if np.isnan(values).all() and study.phase != "search":
+                notes.append(f"{name}: no finished baseline on {env}, so no improvement there")
+        notes += version_notes(name, group["versions"])
+        studies.append(study)
     return studies, notes
 
 
-def version_notes(algorithm, versions):
-    """Say in words where runs of one algorithm differ in versions of code or libraries."""
+def version_notes(name, versions):
+    """Say in words where runs of one study differ in versions of code or libraries."""
     notes = []
-    for name in sorted(set().union(*versions)):
-        counts = Counter(str(version.get(name)) for version in versions)
+    for library in sorted(set().union(*versions)):
+        counts = Counter(str(version.get(library)) for version in versions)
         if len(counts) > 1:
             found = ", ".join(f"{version} (n = {n})" for version, n in sorted(counts.items()))
-            what = f"with different {name}"
-            if name == "git commit":
+            what = f"with different {library}"
+            if library == "git commit":
                 what = "of different code versions"
-            notes.append(f"{algorithm}: some rows average runs {what}: {found}")
+            notes.append(f"{name}: some rows average runs {what}: {found}")
     return notes

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+from analysis.configurations import BASELINE
 from analysis.formatting import P_VALUE, PLAIN, SHARE, WHOLE, Table
 from analysis.luck import (
     CONSISTENT_PERCENT,
@@ -19,7 +20,7 @@ from analysis.luck import (
     luck_rows,
 )
 from analysis.paper import PAPER_CONFIGURATIONS, compare_tables
-from analysis.runs import BASELINE, KEYS
+from analysis.runs import KEYS, STUDY, rows_of, study_name
 from analysis.statistics import (
     COVERAGE,
     COVERAGE_OF_MIXTURES,
@@ -36,30 +37,30 @@ from analysis.statistics import (
 )
 from analysis.verdicts import counted, power, verdict
 
-COLUMNS = {
-    "summary": """algorithm environment noise noise_rate n mean std n_baseline baseline_mean
+# After those that name a study
+_COLUMNS = {
+    "summary": """environment noise noise_rate n mean std n_baseline baseline_mean
         baseline_std improvement_percent p std_change_percent steps_to_baseline""",
-    "best": """algorithm environment noise noise_rate baseline_mean baseline_std noisy_mean
+    "best": """environment noise noise_rate baseline_mean baseline_std noisy_mean
         noisy_std improvement_percent p p_adjusted luck_median_percent luck_95_percent p_luck
         leave_one_seed_out_percent n n_baseline chosen_from leave_one_seed_out_mean""",
-    "consistency": """algorithm noise noise_rate percent_of_environments
+    "consistency": """noise noise_rate percent_of_environments
         average_improvement_percent std_improvement_percent p p_adjusted p_luck environments n
         fails_at_every_rate""",
-    "luck": """algorithm environments best_beyond_luck configurations
+    "luck": """environments best_beyond_luck configurations
         consistent consistent_by_luck consistent_by_luck_95 p_consistent consistent_beyond_luck
         consistently_worse consistently_worse_by_luck consistently_worse_by_luck_95
         p_consistently_worse consistently_worse_beyond_luck""",
-    "interactions": """algorithm environment noise noise_rate n both_mean first_mean second_mean
+    "interactions": """environment noise noise_rate n both_mean first_mean second_mean
         baseline_mean interaction interaction_low interaction_high standard_error
         interaction_percent percent_low percent_high""",
-    "early_performance": "algorithm environment noise steps_millions noise_rate mean std n",
-    "statistics": """algorithm environment noise noise_rate verdict improvement_iqm_percent
+    "early_performance": "environment noise steps_millions noise_rate mean std n",
+    "statistics": """scope environment noise noise_rate verdict improvement_iqm_percent
         improvement_low improvement_high p p_adjusted comparisons probability_of_improvement
         probability_low probability_high environments n n_baseline iqm iqm_low iqm_high
         detectable_percent seeds_needed smallest_p smallest_p_adjusted""",
 }
-
-
+COLUMNS = {name: [*STUDY, *text.split()] for name, text in _COLUMNS.items()}
 _COLUMNS_WITH = {
     WHOLE: """n n_baseline environments chosen_from configurations seeds seeds_needed
         steps_to_baseline percent_of_environments best_beyond_luck consistent
@@ -75,13 +76,12 @@ LUCK_ONLY_CSV = ("consistent_by_luck_95", "consistently_worse_by_luck_95")
 
 def frame(name, rows):
     """Make a table of a list of dicts, with the columns of its kind even when it is empty."""
-    return pd.DataFrame(list(rows), columns=COLUMNS[name].split())
+    return pd.DataFrame(list(rows), columns=COLUMNS[name])
 
 
-def row_keys(algorithm, environment, config):
+def row_keys(study, environment, config):
     """Return the columns that say what a row is about."""
-    noise, rate = config
-    return {"algorithm": algorithm, "environment": environment, "noise": noise, "noise_rate": rate}
+    return dict(zip(KEYS, (*study.key, environment, config.noise, config.noise_rate), strict=True))
 
 
 def summary_rows(study):
@@ -92,7 +92,7 @@ def summary_rows(study):
             continue
         base_mean, base_std, base_n = mean_std(study.final(BASELINE)[:, e])
         row = {
-            **row_keys(study.algorithm, env, config),
+            **row_keys(study, env, config),
             "n": n,
             "mean": mean,
             "std": std,
@@ -111,7 +111,7 @@ def summary_rows(study):
 def best_rows(study, summary):
     """Yield the best noise per environment, with the leave-one-seed-out value of choosing it."""
     noisy = summary[summary["improvement_percent"].notna()]
-    for env, group in noisy[noisy["algorithm"] == study.algorithm].groupby("environment"):
+    for env, group in noisy[rows_of(noisy, study.key)].groupby("environment"):
         best = group.loc[group["mean"].idxmax()]
         e = study.environments.index(env)
         finals = np.stack([study.final(c)[:, e] for c in study.returns if c != BASELINE])
@@ -127,7 +127,7 @@ def best_rows(study, summary):
 
 def consistency_rows(summary):
     """Yield per noise and rate the share of envs that are matched or better, and by how much."""
-    keys = ["algorithm", "noise", "noise_rate"]
+    keys = [*STUDY, "noise", "noise_rate"]
     for key, group in summary[summary["improvement_percent"].notna()].groupby(keys):
         mean, std, count = mean_std(group["improvement_percent"])
         yield dict(zip(keys, key, strict=True)) | {
@@ -146,10 +146,10 @@ def split_consistency(consistency):
     """
     consistency = consistency[consistency["environments"] > 1]
     share = consistency["percent_of_environments"]
-    by = ["algorithm", "percent_of_environments", "average_improvement_percent"]
+    by = [*STUDY, "percent_of_environments", "average_improvement_percent"]
     good = consistency[share >= CONSISTENT_PERCENT].drop(columns="fails_at_every_rate")
-    good = good.sort_values(by, ascending=[True, False, False], kind="stable")
-    highest = share.groupby([consistency["algorithm"], consistency["noise"]]).transform("max")
+    good = good.sort_values(by, ascending=[True, True, True, False, False], kind="stable")
+    highest = share.groupby([consistency[name] for name in (*STUDY, "noise")]).transform("max")
     bad = consistency.assign(fails_at_every_rate=np.where(highest == 0, "yes", "no"))[share == 0]
     return good, bad
 
@@ -161,16 +161,17 @@ def early_rows(study):
     wanted = np.arange(1, round(total / stride) + 1) * stride
     places = np.unique(np.searchsorted(study.steps, wanted, side="right") - 1)
     places = places[places >= 0]
-    noises = sorted({noise for noise, _ in study.returns if noise})
+    noises = sorted({config.noise for config in study.returns if not config.is_baseline})
     for (e, env), noise in product(enumerate(study.environments), noises):
-        configs = [config for config in study.returns if config[0] == noise]
+        configs = [config for config in study.returns if config.noise == noise]
         if not any(np.isfinite(study.final(config)[:, e]).any() for config in configs):
             continue  # not tried here: the baseline alone would be no comparison
         for i, config in product(places, [BASELINE, *configs]):
             mean, std, n = mean_std(study.returns[config][i, :, e])
             if n > 0:
                 yield {
-                    **row_keys(study.algorithm, env, (noise, config[1])),
+                    **row_keys(study, env, config),
+                    "noise": noise,
                     "steps_millions": study.steps[i] / 1e6,
                     "mean": mean,
                     "std": std,
@@ -179,20 +180,19 @@ def early_rows(study):
 
 
 def statistics_rows(study):
-    """Yield IQM, improvement, probability of improvement and test, per env and over several."""
-    everywhere = list(range(len(study.environments)))
-    others = [e for e in everywhere if not study.environments[e].startswith("Pusher")]
-    scopes = {env: [e] for e, env in enumerate(study.environments)}
+    """Yield IQM, improvement, probability of improvement and test, per env and over all.
+
+    The scope of a row is "environment", or "all": of those with both kinds of runs.
+    """
+    places = [("environment", env, [e]) for e, env in enumerate(study.environments)]
     if study.phase != "confirmation":  # there each environment has its one comparison
-        scopes["all"] = everywhere
-        if others != everywhere:
-            scopes["all but Pusher"] = others
-    for (scope, chosen), config in product(scopes.items(), study.returns):
+        places.append(("all", "", list(range(len(study.environments)))))
+    for (scope, environment, chosen), config in product(places, study.returns):
         x, y = study.final(config)[:, chosen], study.final(BASELINE)[:, chosen]
         here = np.isfinite(x).any(axis=0)
         both = here & np.isfinite(y).any(axis=0)
-        row = row_keys(study.algorithm, scope, config)
-        if scope.startswith("all"):
+        row = row_keys(study, environment, config) | {"scope": scope}
+        if scope == "all":
             if config == BASELINE or both.sum() < 2:
                 continue
         elif not here.any():
@@ -228,17 +228,17 @@ def against_baseline(x, y):
     return row
 
 
-def adjust(statistics, confirmations=()):
+def adjust(statistics):
     """Add p corrected for all comparisons of a family, the smallest in reach, and verdicts.
 
-    A family is an algorithm in one environment, corrected with Benjamini and Hochberg's method. The
-    `confirmations` (algorithms) of `./benchmark.sh choose` were fixed beforehand: they are one
-    family, corrected with Holm's method.
+    A family is a study in one environment, or in all, corrected with Benjamini and Hochberg's
+    method. The confirmations of `./benchmark.sh choose` were fixed beforehand: they are one family,
+    corrected with Holm's method.
     """
     tested = statistics[statistics["p"].notna()]
-    confirmed = tested["algorithm"].isin(confirmations)
+    confirmed = tested["phase"] == "confirmation"
     families = [(tested[confirmed], holm)] if confirmed.any() else []
-    for _, family in tested[~confirmed].groupby(["algorithm", "environment"]):
+    for _, family in tested[~confirmed].groupby([*STUDY, "scope", "environment"], dropna=False):
         families.append((family, stats.false_discovery_control))
     for family, correct in families:
         number = len(family)
@@ -257,7 +257,7 @@ def interaction_rows(study):
     four have at least MIN_SEEDS seeds, with a 95 % interval; then relative to |J(0)|.
     """
     for (e, environment), config in product(enumerate(study.environments), study.returns):
-        parts = list(zip(config[0].split(" + "), config[1].split(" + "), strict=True))
+        parts = config.parts
         if len(parts) != 2 or parts[0] == parts[1]:
             continue
         cells = []
@@ -270,7 +270,7 @@ def interaction_rows(study):
         value, error, low, high = contrast(cells, [1, -1, -1, 1])
         percent = 100 / abs(alone.mean()) if alone.mean() else np.nan
         yield {
-            **row_keys(study.algorithm, environment, config),
+            **row_keys(study, environment, config),
             "n": min(map(len, cells)),
             "both_mean": both.mean(),
             "first_mean": first.mean(),
@@ -291,11 +291,9 @@ def with_p(table, statistics):
 
     A table without environments has averages over all of them: it gets the test over all.
     """
-    keys = KEYS
-    if "environment" not in table:
-        keys = [name for name in KEYS if name != "environment"]
-        statistics = statistics[statistics["environment"] == "all"]
-    tests = statistics.set_index(keys)[["p", "p_adjusted"]]
+    keys = [name for name in KEYS if name in table]
+    scope = "environment" if "environment" in table else "all"
+    tests = statistics[statistics["scope"] == scope].set_index(keys)[["p", "p_adjusted"]]
     found = tests.reindex(pd.MultiIndex.from_frame(table[keys])).set_index(table.index)
     for name in ("p", "p_adjusted"):
         if name in table:
@@ -308,11 +306,12 @@ def family_notes(statistics):
     notes = []
     tested = statistics[statistics["p"].notna()]
     keys = ["comparisons", "smallest_p"]
-    for algorithm, rows in tested.groupby("algorithm"):
-        best = rows.sort_values("smallest_p", kind="stable").drop_duplicates("environment")
-        best = best.sort_index()
+    for study, rows in tested.groupby(STUDY):
+        best = rows.sort_values("smallest_p", kind="stable")
+        best = best.drop_duplicates(["scope", "environment"]).sort_index()
         for (size, smallest), same in best.groupby(keys, sort=False):
-            where = f"{algorithm}, {', '.join(same['environment'])}"
+            places = same["environment"].mask(same["scope"] == "all", "all")
+            where = f"{study_name(*study)}, {', '.join(places)}"
             seeds = counted(min(same["n"].min(), same["n_baseline"].min()), "seed")
             needed = ceil(round(size * smallest / 0.05, 9))
             if smallest > 0.05:
@@ -413,28 +412,28 @@ def make_tables(studies, paper=None):
     summary = frame("summary", (row for study in studies for row in summary_rows(study)))
     # The seeds of a search chose the noise, so they cannot judge it.
     judging = [study for study in studies if study.phase != "search"]
-    judged = summary[summary["algorithm"].isin([study.algorithm for study in judging])]
+    judged = summary[summary["phase"] != "search"]
     best = frame("best", (row for study in judging for row in best_rows(study, judged)))
     consistency = frame("consistency", consistency_rows(judged))
     early = frame("early_performance", (row for study in studies for row in early_rows(study)))
     statistics = frame("statistics", (row for study in judging for row in statistics_rows(study)))
-    confirmations = [study.algorithm for study in studies if study.phase == "confirmation"]
-    statistics = adjust(statistics, confirmations)
+    statistics = adjust(statistics)
     summary, judged, best, consistency = (
         with_p(table, statistics) for table in (summary, judged, best, consistency)
     )
     good, bad = split_consistency(consistency)
-    lucks = {study.algorithm: luck_of_study(study) for study in judging}
+    lucks = {study.key: luck_of_study(study) for study in judging}
     best = add_luck_of_best(best, lucks)
     good, bad = add_luck_of_consistent(good, bad, lucks)
     luck = frame("luck", luck_rows(lucks, best, good, bad))
-    failing = bad[bad["fails_at_every_rate"] == "yes"][["algorithm", "noise"]].drop_duplicates()
-    failing = "; ".join(f"{noise} ({algorithm})" for algorithm, noise in failing.values) or "none"
+    failing = bad[bad["fails_at_every_rate"] == "yes"][[*STUDY, "noise"]].drop_duplicates()
+    failing = "; ".join(f"{noise} ({study_name(*study)})" for *study, noise in failing.values)
+    worse = f"{CAPTIONS['consistently_worse']} {failing or 'none'}."
     limits = "\n".join(family_notes(statistics))
     tables = [
         table_of("best", best, only_csv=("leave_one_seed_out_mean",)),
         table_of("consistent", good),
-        table_of("consistently_worse", bad, f"{CAPTIONS['consistently_worse']} {failing}."),
+        table_of("consistently_worse", bad, worse),
         table_of("luck", luck, only_csv=LUCK_ONLY_CSV),
         table_of(
             "statistics",
@@ -447,13 +446,11 @@ def make_tables(studies, paper=None):
     found = frame("interactions", (row for study in judging for row in interaction_rows(study)))
     if len(found):
         tables.append(table_of("interactions", found))
-    for base in sorted({study.base for study in studies}):
-        same = [study.algorithm for study in studies if study.base == base]
-        table = summary[summary["algorithm"].isin(same)]
-        tables.append(table_of(f"summary_{base}", table, CAPTIONS["summary"], "summary"))
+    for algorithm, table in summary.groupby("algorithm"):
+        tables.append(table_of(f"summary_{algorithm}", table, CAPTIONS["summary"], "summary"))
     if paper:
-        lengths = {study.algorithm: study.steps[-1] for study in studies}
-        caption = ", ".join(f"{algorithm} {steps:,} steps" for algorithm, steps in lengths.items())
+        lengths = {study.key: study.steps[-1] for study in studies}
+        caption = ", ".join(f"{study_name(*key)} {n:,} steps" for key, n in lengths.items())
         caption = f"{CAPTIONS['compare']} {caption}."
         listed = judged, best, consistency, good, bad, early
         for name, table in compare_tables(paper, lengths, *listed):

@@ -12,7 +12,8 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from analysis.runs import BASELINE
+from analysis.configurations import BASELINE
+from analysis.runs import STUDY, rows_of, study_name
 from analysis.statistics import improvement_percent, mann_whitney_null, mean_std
 
 LEVEL, POWER = 0.05, 0.8
@@ -186,10 +187,11 @@ def reach(row):
 
 def sentence(row):
     """Say in one sentence what a row of statistics shows."""
-    environment = row["environment"]
-    if environment == "all":
-        environment = f"all {row['environments']:.0f} environments together"
-    start = f"{row['algorithm']} on {environment} with {row['noise']} at rate {row['noise_rate']}"
+    where = row["environment"]
+    if row["scope"] == "all":
+        where = f"all {row['environments']:.0f} environments together"
+    study = study_name(*row[STUDY])
+    start = f"{study} on {where} with {row['noise']} at rate {row['noise_rate']}"
     if row["verdict"] == UNCLEAR:
         return f"{start} shows {UNCLEAR}: {evidence(row)}{reach(row)}."
     return f"{start} is {row['verdict']} than no noise: {evidence(row)}."
@@ -203,30 +205,32 @@ def tally(verdicts):
 
 
 def sentences(studies, statistics):
-    """Return a frame of algorithm, environment, verdict and sentence for all that was tested.
+    """Return a frame with a verdict and a sentence for all that was tested.
 
     All environments together come before each alone, and clear differences before others.
     """
-    tested = statistics[statistics["p"].notna() & (statistics["environment"] != "all but Pusher")]
+    columns = [*STUDY, "scope", "environment", "verdict", "sentence"]
+    tested = statistics[statistics["p"].notna()]
     tested = tested.assign(
-        apart=tested["environment"] != "all",
+        apart=tested["scope"] != "all",
         rank=[VERDICTS.index(verdict) for verdict in tested["verdict"]],
     )
     rows = []
     for study in studies:
-        mine = tested[tested["algorithm"] == study.algorithm]
+        mine = tested[rows_of(tested, study.key)]
         for _, row in mine.sort_values(["apart", "environment", "rank", "p"]).iterrows():
             text = sentence(row) + remark(study, row)
-            rows.append((study.algorithm, row["environment"], row["verdict"], text))
-    return pd.DataFrame(rows, columns=["algorithm", "environment", "verdict", "sentence"])
+            rows.append((*row[columns[:-1]], text))
+    return pd.DataFrame(rows, columns=columns)
 
 
 def remark(study, row):
     """Return what the returns behind a row of one environment say besides, or ""."""
-    if row["environment"] not in study.environments:
+    if row["scope"] == "all":
         return ""
     e = study.environments.index(row["environment"])
-    x = study.final((row["noise"], row["noise_rate"]))[:, e]
+    configs = {(config.noise, config.noise_rate): config for config in study.returns}
+    x = study.final(configs[row["noise"], row["noise_rate"]])[:, e]
     y = study.final(BASELINE)[:, e]
     x, y = x[np.isfinite(x)], y[np.isfinite(y)]
     mean_percent = improvement_percent(x.mean(), y.mean())

@@ -38,6 +38,7 @@ from analysis.runs import make_studies, read_runs
 from analysis.statistics import contrast, holm, improvement_percent, mann_whitney, wins
 from analysis.tables import make_tables
 from analysis.verdicts import power as finds
+from noisy_wrappers import parse_noise
 
 FIXED_SEEDS = range(1, 11)
 FRESH_SEEDS = range(11, 31)
@@ -226,10 +227,7 @@ def rates(paper):
 
 def kind(noise):
     """Say what a noise perturbs: "RandomNormalNoisyReward(1.0)" -> "reward"."""
-    wrapper = noise.split("(")[0]
-    if wrapper.endswith("Observation"):
-        return "observation"
-    return "reward" if wrapper.endswith("Reward") else "dynamics"
+    return parse_noise(noise).wrapper.kind
 
 
 def kinds(paper):

@@ -16,8 +16,8 @@ sys.path.insert(0, str(RESULTS.parent))
 from analysis.runs import read_runs  # noqa: E402
 
 runs = read_runs(RESULTS / "data/precision")
-runs["precision"] = [json.loads(settings)["matmul_precision"] for settings in runs["settings"]]
-algorithms = runs.groupby(runs["algorithm"].str.split().str[0])  # "TD3 [exp_name=td3_bf16]"
+runs["precision"] = [json.loads(text)["matmul_precision"] for text in runs["arguments"]]
+algorithms = runs.groupby("algorithm")
 
 fig, axes = plt.subplots(
     1, len(algorithms), figsize=(2 + 4 * len(algorithms), 3.2), layout="constrained", squeeze=False

@@ -24,6 +24,7 @@ from common import (
     render,
 )
 
+from analysis.figures import STYLE
 from analysis.robustness import (
     CONDITION,
     condition_rows,
@@ -51,7 +52,7 @@ def scores(found, counts):
     found is a frame of read_robustness; counts is is_unseen or is_seen of analysis.robustness.
     """
     table = pd.DataFrame(score_rows(found, counts))
-    together = table["environment"] == "all"
+    together = table["scope"] == "all"
     table["p_holm"] = float("nan")
     table.loc[together, "p_holm"] = holm(table.loc[together, "p"].to_numpy(float))
     return table
@@ -59,7 +60,7 @@ def scores(found, counts):
 
 def answers(table):
     """Spell the rows of all environments together, which are the tests fixed beforehand."""
-    rows = table[table["environment"] == "all"]
+    rows = table[table["scope"] == "all"]
     return markdown(
         {
             "trained with": [SHORT[noise] for noise in rows["noise"]],
@@ -73,7 +74,7 @@ def answers(table):
 
 def by_environment(table):
     """Spell the rows of one environment each, which are secondary and uncorrected."""
-    rows = plain(table[table["environment"] != "all"])
+    rows = plain(table[table["scope"] != "all"])
     return markdown(
         {
             "trained with": [SHORT[noise] for noise in rows["noise"]],
@@ -98,7 +99,7 @@ def score_columns(rows):
 
 def harder(table):
     """Spell the worst condition and the worst episodes, over all environments together."""
-    rows = table[table["environment"] == "all"]
+    rows = table[table["scope"] == "all"]
     return markdown(
         {
             "trained with": [SHORT[noise] for noise in rows["noise"]],
@@ -130,7 +131,7 @@ def clean_returns(runs):
 
 def clean_changes(table):
     """Return {"observation noise": {"Hopper": percent}}: the change of the return without noise."""
-    rows = plain(table[table["environment"] != "all"])
+    rows = plain(table[table["scope"] != "all"])
     rows = rows.assign(noise=rows["noise"].map(SHORT))
     return {
         noise: same.set_index("environment")["clean_change_percent"].to_dict()
@@ -194,12 +195,12 @@ def kept(found, counts):
     clean = found[found["test_noise"] == ""].set_index(policy)["mean"].rename("clean")
     tested = found[found["test_noise"] != ""].join(clean, on=policy)
     tested["share"] = 100 * tested["mean"] / tested["clean"]
-    conditions = list(zip(tested["test_noise"], tested["test_rate"], strict=True))
     result = {}
-    for noise, rate in sorted(set(zip(found["noise"], found["noise_rate"], strict=True))):
-        if noise == "":
+    for config in sorted(set(found["configuration"])):
+        if config.is_baseline:
             continue
-        mask = [counts(condition, (noise, rate)) for condition in conditions]
+        noise = config.noise
+        mask = [counts(condition, config) for condition in tested["condition"]]
         shares = tested[mask].groupby(policy)["share"].mean()
         x, y = (shares[name].unstack("environment") for name in (noise, ""))
         n = x.shape[1]
@@ -236,7 +237,7 @@ def shares_table(unseen, seen):
 
 def by_noise(table):
     """Return the rows of all environments together as {"observation noise": {column: value}}."""
-    rows = table[table["environment"] == "all"]
+    rows = table[table["scope"] == "all"]
     return rows.set_index(rows["noise"].map(SHORT)).to_dict("index")
 
 
@@ -297,6 +298,7 @@ def draw():
     clean = table[table["test_noise"] == ""]
     noises = [noise for noise in SHORT if noise]
     environments = sorted(set(table["environment"]))
+    plt.rcParams.update(STYLE)
     fig, axes = plt.subplots(
         len(noises), len(environments), figsize=(9, 8), sharey="col", layout="constrained"
     )

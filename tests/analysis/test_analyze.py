@@ -28,6 +28,7 @@ import analysis.runs
 import analysis.statistics
 import analysis.tables
 import analyze
+from analysis.configurations import BASELINE, Configuration
 
 RESULTS = Path(analyze.__file__).parent / "results"
 NAN = float("nan")
@@ -111,9 +112,10 @@ def run(tmp_path, runs="runs", out="results", compare=None):
     """Run analyze.py's main function and read its csv tables."""
     args = analyze.Args(runs_dir=tmp_path / runs, out=tmp_path / out, compare=compare)
     analyze.main(args)
-    text = {"noise": str, "noise_rate": str, "test_rate": str}
+    empty = dict.fromkeys(("settings", "phase", "environment", "noise"), "")
+    text = dict.fromkeys((*empty, "noise_rate", "test_rate"), str)
     files = sorted((tmp_path / out).glob("*.csv"))
-    return {f.stem: pd.read_csv(f, dtype=text).fillna({"noise": ""}) for f in files}
+    return {f.stem: pd.read_csv(f, dtype=text).fillna(empty) for f in files}
 
 
 def row(table, **where):
@@ -144,7 +146,7 @@ def committed(tmp_path_factory):
 
 def test_summary_by_hand(sweep):
     table = sweep.tables["summary_SAC"]
-    assert list(table.columns) == analysis.tables.COLUMNS["summary"].split()
+    assert list(table.columns) == analysis.tables.COLUMNS["summary"]
     assert len(table) == len(FINALS)
     base = row(table, environment="Hopper-v5", noise="")
     assert (base["algorithm"], base["noise_rate"], base["n"], base["mean"]) == (
@@ -182,7 +184,7 @@ def test_the_baseline_reaches_its_own_final_mean():
 
 def test_best_by_hand(sweep):
     table = sweep.tables["best"]
-    assert list(table.columns) == analysis.tables.COLUMNS["best"].split()
+    assert list(table.columns) == analysis.tables.COLUMNS["best"]
     assert len(table) == 2
     pusher = row(table, environment="Pusher-v5")
     assert (pusher["noise"], pusher["noise_rate"]) == (SCALE, "0.05")
@@ -227,7 +229,8 @@ def test_consistent_is_80_percent_or_more_best_first():
     }
     names = ("noise", "percent_of_environments", "average_improvement_percent")
     rows = [dict(zip(names, (noise, *v), strict=True)) for noise, v in shares.items()]
-    rows = [{"algorithm": "SAC", "environments": 5} | row for row in rows]
+    study = {"algorithm": "SAC", "settings": "", "phase": ""}
+    rows = [study | {"environments": 5} | row for row in rows]
     rows.append(rows[2] | {"noise": "in one environment only", "environments": 1})
     table = analysis.tables.frame("consistency", rows)
     good, bad = analysis.tables.split_consistency(table)
@@ -249,7 +252,7 @@ def test_fails_at_every_rate_needs_every_rate(tmp_path):
 
 def test_early_performance_by_hand(sweep):
     table = sweep.tables["early_performance"]
-    assert list(table.columns) == analysis.tables.COLUMNS["early_performance"].split()
+    assert list(table.columns) == analysis.tables.COLUMNS["early_performance"]
     assert set(table["steps_millions"]) == {0.01, 0.02, 0.03, 0.04, 0.05}  # fifths of a short run
     where = {"environment": "Pusher-v5", "noise": SCALE, "steps_millions": 0.03}
     assert set(table[(table[list(where)] == pd.Series(where)).all(axis=1)]["noise_rate"]) == {
@@ -283,7 +286,7 @@ def test_early_performance_needs_a_run_with_noise(tmp_path):
 
 def test_statistics_by_hand(sweep):
     table = sweep.tables["statistics"]
-    assert list(table.columns) == analysis.tables.COLUMNS["statistics"].split()
+    assert list(table.columns) == analysis.tables.COLUMNS["statistics"]
     base = row(table, environment="Hopper-v5", noise="")
     assert (base["n"], base["iqm"]) == (4, 115) and np.isnan(base["p"])  # IQM: mean of 110 and 120
     even = row(table, environment="Hopper-v5", noise=SCALE, noise_rate="0.20")
@@ -305,29 +308,57 @@ def test_statistics_by_hand(sweep):
     assert worst["p"] == pytest.approx(2 / 70) == worst["smallest_p"]  # C(8, 4) = 70
     # Hopper's family of three: 2/70 (ENDING), 4/70 (130 ties 130, taken as U = 15), and the rest
     assert worst["p_adjusted"] == pytest.approx(3 * 2 / 70) == worst["smallest_p_adjusted"]
-    both = row(table, environment="all", noise=ENDING)
+    both = row(table, scope="all", noise=ENDING)
     assert both["environments"] == 2 and both["n"] == 4 and np.isnan(both["iqm"])
     scores = [100 * (r - 115) / 115 for r in (10, 20, 30, 40)] + [-100] * 4
     assert both["improvement_iqm_percent"] == pytest.approx(np.mean(sorted(scores)[2:6]))
     assert both["p"] == pytest.approx(2 / 70**2) == both["smallest_p"]
     assert both["improvement_low"] < both["improvement_iqm_percent"] < both["improvement_high"]
-    assert "all but Pusher" not in set(
-        table["environment"]
-    )  # one other environment is no aggregate
 
 
-def test_pusher_is_also_left_out_of_an_aggregate(tmp_path):
-    small_sweep(tmp_path / "runs")
-    for seed in range(3):
-        write_run(tmp_path / "runs", [100 + seed], env="Walker2d-v5", seed=seed, every=50_000)
-        args = {"env": "Walker2d-v5", "noise": SCALE, "rate": 0.05, "seed": seed, "every": 50_000}
-        write_run(tmp_path / "runs", [130 + seed], **args)
+def test_names_of_environments_say_nothing_about_a_row(tmp_path, capsys):
+    """They may begin with "all", and no environment is left out of the aggregate."""
+    for env in ("allegro-v0", "allegro_gym:Hand-v0", "PusherHard-v0"):
+        for seed in range(3):
+            write_run(tmp_path / "runs", [100 + seed], env=env, seed=seed)
+            write_run(tmp_path / "runs", [130 + seed], env=env, seed=seed, noise=SCALE, rate=0.1)
     table = run(tmp_path)["statistics"]
-    rest = row(table, environment="all but Pusher", noise=SCALE, noise_rate="0.05")
-    every = row(table, environment="all", noise=SCALE, noise_rate="0.05")
-    assert (every["environments"], rest["environments"], rest["n"]) == (3, 2, 3)
-    # Hopper's 130 ties 130: U = 15.5 of 16, taken as 15; with Walker2d's 9 of 9, 3 orders reach 24
-    assert rest["p"] == pytest.approx(2 * 3 / (70 * 20)) != every["p"]
+    table = table[table["p"].notna()]
+    assert list(zip(table["scope"], table["environment"], strict=True)) == [
+        ("environment", "PusherHard-v0"),
+        ("environment", "allegro-v0"),
+        ("environment", "allegro_gym:Hand-v0"),
+        ("all", ""),
+    ]
+    assert table["environments"].tolist() == [1, 1, 1, 3]
+    assert set(table["verdict"]) == {"no clear difference", "better"}  # better: all together
+    printed = capsys.readouterr().out
+    assert f"SAC on all 3 environments together with {SCALE}" in printed
+    assert f"SAC on allegro_gym:Hand-v0 with {SCALE}" in printed
+
+
+def test_a_single_environment_may_be_called_all(tmp_path, capsys):
+    for seed in range(3):
+        write_run(tmp_path / "runs", [100 + seed], env="all-v0", seed=seed)
+        write_run(tmp_path / "runs", [130 + seed], env="all-v0", seed=seed, noise=SCALE, rate=0.1)
+    run(tmp_path)
+    assert f"SAC on all-v0 with {SCALE} at rate 0.10" in capsys.readouterr().out
+
+
+def test_an_unfinished_run_renames_no_other(tmp_path, capsys):
+    for seed in range(3):
+        write_run(tmp_path / "runs", [100 + seed], seed=seed)
+        write_run(tmp_path / "runs", [130 + seed], seed=seed, noise=SCALE, rate=0.1)
+    write_run(tmp_path / "runs", [1], env="Hopper-v9", finished=False)
+    write_run(tmp_path / "runs", [1], gamma=0.5, finished=False, folder="other__1")
+    tables = run(tmp_path)
+    assert set(tables["statistics"]["settings"]) == {""}
+    assert f"SAC on Hopper-v5 with {SCALE}" in capsys.readouterr().out
+    left = tables["missing"]
+    assert set(left[left["status"] == "unfinished"]["settings"]) == {
+        "environments v9",
+        "gamma=0.5",
+    }
 
 
 def test_several_noises_are_one_configuration(tmp_path):
@@ -354,10 +385,10 @@ def test_papers_sign_convention_and_data():
     assert len(best) == 15 and {"noise", "noise_as_run"} <= set(best)
     for name, ours in (("consistent", "consistency"), ("consistently_worse", "consistency")):
         columns = set(pd.read_csv(paper / f"{name}.csv")) - {"noise_as_run"}
-        assert columns <= set(analysis.tables.COLUMNS[ours].split())
+        assert columns <= set(analysis.tables.COLUMNS[ours])
     columns = set(pd.read_csv(paper / "early_performance_sac.csv")) - {"noise_as_run"}
-    assert columns <= set(analysis.tables.COLUMNS["early_performance"].split())
-    assert set(best) - {"noise_as_run"} <= set(analysis.tables.COLUMNS["best"].split())
+    assert columns <= set(analysis.tables.COLUMNS["early_performance"])
+    assert set(best) - {"noise_as_run"} <= set(analysis.tables.COLUMNS["best"])
 
 
 # ------------------------------------------------------------------------------------- statistics
@@ -437,7 +468,8 @@ def test_mann_whitney_over_environments_by_enumeration():
 
 def test_benjamini_hochberg_by_hand_and_its_limit():
     table = analysis.tables.frame("statistics", [{"p": p} for p in (0.01, 0.04, 0.03, 0.2, NAN)])
-    table[["algorithm", "environment", "smallest_p"]] = "SAC", "Hopper-v5", 0.01
+    table[["algorithm", "scope", "environment"]] = "SAC", "environment", "Hopper-v5"
+    table["smallest_p"] = 0.01
     table = analysis.tables.adjust(table)
     expected = [0.04, 0.04 * 4 / 3, 0.04 * 4 / 3, 0.2]
     np.testing.assert_allclose(table["p_adjusted"][:4].astype(float), expected)
@@ -447,12 +479,11 @@ def test_benjamini_hochberg_by_hand_and_its_limit():
 
 def test_five_against_five_cannot_reach_significance_alone_among_90(tmp_path):
     rng = np.random.default_rng(0)
-    returns = {(f"N({i})", "0.05"): rng.normal(0, 1, (1, 5, 1)) for i in range(90)}
-    returns = {
-        analysis.runs.BASELINE: rng.normal(1000, 1, (1, 5, 1))
-    } | returns  # all lose every pair
+    noisy = [Configuration((f"N({i})",), ((0.05, 0.05),)) for i in range(90)]
+    returns = {config: rng.normal(0, 1, (1, 5, 1)) for config in noisy}
+    returns = {BASELINE: rng.normal(1000, 1, (1, 5, 1))} | returns  # all lose every pair
     study = analysis.runs.Study(
-        "SAC", "SAC", "", ["Hopper-v5"], [1, 2, 3, 4, 5], np.array([1]), returns
+        "SAC", "", "", ["Hopper-v5"], [1, 2, 3, 4, 5], np.array([1]), returns
     )
     table = analysis.tables.adjust(
         analysis.tables.frame("statistics", analysis.tables.statistics_rows(study))
@@ -556,7 +587,7 @@ def test_corrupt_evaluations_are_reported_and_left_out(name, tmp_path):
     assert list(runs["status"]) == ["finished", "finished", "corrupt"]
     assert runs["reason"].iloc[2].count("\n") == 0 and len(runs["reason"].iloc[2]) > 10
     (study,), _ = analysis.runs.make_studies(runs)
-    assert study.final(analysis.runs.BASELINE).ravel().tolist() == [51, 52]
+    assert study.final(BASELINE).ravel().tolist() == [51, 52]
     assert analysis.runs.missing_runs(runs).empty  # it is there, only broken
 
 
@@ -641,14 +672,14 @@ def test_more_seeds_for_the_baseline_or_for_one_noise_are_nothing_missing(tmp_pa
 def test_only_the_older_versions_of_an_environment_are_labelled(tmp_path):
     for env in ("Hopper-v5", "Walker2d-v9", "Walker2d-v10", "Ant", "Ant-v4"):
         write_run(tmp_path, [10], env=env)
-    runs = analysis.runs.read_runs(tmp_path).set_index("environment")["algorithm"]
-    assert runs["Walker2d-v9"] == "SAC [environments v9]"
-    assert runs["Ant"] == "SAC [environments v]"
-    assert set(runs[["Hopper-v5", "Walker2d-v10", "Ant-v4"]]) == {"SAC"}
+    runs = analysis.runs.read_runs(tmp_path).set_index("environment")["settings"]
+    assert runs["Walker2d-v9"] == "environments v9"
+    assert runs["Ant"] == "environments v"
+    assert set(runs[["Hopper-v5", "Walker2d-v10", "Ant-v4"]]) == {""}
     for env in ("Grid-v0", "Maze-v0", "Maze-v1"):
         write_run(tmp_path, [10], env=env)
-    runs = analysis.runs.read_runs(tmp_path).set_index("environment")["algorithm"]
-    assert runs["Grid-v0"] == "SAC" and runs["Maze-v0"] == "SAC [environments v0]"
+    runs = analysis.runs.read_runs(tmp_path).set_index("environment")["settings"]
+    assert runs["Grid-v0"] == "" and runs["Maze-v0"] == "environments v0"
 
 
 def test_a_noise_is_not_missing_where_nobody_tried_it(tmp_path):
@@ -675,32 +706,34 @@ def test_a_missing_baseline_is_said(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("change", "label"),
+    ("change", "study"),
     [
-        ({"env": "Hopper-v4"}, "SAC [environments v4]"),
-        ({"every": 20_000}, "SAC [total_timesteps=20000]"),
-        ({"gamma": 0.9}, "SAC [gamma=0.9]"),
-        ({"tau": 0.1}, "SAC [tau=0.1]"),
-        ({"exp_name": "other"}, "SAC [exp_name=other]"),
-        ({"algorithm": "TD3", "exp_name": "SAC"}, "TD3"),
+        ({"env": "Hopper-v4"}, ("SAC", "environments v4")),
+        ({"every": 20_000}, ("SAC", "total_timesteps=20000")),
+        ({"gamma": 0.9}, ("SAC", "gamma=0.9")),
+        ({"tau": 0.1}, ("SAC", "tau=0.1")),
+        ({"exp_name": "other"}, ("SAC", "exp_name=other")),
+        ({"algorithm": "TD3", "exp_name": "SAC"}, ("TD3", "")),
     ],
 )
-def test_runs_that_differ_never_share_a_row(change, label, tmp_path):
+def test_runs_that_differ_never_share_a_row(change, study, tmp_path):
     for seed in (1, 2):
         write_run(tmp_path / "runs", [10], seed=seed, folder=f"a{seed}")
         write_run(tmp_path / "runs", [99], seed=seed, folder=f"b{seed}", **change)
         write_run(tmp_path / "runs", [50], seed=seed, folder=f"c{seed}", noise=SCALE, rate=0.1)
     runs = analysis.runs.read_runs(tmp_path / "runs")
-    assert set(runs["status"]) == {"finished"} and label in set(runs["algorithm"])
+    assert set(runs["status"]) == {"finished"}
+    assert study in set(zip(runs["algorithm"], runs["settings"], strict=True))
     tables = run(tmp_path)
     summary = pd.concat([t for name, t in tables.items() if name.startswith("summary_")])
     assert list(summary["n"]) == [2, 2, 2] and sorted(summary["std"]) == [0, 0, 0]
-    other = row(summary, algorithm=label)
+    algorithm, settings = study
+    other = row(summary, algorithm=algorithm, settings=settings)
     assert other["mean"] == 99 and np.isnan(other["improvement_percent"])
     noisy = row(summary, noise=SCALE)
-    assert noisy["baseline_mean"] == 10 and noisy["algorithm"] != label
-    assert noisy["algorithm"] == "SAC" or change.keys() <= {"every", "gamma", "tau", "exp_name"}
-    assert "all" not in set(tables["statistics"]["environment"])
+    assert noisy["baseline_mean"] == 10 and (noisy["algorithm"], noisy["settings"]) != study
+    assert noisy["settings"] == "" or change.keys() <= {"every", "gamma", "tau", "exp_name"}
+    assert "all" not in set(tables["statistics"]["scope"])
 
 
 def test_paths_threads_and_evaluation_steps_do_not_split_rows(tmp_path, capsys):
@@ -710,7 +743,7 @@ def test_paths_threads_and_evaluation_steps_do_not_split_rows(tmp_path, capsys):
     runs = analysis.runs.read_runs(tmp_path / "runs")
     (study,), notes = analysis.runs.make_studies(runs)
     assert study.algorithm == "SAC" and study.steps.tolist() == [20_000, 40_000]
-    assert study.returns[analysis.runs.BASELINE][:, :, 0].tolist() == [[2, 6, 2], [4, 8, 5]]
+    assert study.returns[BASELINE][:, :, 0].tolist() == [[2, 6, 2], [4, 8, 5]]
     assert "cut to the 2 steps that all share (of up to 4)" in notes[0]
     assert (
         "some rows average runs with different mujoco" in notes[1] and "3.14.0 (n = 1)" in notes[1]
@@ -802,18 +835,18 @@ def test_a_difference_needs_equal_steps_and_a_listing_one_version(tmp_path):
                 write_run(tmp_path / "runs", 5 * [12 + seed], env=f"{env}-v4", **more)
             write_run(tmp_path / "runs", [final], env="Walker2d-v5", **more)
     tables = run(tmp_path, compare=RESULTS / "paper")
-    best = tables["compare_best"].set_index(["algorithm", "environment", "noise"]).sort_index()
-    whole, short = "SAC [total_timesteps=1000000]", "SAC [total_timesteps=200000]"
+    best = tables["compare_best"].set_index(["settings", "environment", "noise"]).sort_index()
+    whole, short = "total_timesteps=1000000", "total_timesteps=200000"
     assert np.isfinite(best.loc[(whole, "Hopper-v5", ""), "difference_se"])
     assert best.loc[(short, "Walker2d-v5", ""), "mean"] == 11
     assert np.isnan(best.loc[(short, "Walker2d-v5", ""), "difference_se"])
     early = tables["compare_early_performance"]
-    early = early[(early["algorithm"] == short) & (early["steps_millions"] == 0.2)]
+    early = early[(early["settings"] == short) & (early["steps_millions"] == 0.2)]
     assert len(early) == 2 and early["difference_se"].notna().all()
     table = tables["compare_consistent"]  # the paper lists this noise: SAC, 100 %
     table = table[(table["noise"] == SCALE) & (table["noise_rate"] == "0.05")]
-    listed = table.set_index("algorithm")["listed_by"]
-    assert listed[whole] == "paper" and listed[whole.replace("]", ", environments v4]")] == "both"
+    listed = table.set_index("settings")["listed_by"]
+    assert listed[whole] == "paper" and listed[f"{whole}, environments v4"] == "both"
 
 
 def test_without_a_common_configuration_each_environment_has_its_interval(tmp_path):
@@ -872,10 +905,12 @@ def test_figures_have_labels_units_and_n(sweep):
 
     [study] = studies  # an environment without this noise has no panel
     for config, returns in study.returns.items():
-        returns[:, :, 0] = np.nan if config[0] == "RandomEarlyTermination(50)" else 1.0
+        returns[:, :, 0] = np.nan if config.noise == ENDING else 1.0
     _, fig, _ = analysis.figures.curves_figure(study, "RandomEarlyTermination(50)")
     assert [ax.get_title() for ax in fig.axes] == ["Pusher-v5"]
-    study.returns[SCALE, "0.05"][:, :, 0] = np.nan  # nor has a rate that was not tried a line
+    study.returns[Configuration.parse(SCALE, 0.05)][:, :, 0] = (
+        np.nan
+    )  # nor has a rate that was not tried a line
     _, fig, _ = analysis.figures.curves_figure(study, SCALE)
     legend = [text.get_text() for text in fig.legends[0].get_texts()]
     assert legend[1] == "rate 0.05 (n = 4)" and len(fig.axes) == 2
@@ -1015,7 +1050,7 @@ def test_heatmap_colours_fit_the_data(tmp_path):
         write_run(tmp_path, [95 + seed], seed=seed, noise=ENDING, rate=0.1)
     for factor, limit in ((1, 12), (100, 100)):  # 12 / 102 = 11.8 %; at most 100 %
         studies, _ = analysis.runs.make_studies(analysis.runs.read_runs(tmp_path))
-        studies[0].returns[SCALE, "0.10"] += 12 * (factor - 1)
+        studies[0].returns[Configuration.parse(SCALE, 0.1)] += 12 * (factor - 1)
         tables = analysis.tables.make_tables(studies)
         drawn = {name: figure for name, figure, _ in analysis.figures.figures(studies, tables)}
         image = drawn["heatmap_SAC"].axes[0].images[0]

@@ -40,17 +40,19 @@ def test_search_and_confirmation_are_never_mixed(tmp_path, capsys):
     write_choice(tmp_path / "runs")
     tables = run(tmp_path)
     summary = tables["summary_PPO"]
-    search, fresh = "PPO [search]", "PPO [confirmation]"
-    assert row(summary, algorithm=search, noise=SCALE)[["n", "mean"]].tolist() == [3, 902]
-    confirmed = row(summary, algorithm=fresh, noise=SCALE)
+    search, fresh = "search", "confirmation"
+    assert row(summary, phase=search, noise=SCALE)[["n", "mean"]].tolist() == [3, 902]
+    confirmed = row(summary, phase=fresh, noise=SCALE)
     assert confirmed[["n", "mean", "n_baseline", "baseline_mean"]].tolist() == [5, 133, 5, 103]
-    assert np.isnan(row(summary, algorithm=search, noise=SCALE)["improvement_percent"])
+    assert np.isnan(row(summary, phase=search, noise=SCALE)["improvement_percent"])
     # Only the confirmation is judged: five against five that are all higher.
     for name in ("statistics", "best", "luck"):
-        assert set(tables[name]["algorithm"]) == {fresh}
+        assert set(tables[name]["phase"]) == {fresh}
     assert row(tables["statistics"], noise=SCALE)["p"] == pytest.approx(2 / 252)
     printed = capsys.readouterr().out
-    found = f"{fresh} on Hopper-v5 with {SCALE} at rate 1.00 is better than no noise: +29 %"
+    found = (
+        f"PPO [confirmation] on Hopper-v5 with {SCALE} at rate 1.00 is better than no noise: +29 %"
+    )
     assert found in printed
     assert "no finished baseline" not in printed and tables["missing"].empty
     choice = tables["choice"]
@@ -65,7 +67,7 @@ def test_confirmations_are_one_family_of_holms(tmp_path):
         write_choice(tmp_path / "runs", env, gain=0.5 if env == "Pusher-v5" else 30.0)
     table = run(tmp_path)["statistics"]
     table = table[table["p"].notna()].set_index("environment")
-    assert set(table.index) == {"Hopper-v5", "Pusher-v5", "Walker2d-v5"}  # no "all"
+    assert set(table.index) == {"Hopper-v5", "Pusher-v5", "Walker2d-v5"}  # nor all of them
     p = 2 / 252
     assert table.loc["Hopper-v5", "p_adjusted"] == pytest.approx(3 * p)
     assert table.loc["Walker2d-v5", "p_adjusted"] == pytest.approx(3 * p)  # never below another
@@ -77,7 +79,7 @@ def test_without_choice_csv_high_seeds_are_seeds(tmp_path):
     write_choice(tmp_path / "runs")
     (tmp_path / "runs/choice.csv").unlink()
     tables = run(tmp_path)
-    assert set(tables["summary_PPO"]["algorithm"]) == {"PPO"} and "choice" not in tables
+    assert set(tables["summary_PPO"]["phase"]) == {""} and "choice" not in tables
     assert row(tables["summary_PPO"], noise=SCALE)["n"] == 8
 
 
@@ -88,11 +90,11 @@ def test_other_sweeps_in_the_folder_of_a_choice_stay_as_they_are(tmp_path):
             write_run(tmp_path / "runs", [100.0 + seed], algorithm, env, seed=seed)
             write_run(tmp_path / "runs", [110.0 + seed], algorithm, env, SCALE, 1.0, seed)
     tables = run(tmp_path)
-    found = tables["statistics"].query("environment != 'all'")
-    assert set(zip(found["algorithm"], found["environment"], strict=True)) == {
-        ("PPO [confirmation]", "Hopper-v5"),
-        ("PPO", "Pusher-v5"),
-        ("SAC", "Hopper-v5"),
+    found = tables["statistics"].query("scope == 'environment'")
+    assert set(zip(found["algorithm"], found["phase"], found["environment"], strict=True)) == {
+        ("PPO", "confirmation", "Hopper-v5"),
+        ("PPO", "", "Pusher-v5"),
+        ("SAC", "", "Hopper-v5"),
     }
 
 

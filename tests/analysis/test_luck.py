@@ -13,19 +13,22 @@ import analysis.paper
 import analysis.runs
 import analysis.tables
 import analyze
+from analysis.configurations import BASELINE, Configuration
 
 NAN = float("nan")
 PAPER = Path(analyze.__file__).parent / "results/paper"
+STUDY = {"algorithm": "PPO", "settings": "", "phase": ""}
 MANY = 10**9  # seeds or degrees of freedom: no uncertainty
 
 
 def make_study(baseline, noisy):
     """Make a Study of final returns: baseline (seeds x envs), noisy (configs x seeds x envs)."""
-    returns = {analysis.tables.BASELINE: baseline[None]}
-    returns |= {(f"N({i})", "1.00"): values[None] for i, values in enumerate(noisy)}
+    returns = {BASELINE: baseline[None]}
+    for i, values in enumerate(noisy):
+        returns[Configuration((f"N({i})",), ((1.0, 1.0),))] = values[None]
     environments = [f"Env{e}-v0" for e in range(baseline.shape[1])]
     seeds = list(range(len(baseline)))
-    return analysis.runs.Study("PPO", "PPO", "", environments, seeds, np.array([1]), returns)
+    return analysis.runs.Study("PPO", "", "", environments, seeds, np.array([1]), returns)
 
 
 def luck_of_one_environment(baseline, noisy):
@@ -113,8 +116,9 @@ def test_what_cannot_be_drawn_is_left_out():
     with np.errstate(all="raise"):  # no division by zero
         zero = analysis.luck.luck_of_study(make_study(np.array([[-1.0], [1]]), np.ones((2, 2, 1))))
     assert alone.best == zero.best == {}
-    best = pd.DataFrame([{"algorithm": "PPO", "environment": "Env0-v0", "improvement_percent": 1}])
-    assert analysis.luck.add_luck_of_best(best, {"PPO": alone})["p_luck"].isna().all()
+    best = pd.DataFrame([STUDY | {"environment": "Env0-v0", "improvement_percent": 1}])
+    lucks = {("PPO", "", ""): alone}
+    assert analysis.luck.add_luck_of_best(best, lucks)["p_luck"].isna().all()
 
 
 # -------------------------------------------------------------------------------- false alarms
@@ -148,12 +152,12 @@ def test_useless_noise_in_a_paper_is_beyond_luck_in_five_percent_of_studies(n, m
     """Only the baseline's standard deviation is known there, from n seeds."""
     monkeypatch.setattr(analysis.luck, "DRAWS", 1000)
     rng, studies, p = np.random.default_rng(n), 500, []
-    names = ["algorithm", "environment", "baseline_mean", "baseline_std", "improvement_percent"]
+    names = ["environment", "baseline_mean", "baseline_std", "improvement_percent"]
     for _ in range(studies):
         baseline, noisy = rng.normal(20, 1, n), rng.normal(20, 1, (90, n))
         percent = 100 * (noisy.mean(axis=1).max() / baseline.mean() - 1)
-        values = ["PPO", "Env0-v0", baseline.mean(), baseline.std(ddof=1), percent]
-        table = pd.DataFrame([dict(zip(names, values, strict=True))])
+        values = ["Env0-v0", baseline.mean(), baseline.std(ddof=1), percent]
+        table = pd.DataFrame([STUDY | dict(zip(names, values, strict=True))])
         lucks = analysis.luck.luck_of_paper(table, {"PPO": n}, 90)
         p.append(analysis.luck.add_luck_of_best(table, lucks)["p_luck"].item())
     assert 0.03 <= (np.array(p) <= 0.05).mean() <= 0.08

@@ -127,7 +127,8 @@ def test_environments_count_equally_and_the_test_is_stratified(tmp_path):
     write_tests(tmp_path / "runs", few, "Hopper-v5")
     write_tests(tmp_path / "runs", pusher, "Pusher-v5", seeds=(1, 2, 3))
     scores = run(tmp_path)["robustness_score"]
-    assert list(scores["environment"]) == ["all", "Hopper-v5", "Pusher-v5"]
+    assert list(scores["scope"]) == ["all", "environment", "environment"]
+    assert list(scores["environment"]) == ["", "Hopper-v5", "Pusher-v5"]
     every, _, one = (scores.iloc[i] for i in range(3))
     assert one["score"] == pytest.approx(100 * (-76 + 50) / 50)  # -52
     assert one["baseline_score"] == pytest.approx(-102)
@@ -268,4 +269,4 @@ def test_robustness_of_runs_with_other_settings_is_apart(tmp_path):
         path.write_text(json.dumps(config))
     found, _ = analysis.robustness.read_robustness(tmp_path, analysis.runs.read_runs(tmp_path))
     scores = analysis.robustness.robustness_tables(found)["robustness_score"].frame
-    assert scores.empty and set(found["algorithm"]) == {"PPO [gamma=0.99]", "PPO [gamma=0.5]"}
+    assert scores.empty and set(found["settings"]) == {"gamma=0.99", "gamma=0.5"}

@@ -9,14 +9,15 @@ import analysis.runs
 import analysis.tables
 import analysis.verdicts
 import analyze
+from analysis.configurations import BASELINE, Configuration
 
 NOISE = "RandomEarlyTermination(50)"
 
 
 def study(baseline, noisy):
     """One environment: final returns of the baseline, and those with noise, by its rate."""
-    finals = {analysis.runs.BASELINE: baseline}
-    finals |= {(NOISE, rate): values for rate, values in noisy.items()}
+    finals = {BASELINE: baseline}
+    finals |= {Configuration.parse(NOISE, rate): values for rate, values in noisy.items()}
     most = max(map(len, finals.values()))
     returns = {}
     for config, values in finals.items():
@@ -24,7 +25,7 @@ def study(baseline, noisy):
         padded[: len(values)] = values
         returns[config] = padded.reshape(1, most, 1)
     seeds = list(range(most))
-    return analysis.runs.Study("PPO", "PPO", "", ["Pusher-v5"], seeds, np.array([1000]), returns)
+    return analysis.runs.Study("PPO", "", "", ["Pusher-v5"], seeds, np.array([1000]), returns)
 
 
 def judge(baseline, noisy):
