@@ -23,6 +23,7 @@ initial states are the same with and without noise.
 
 import ast
 import contextlib
+import functools
 import hashlib
 import importlib
 import importlib.machinery
@@ -790,9 +791,16 @@ def parse_noise(text: str) -> Noise:
         ValueError: unknown name or bad arguments; below the first line, the message lists the
             wrappers, one on a line.
     """
+    if not isinstance(text, str):
+        raise _bad_noise(text, "expected Name(number, ..., keyword=value)")
+    return _read_noise(text)
+
+
+@functools.cache  # the runs of a large sweep have few different noises
+def _read_noise(text: str) -> Noise:
     try:
         name, args, kwargs = _read_call(text)
-    except (AttributeError, MemoryError, RecursionError, SyntaxError, TypeError, ValueError):
+    except (MemoryError, RecursionError, SyntaxError, TypeError, ValueError):
         raise _bad_noise(text, "expected Name(number, ..., keyword=value)") from None
     if name not in WRAPPERS:
         raise _bad_noise(text, "unknown name")
