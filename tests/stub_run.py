@@ -2,7 +2,8 @@
 
     python tests/stub_run.py SCRIPT ARGUMENTS...
 
-STUB_SECONDS is how long a run takes; SIGTERM ends it. STUB_FAILS is a pattern of folders whose runs
+It makes 100,000 steps a second, and a checkpoint after each tenth of them and when SIGTERM or
+SIGINT stops it; started again, it goes on from there. STUB_FAILS is a pattern of folders whose runs
 fail.
 """
 
@@ -11,6 +12,7 @@ import fnmatch
 import json
 import os
 import random
+import signal
 import sys
 import time
 from pathlib import Path
@@ -20,6 +22,8 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 from noisy_wrappers import run_folder  # noqa: E402
 
 EPISODES = 10  # the scripts' default
+STEPS, SECONDS = 2000, 0.02
+STOPPED = []  # the signals that have come
 
 
 def episodes_of(algorithm, env_id, noise, rates, seed):
@@ -35,6 +39,33 @@ def episodes_of(algorithm, env_id, noise, rates, seed):
 
 def tests_of(*run):
     return [fmean(episodes) for episodes in episodes_of(*run)]
+
+
+def stop(number, frame):
+    """Ask for a checkpoint; a second signal ends the run at once, as in the scripts."""
+    if STOPPED:
+        os._exit(128 + number)
+    STOPPED.append(number)
+
+
+def pretend_to_train(total_timesteps, checkpoint):
+    """Wait as long as it takes, from the checkpoint on if there is one."""
+    step = saved = int(checkpoint.read_text()) if checkpoint.exists() else 0
+    if step:
+        print(f"resumed at step {step}")
+    while step < total_timesteps:
+        step = min(step + STEPS, total_timesteps)
+        time.sleep(SECONDS * (total_timesteps >= STEPS))
+        print(f"step={step}/{total_timesteps} sps=100", flush=True)
+        if STOPPED:
+            time.sleep(0.2)  # for a second signal, which should not come
+        if STOPPED or step - saved >= total_timesteps / 10:
+            checkpoint.with_suffix(".tmp").write_text(str(step))
+            checkpoint.with_suffix(".tmp").rename(checkpoint)
+            saved = step
+        if STOPPED:
+            sys.exit(128 + STOPPED[0])
+    checkpoint.unlink(missing_ok=True)
 
 
 def train(argv):
@@ -57,10 +88,9 @@ def train(argv):
     config = {"algorithm": exp_name[:3].upper(), "versions": {}}
     config["args"] = vars(args) | {"eval_episodes": EPISODES, "exp_name": exp_name}
     (folder / "config.json").write_text(json.dumps(config))
-    print(f"step=0/{args.total_timesteps} sps=100", flush=True)
     if fnmatch.fnmatch(folder.name, os.environ.get("STUB_FAILS", "")):
         sys.exit("error: this one fails")
-    time.sleep(float(os.environ.get("STUB_SECONDS", 0)))
+    pretend_to_train(args.total_timesteps, folder / "checkpoint.pt")
 
     tests = episodes_of(exp_name[:3], args.env_id, args.noise, args.noise_rate, args.seed)
     rows = ["step,episode,episodic_return,episodic_length"]
@@ -75,4 +105,6 @@ def train(argv):
 
 
 if __name__ == "__main__":
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, stop)
     train(sys.argv[1:])

@@ -1,0 +1,368 @@
+"""The grid of a sweep, asked in this process: its runs, what counts as finished, bad input."""
+
+import argparse
+import csv
+import functools
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+import time
+from collections import Counter
+from importlib import import_module
+from unittest import mock
+
+import pytest
+import tyro
+from views import ROOT, folders, log_of, view
+
+import noisy_wrappers
+from sweep.grid import GIVEN_BY_THE_GRID, script_options
+
+ALGORITHMS = {"sac": 5, "td3": 5, "ppo": 10}  # seeds
+SCALE = "RandomUniformScaleReward(0.5, 1.5)"
+A = "RandomNormalNoisyReward(1)"
+C = "choose --algos ppo --envs Hopper-v5"
+GRID = ["--algos", "sac", "--envs", "Pendulum-v1", "--seeds", "1"]
+
+
+@functools.cache
+def dry_run(*args):
+    """Return the grid's lines, each with its text and its options."""
+    result = view("list", *args)
+    assert result.code == 0, result.err
+    lines = [line.split("\t")[2] for line in result.out.splitlines()]
+    assert result.err.startswith(f"{len(lines)} runs")
+    parser = argparse.ArgumentParser()
+    parser.add_argument("python", choices=[sys.executable])
+    parser.add_argument("script", choices=[f"{name}_continuous_noisy.py" for name in ALGORITHMS])
+    for option in ("--env-id", "--runs-dir"):
+        parser.add_argument(option, required=True)
+    for option in ("--seed", "--total-timesteps"):
+        parser.add_argument(option, required=True, type=int)
+    parser.add_argument("--noise", nargs="+", default=[])
+    parser.add_argument("--noise-rate", nargs="+", default=[])
+    return [parser.parse_args(shlex.split(line), argparse.Namespace(text=line)) for line in lines]
+
+
+# THE RUNS
+
+
+def test_paper_grid():
+    with mock.patch.object(
+        noisy_wrappers, "_read_call", wraps=noisy_wrappers._read_call
+    ) as read_noise:
+        lines = dry_run("paper")
+    assert read_noise.call_count <= 15  # each noise once: for each run, it would take seconds
+    assert len(lines) == len({line.text for line in lines}) == 9100
+    assert len(set(folders("paper"))) == 9100
+    tables = (ROOT / "results" / "paper").glob("*.csv")
+    noises = {row["noise_as_run"] for path in tables for row in csv.DictReader(path.open())}
+    assert len(noises) == 15
+    assert Counter(line.script[:3] for line in lines) == {"sac": 2275, "td3": 2275, "ppo": 4550}
+    assert Counter(line.env_id for line in lines) == {
+        f"{env}-v5": 1820 for env in ("HalfCheetah", "Hopper", "Humanoid", "Pusher", "Walker2d")
+    }
+    noisy = [line for line in lines if line.noise]
+    assert len(noisy) == 9000
+    assert Counter(*zip(*(x.noise for x in noisy), strict=True)) == dict.fromkeys(noises, 600)
+    rates = ["0.01", "0.05", "0.1", "0.2", "0.5", "1.0"]
+    assert Counter(*zip(*(x.noise_rate for x in noisy), strict=True)) == dict.fromkeys(rates, 1500)
+    for algorithm, seeds in ALGORITHMS.items():
+        of = Counter(line.seed for line in lines if line.script.startswith(algorithm))
+        assert of == {seed: 455 for seed in range(1, seeds + 1)}
+    assert {line.total_timesteps for line in lines} == {1_000_000}
+    assert [line.seed for line in lines] == sorted(line.seed for line in lines)
+    # Seeds differ in their number only, so the first seed stands for all in the next test.
+    for seed in range(2, 11):
+        first = [x.text.replace("--seed 1 ", f"--seed {seed} ") for x in lines if x.seed == 1]
+        assert {line.text for line in lines if line.seed == seed} <= set(first)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_scripts_accept_every_line(algorithm):
+    script = import_module(f"{algorithm}_continuous_noisy")
+    lines = [x for x in dry_run("paper") if x.seed == 1 and x.script.startswith(algorithm)]
+    for line in lines:
+        args = tyro.cli(script.Args, args=shlex.split(line.text)[2:])
+        assert list(args.noise) == line.noise
+        assert [args.env_id, args.seed] == [line.env_id, 1]
+        assert list(map(str, args.noise_rate)) == line.noise_rate
+
+
+def test_other_presets():
+    best = {(x.script[:3], x.env_id, *x.noise, *x.noise_rate) for x in dry_run("best")}
+    with open(ROOT / "results" / "paper" / "best.csv") as file:
+        for row in csv.DictReader(file):
+            cell = (row["algorithm"].lower(), row["environment"].replace("-v2", "-v5"))
+            best -= {cell, (*cell, row["noise_as_run"], str(float(row["noise_rate"])))}
+    assert not best
+    assert len(dry_run("best")) == 2 * len(dry_run("baseline")) == 200
+    ablation = dry_run("ablation")
+    assert len(ablation) == 5 * 10 * (1 + 5 + 5)
+    for line in ablation:
+        if line.noise:
+            name, low, high = re.fullmatch(r"(\w+)\((.+), (.+)\)", *line.noise).groups()
+            scale = name == "RandomUniformScaleReward"
+            assert float(low) == pytest.approx(2 - float(high) if scale else -float(high))
+            assert line.noise_rate == (["0.05"] if scale else ["1.0"])
+    assert {(x.script[:3], x.env_id, x.runs_dir) for x in dry_run("demo")} == {
+        ("ppo", "Pusher-v5", "runs/demo")
+    }
+    chosen = view("list", *C.split())
+    assert all(line.endswith("--runs-dir runs/choose") for line in chosen.out.splitlines())
+    assert view("status", *C.split()).out.startswith("runs/choose: ")
+    assert [(x.seed, x.noise, x.total_timesteps) for x in dry_run("demo")] == [
+        (seed, noise, 100_000)
+        for seed in range(1, 6)
+        for noise in ([], ["RandomEarlyTermination(50)"])
+    ]
+
+
+def test_spellings_and_rate_zero_are_one_run():
+    noises = ["RandomUniformScaleReward(.5, 1.5)", "RandomUniformScaleReward(0.50, high=1.5)"]
+    grid = ["--algos=SAC", "--envs", "Hopper-v5", "Hopper-v5", "--seeds", "3", "3-4"]
+    lines = dry_run("custom", *grid, "--noises", *noises, "--noise-rates", "0.10", "0", ".1")
+    assert [(line.seed, line.noise) for line in lines] == [
+        (seed, noise) for seed in (3, 4) for noise in ([], [SCALE])
+    ]
+
+
+def test_rates_of_ones_own_and_pairs():
+    cells = ["--noises", f"{A}@0.1+RandomEarlyTermination(50)@1:0", "RandomDropoutObservation(0.9)"]
+    lines = dry_run("custom", *GRID, *cells, "--noise-rates", "0.5", "1.0:0", "--combine")
+    early, reward, drop = (
+        "RandomEarlyTermination(50)",
+        "RandomNormalNoisyReward(1.0)",
+        "RandomDropoutObservation(0.9)",
+    )
+    assert [list(zip(line.noise, line.noise_rate, strict=True)) for line in lines] == [
+        [],
+        [(early, "1.0:0.0"), (reward, "0.1")],
+        [(drop, "0.5")],
+        [(drop, "1.0:0.0")],
+        [(early, "1.0:0.0"), (reward, "0.1"), (drop, "0.5")],
+        [(early, "1.0:0.0"), (reward, "0.1"), (drop, "1.0:0.0")],
+    ]
+    lines = dry_run("custom", *GRID, "--noises", f"{A}@0.1")
+    assert [line.noise_rate for line in lines] == [[], ["0.1"]]
+    three = ["--noises", A, "RandomEarlyTermination(50)", "RandomDropoutObservation(0.9)"]
+    lines = dry_run("custom", *GRID, *three, "--noise-rates", "0.5", "--combine")
+    assert [len(line.noise) for line in lines] == [0, 1, 1, 1, 2, 2, 2]
+    assert {rate for line in lines for rate in line.noise_rate} == {"0.5"}
+    assert {x.total_timesteps for x in dry_run("demo", "--total-timesteps", "2.5e3")} == {2500}
+
+
+# FINISHED RUNS
+
+
+def test_status_arithmetic(tmp_path):
+    grid = ["baseline", "--algos", "ppo", "--envs", "Hopper-v5", "--seeds", "1-6"]
+    grid += ["--total-timesteps", "1000", "--runs-dir", tmp_path]
+    done, running, slow, failed, stopped, lost = folders(*grid)
+    (tmp_path / "logs").mkdir()
+    done.mkdir()
+    (done / "result.json").write_text('{"total_timesteps": 1000}')
+    (done / "config.json").write_text('{"args": {}}')
+    for folder, text in {
+        done: "step=1000/1000 sps=200 eval_return=1.0\n# now host: exit=0\n",
+        running: "step=100/1000 sps=100 eta=0:00:09\nstep=200/1000 sps=100 eta=0:00:08\n",
+        slow: "step=200/1000 sps=10 eta=0:01:20\n",
+        failed: "step=600/1000 sps=100\nTraceback\n  x\nValueError: broken\n"
+        "(training stopped)\n# now host: exit=1\n",
+        stopped: "step=500/1000 sps=100\n# now host: exit=143\n",
+        lost: "step=500/1000 sps=100\n",
+    }.items():
+        log_of(folder).write_text("# now host: python ppo_continuous_noisy.py --seed 1\n" + text)
+    os.utime(log_of(lost), (time.time() - 300,) * 2)
+    result = view("status", *grid)
+    assert result.code == 0
+    # 800 + 800 + 400 + 500 + 500 steps are left. At 200, 100, 10, 100, 100 and 100 steps per second
+    # the mean time of a step is 0.145 / 6 seconds, and two runs run at a time: 36.25 seconds.
+    state = "6 runs: 1 done, 2 running, 1 failed, 2 to do; 110 steps/s now, about 0:00:36 left"
+    assert state in result.out
+    assert re.search(rf"exit 1 +{log_of(failed)} +ValueError: broken\n", result.out)
+    slowest = result.out.partition("slowest")[2].splitlines()[1:]
+    assert [line.split() for line in slowest] == [
+        ["0:01:20", "10/s", "200", str(slow)],
+        ["0:00:08", "100/s", "200", str(running)],
+    ]
+
+
+def test_a_finished_run_of_another_length_is_not_taken_for_done(tmp_path):
+    grid = ["baseline", "--algos", "ppo", "--envs", "Hopper-v5", "--seeds", "1"]
+    grid += ["--total-timesteps", "1000", "--runs-dir", tmp_path]
+    [folder] = folders(*grid)
+    folder.mkdir()
+    (folder / "result.json").write_text('{"total_timesteps": 20}')
+    (folder / "config.json").write_text('{"args": {}}')
+    result = view("list", *grid)
+    assert result.code == 2 and "holds a finished run of 20 steps" in result.err
+    assert not (tmp_path / "logs").exists()
+
+
+def test_a_finished_run_with_other_options_is_not_taken_for_done(tmp_path):
+    grid = ["baseline", "--algos", "sac", "--envs", "Hopper-v5", "--seeds", "1"]
+    grid += ["--total-timesteps", "1000", "--runs-dir", tmp_path]
+    [folder] = folders(*grid)
+    folder.mkdir()
+    (folder / "result.json").write_text('{"total_timesteps": 1000}')
+
+    def made_with(**args):
+        (folder / "config.json").write_text(json.dumps({"args": args}))
+
+    made_with(gamma=0.99, autotune=True, learning_starts=10, torch_threads=8, compile=False)
+    refused = view("list", *grid, "--", "--gamma", "0.5", "--learning_starts=10", "--no-autotune")
+    assert (
+        refused.code == 2
+        and not refused.out
+        and refused.err
+        == (
+            f"error: {folder} holds a finished run with --gamma 0.99, not 0.5 and --autotune True, "
+            "not False; choose another --runs-dir, or the same options after the --\n"
+        )
+    )
+    assert "with --learning-starts 10, not 5000; choose" in view("status", *grid).err
+    for same in ("--learning-starts 10", "--learning_starts=10 --no-compile --torch-threads 2"):
+        result = view("report", *grid, "--", *same.split())
+        assert result.code == 0 and "1 runs: 1 done" in result.out, result.err
+    # An older version had an option that is gone, and did not have one of today's
+    made_with(gamma=0.99, capture_video=True)
+    assert "1 runs: 1 done" in view("status", *grid).out
+    longer = view("list", *grid, "--", "--max-episode-steps", "50")
+    assert "--max-episode-steps None, not 50" in longer.err
+
+
+def test_misspelt_options_are_refused_where_nothing_is_to_do(tmp_path):
+    grid = ["baseline", *GRID, "--total-timesteps", "1000", "--runs-dir", tmp_path]
+    [folder] = folders(*grid)
+    folder.mkdir()
+    (folder / "result.json").write_text('{"total_timesteps": 1000}')
+    (folder / "config.json").write_text('{"args": {}}')
+    assert "1 runs, 0 to do" in view("list", *grid).err
+    for words, message in {
+        "--gama 0.99": "sac_continuous_noisy.py has no option --gama; did you mean --gamma?",
+        "--gamma=0.99 1": "'1' after the -- belongs to no option of sac_continuous_noisy.py",
+        "--gamma --no-compile": "--gamma needs a value",
+        "--gamma": "--gamma needs a value",
+        "--compile=False": "--compile takes no value: write --compile or --no-compile",
+    }.items():
+        result = view("list", *grid, "--", *words.split())
+        assert (result.code, result.out, result.err) == (2, "", f"error: {message}\n")
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_the_grid_reads_options_as_the_scripts_do(algorithm):
+    script = import_module(f"{algorithm}_continuous_noisy")
+    for words in (
+        "",
+        "--gamma 0.5 --eval_episodes=3 --no-compile --matmul_precision high",
+        "--gamma=.5 --gamma 1 --cuda --no_overwrite --max-episode-steps 1_000",
+        "--max-episode-steps None --gamma -inf --torch-threads=2",
+    ):
+        read = vars(tyro.cli(script.Args, args=words.split()))
+        wanted = {name.replace("_", "-"): value for name, value in read.items()}
+        wanted = {name: wanted[name] for name in wanted.keys() - GIVEN_BY_THE_GRID.keys()}
+        assert script_options(f"{algorithm}_continuous_noisy.py", tuple(words.split())) == wanted
+
+
+# BAD INPUT
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        ("nope", "unknown preset 'nope'; choose one of demo, baseline, best"),
+        ("best --algos dqn", "unknown algorithm 'dqn'; choose from sac, td3, ppo"),
+        ("custom --noises Foo(1) --noise-rates 1", "bad noise 'Foo(1)': unknown name; valid are"),
+        ("paper --noise-rates 1.5", "1.5"),
+        (
+            "custom --noises RandomNormalNoisyReward(1)",
+            '--noises needs --noise-rates, or a rate with each noise, as in "NOISE@0.1"',
+        ),
+        ("best --envs Ant-v5", "the paper has no best noise for sac on Ant-v5"),
+        ("custom --noise-rates 1", "--noise-rates needs --noises that have no rate of their own"),
+        (
+            f"custom --noises {A}@1 --noise-rates 1",
+            "--noise-rates needs --noises that have no rate",
+        ),
+        (f"custom --noises {A}@1+{A}", "give each of these noises a rate with @, or none"),
+        (
+            f"custom --noises {A}@x",
+            "'x' is no rate: give a number from 0 to 1, or two as in 1.0:0.0",
+        ),
+        (f"custom --noises {A}@1:2", "got '1:2'"),
+        (f"custom --noises {A} --noise-rates 0.5:", "got '0.5:'"),
+        ("paper --noise-rates a:b", "got 'a:b'"),
+        ("paper --combine", "--combine belongs to custom"),
+        ("paper --budget 5", "--budget belongs to choose"),
+        ("choose --algos ppo", "choose needs --algos and --envs"),
+        ("choose --envs Hopper-v5", "choose needs --algos and --envs"),
+        (f"{C} --seeds 1-3", "leave out --seeds"),
+        (
+            f"{C} --noises paper --budget 89",
+            "--budget must be at least 90, a run for each noise, not 89",
+        ),
+        (f"{C} --budget 100000", "--budget 100000 is too large: the best noises would run with"),
+        (f"{C} --confirm 3", "--confirm must be at least 4, not 3: with fewer seeds no difference"),
+        (f"{C} --envs Hopper Pusher-v5 --confirm 4", "--confirm must be at least 5, not 4: "),
+        (f"{C} --noises {A} --noise-rates 0", "there is no noise to choose from"),
+        (f"{C} --noises {A} --noise-rates 1 --exclude {A}@1", "there is no noise to choose from"),
+        (f"{C} --exclude {A}@0.3", "--exclude: RandomNormalNoisyReward(1.0) at 0.3 is not among"),
+        (f"{C} --exclude {A}", '--exclude needs a rate with each noise, as in "NOISE@0.1"'),
+        (f"{C} --noise-rates 0.5:", "got '0.5:'"),
+        ("demo --envs Nope-v5", "--envs: there is no environment 'Nope-v5': "),
+        ("demo --envs nope:Env-v0", "--envs: there is no environment 'nope:Env-v0': No module"),
+        (
+            "demo --seeds 1 2-1",
+            "--seeds takes numbers and ranges, separated by spaces: 1 2 3 or 1-3",
+        ),
+        ("demo --seeds 1,2,3", "separated by spaces: 1 2 3 or 1-3, not '1,2,3'"),
+        ("demo --seeds 1-", "not '1-'"),
+        ("demo --total-timesteps 1.5", "'1.5' is not a whole number, such as 1000000 or 1e6"),
+        ("demo --total-timesteps inf", "'inf' is not a whole number"),
+        ("demo --seed 1", "unknown option --seed; did you mean --seeds?"),
+        ("demo --env-id Hopper-v5", "unknown option --env-id; did you mean --envs?"),
+        ("demo --exectuor local", "unknown option --exectuor; did you mean --executor?"),
+        ("demo --gamma 0.9", "--gamma is an option of the scripts: put it at the end, after --"),
+        ("demo --gama 0.9", "did you mean --gamma, an option of the scripts, at the end after --?"),
+        ("demo --xyzzy 1", "unknown option --xyzzy; ./benchmark.sh --help lists them"),
+        ("demo --runs-dir=-x", "--runs-dir must be a path"),
+        ("demo -- --overwrite", "--overwrite would start interrupted runs afresh"),
+        ("demo --algos", "--algos: expected at least one argument"),
+        ("demo --dry-run=1", "--dry-run takes no value"),
+        (
+            "demo --total-timesteps 2e3",
+            "--total-timesteps must be at least 2048 for PPO (its --num-steps), not 2000",
+        ),
+        ("demo --total-timesteps 0", "--total-timesteps must be greater than 0, not 0"),
+        ("demo -- --help", "--help after the -- would start nothing"),
+        ("demo -- --seed 2", "--seed is part of the grid: use --seeds, before the --"),
+        ("demo -- --exp-name my_ppo", "--exp-name is part of the grid: use --runs-dir, before"),
+        ("best --algos sac -- --nope", "sac_continuous_noisy.py has no option --nope"),
+        ("best --algos sac ppo -- --tau 0.1", "ppo_continuous_noisy.py has no option --tau"),
+        (
+            "best --algos sac -- --tau abc",
+            "sac_continuous_noisy.py: Error parsing --tau: could not",
+        ),
+    ],
+)
+def test_bad_input(args, message, tmp_path):
+    first, *words = args.split()
+    result = view("list", first, "--runs-dir", tmp_path / "runs", *words)
+    assert result.code == 2, result.out + result.err
+    lines = result.err.splitlines()
+    assert lines[0].startswith("error: ") and message in lines[0]
+    assert len(lines) == (11 if "unknown name" in message else 1)
+    assert not result.out and not list(tmp_path.iterdir())
+
+
+def test_a_list_of_runs_waits_for_no_heavy_import():
+    """status, watch and the dry run of 9,100 commands answer in a moment."""
+    code = "import sys; from sweep.__main__ import main; main('list', '/', ['demo']); "
+    code += "print(*sys.modules)"
+    command = [sys.executable, "-c", code]
+    shown = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert not {"torch", "scipy", "pandas", "mujoco"} & set(shown.stdout.split())
