@@ -55,7 +55,7 @@ def pretend_to_train(total_timesteps, checkpoint):
         print(f"resumed at step {step}")
     while step < total_timesteps:
         step = min(step + STEPS, total_timesteps)
-        time.sleep(SECONDS * (total_timesteps >= STEPS))
+        time.sleep(SECONDS)
         print(f"step={step}/{total_timesteps} sps=100", flush=True)
         if STOPPED:
             time.sleep(0.2)  # for a second signal, which should not come

@@ -23,6 +23,26 @@ class Tiny(gym.Env):
         return self.state.copy(), float(reward), bool(abs(self.state[0]) > 3), False, {}
 
 
+class Push(gym.Env):
+    """A mass is pushed and loses the more the farther it is from 0.
+
+    A push moves it one step later: who looks at the next reward alone learns nothing.
+    """
+
+    observation_space = Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state = np.array([self.np_random.uniform(-1, 1), 0.0])
+        return self.state.copy(), {}
+
+    def step(self, action):
+        position, speed = self.state
+        self.state = np.array([position + speed, 0.8 * speed + 0.3 * float(action[0])])
+        return self.state.copy(), -abs(self.state[0]), False, False, {}
+
+
 class Count(gym.Env):
     """Observes the step, 1.0 is every reward; `break_at` gives NaN from that step of the run on."""
 
@@ -146,6 +166,7 @@ def register(name, entry_point, steps, **kwargs):
 
 sequence = gym.spaces.Sequence(Box(-1.0, 1.0, (2,)))
 register("Tiny", Tiny, 8)
+register("Push", Push, 20)
 register("Count", Count, 8)
 register("Square", Count, 8, shape=(2, 2))
 register("NanReward", Count, 8, break_reward_at=70)

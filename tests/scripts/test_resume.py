@@ -1,8 +1,6 @@
 """A run killed anywhere and started again ends like a run left alone, bit for bit.
 
-Most commands here are processes forked from a server that has imported PyTorch already: what takes
-`python script.py` seconds takes them a moment. They run the script as that would, and can be told
-to die, or to be sent a signal, at a chosen moment. `real` commands are plain subprocesses.
+The commands are processes forked from a server (commands.py).
 """
 
 import functools
@@ -10,32 +8,27 @@ import io
 import itertools
 import json
 import math
-import multiprocessing
 import os
 import pickle
-import pkgutil
 import random
 import resource
-import runpy
 import shutil
 import signal
 import socket
 import subprocess
-import sys
-import threading
 import time
 import zipfile
 from importlib import import_module
 from pathlib import Path
-from types import SimpleNamespace
 
+import commands
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 import tyro
+from commands import ended
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tqdm import tqdm
 
 ROOT = Path(__file__).parents[2]
 ALGORITHMS = ("sac", "td3", "ppo")
@@ -50,12 +43,6 @@ NOISE = (
 RATES = ("0.5", "1", "0.3", "0.3", "0.3")
 EARLY, EXPLORING, LATE = 2, 5, 10  # ends of an episode: near steps 25, 75 and 150
 TRAINING_STEP = "gymnasium.wrappers.RecordEpisodeStatistics.step"  # the test env has none of these
-
-FORK = multiprocessing.get_context("forkserver")
-FORK.set_forkserver_preload(
-    ["pytest", "tyro", "tqdm", "gymnasium.envs.mujoco", "torch.utils.tensorboard"]
-    + ["torch._dynamo", "tensorboard.backend.event_processing.event_accumulator"]
-)
 
 
 def script(algorithm):
@@ -99,21 +86,6 @@ def train(algorithm, words, episodes=math.inf):
     wait_for_a_later_name(words)
     module, ended = script(algorithm), itertools.count(1)
     return module.train(tyro.cli(module.Args, args=words), stop=lambda: next(ended) >= episodes)
-
-
-def at(target, number, action):
-    """Make the number-th call of `target` in this process (None: every call) act first."""
-    owner, _, name = target.rpartition(".")
-    owner, calls = pkgutil.resolve_name(owner), itertools.count(1)
-    function = getattr(owner, name)
-
-    @functools.wraps(function)
-    def patched(*args, **kwargs):
-        if next(calls) == number or number is None:
-            action(*args, **kwargs)
-        return function(*args, **kwargs)
-
-    setattr(owner, name, patched)
 
 
 def die(*args):
@@ -189,49 +161,15 @@ def limit_files(file_size, name, *args, **kwargs):
         resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, resource.RLIM_INFINITY))
 
 
-def child(algorithm, words, stdout, stderr, moments):
-    os.dup2(stdout.fileno(), 1)
-    os.dup2(stderr.fileno(), 2)
-    wait_for_a_later_name(words)
-    tqdm.set_lock(threading.RLock())  # a kill would leave the default one's semaphore behind
-    for moment in moments:
-        at(*moment)
-    sys.argv = [str(ROOT / f"{algorithm}_continuous_noisy.py"), *words]
-    runpy.run_path(sys.argv[0], run_name="__main__")
-
-
 def start(algorithm, words, *moments):
     """Start a command; each moment is (dotted name, number of the call, action)."""
-    (out, stdout), (err, stderr) = FORK.Pipe(duplex=False), FORK.Pipe(duplex=False)
-    arguments = (algorithm, words, stdout, stderr, moments)
-    process = FORK.Process(target=child, args=arguments, daemon=True)
-    process.start()
-    stdout.close()
-    stderr.close()
-    process.out, process.err = out, err
-    return process
-
-
-def ended(process):
-    """Wait for a command; return its exit code (-9 after SIGKILL), stdout and stderr."""
-    process.join(120)
-    assert process.exitcode is not None
-    texts = []
-    for connection in (process.out, process.err):
-        with open(os.dup(connection.fileno()), errors="replace") as file:
-            texts.append(file.read())
-    return SimpleNamespace(code=process.exitcode, out=texts[0], err=texts[1])
+    before = functools.partial(wait_for_a_later_name, words)
+    path = ROOT / f"{algorithm}_continuous_noisy.py"
+    return commands.start(path, words, *moments, before=before)
 
 
 def run(algorithm, words, *moments):
     return ended(start(algorithm, words, *moments))
-
-
-def real(algorithm, words, **kwargs):
-    """Start a command as a user does."""
-    command = [sys.executable, str(ROOT / f"{algorithm}_continuous_noisy.py"), *words]
-    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen(command, **streams | kwargs)
 
 
 def folder(runs_dir):
@@ -388,30 +326,28 @@ def test_events_are_on_the_disk_before_the_checkpoint_is(algorithm, alone, tmp_p
     assert outcome(folder(tmp_path)) == alone(algorithm)
 
 
+@pytest.mark.slow
 def test_killed_by_somebody_else_at_random_times_compiled(tmp_path):
-    """Real commands, torch.compile, kill -9 and SIGTERM from outside."""
-    length = {"total_timesteps": 3000, "eval_frequency": 1000, "compile": True}
+    """With torch.compile, by kill -9 and SIGTERM from outside."""
+    length = {"total_timesteps": 1500, "eval_frequency": 500, "compile": True}
     words = options("td3", tmp_path / "killed", **length)
     (tmp_path / "killed").mkdir()
-    uninterrupted = real("td3", options("td3", tmp_path / "alone", **length))
-    assert uninterrupted.wait(240) == 0, uninterrupted.stderr.read()
-    kills, codes = [signal.SIGKILL, signal.SIGKILL, signal.SIGTERM], []
-    for number in kills:
-        process, delay = real("td3", words), random.uniform(0.2, 1.0)
+    uninterrupted = run("td3", options("td3", tmp_path / "alone", **length))
+    assert (uninterrupted.code, uninterrupted.err) == (0, "")
+    for number, code in ((signal.SIGKILL, -9), (signal.SIGTERM, 143)):
+        process, delay = start("td3", words), random.uniform(0.1, 0.5)
         before = None
-        while process.poll() is None:
+        while process.is_alive():
             time.sleep(0.02)
             now = [path.stat().st_mtime_ns for path in tmp_path.glob("killed/*/checkpoint.pt")]
             before = now if before is None else before
             if now != before:  # it is training and has written a checkpoint of its own
                 time.sleep(delay)
-                process.send_signal(number)
+                os.kill(process.pid, number)
                 break
-        codes.append(process.wait(60))
-    assert codes == [-9, -9, 143]
-    process = real("td3", words)
-    _, err = process.communicate(timeout=240)
-    assert (process.returncode, err) == (0, "")
+        assert ended(process).code == code
+    result = run("td3", words)
+    assert (result.code, result.err) == (0, "")
     assert_finished(folder(tmp_path / "killed"))
     assert outcome(folder(tmp_path / "killed")) == outcome(folder(tmp_path / "alone"))
 

@@ -14,8 +14,10 @@ import urllib.parse
 import urllib.request
 from dataclasses import asdict, fields, replace
 from pathlib import Path
+from types import SimpleNamespace
 from unittest import mock
 
+import commands
 import gymnasium as gym
 import mujoco
 import numpy as np
@@ -54,12 +56,18 @@ def run(algorithm, runs_dir, **kwargs):
     return run_dir
 
 
-def command(algorithm, *options, **kwargs):
+def command(algorithm, *options, cwd=ROOT):
+    """Run a script as a user does, but for the imports (commands.py)."""
+    return commands.run(SCRIPTS[algorithm].__file__, options, cwd=cwd)
+
+
+def real_command(algorithm, *options, **kwargs):
     """Run a script as a user does."""
     path = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
     line = [sys.executable, SCRIPTS[algorithm].__file__, *map(str, options)]
     env = os.environ | {"PYTHONPATH": path}
-    return subprocess.run(line, capture_output=True, text=True, env=env, timeout=240, **kwargs)
+    result = subprocess.run(line, capture_output=True, text=True, env=env, timeout=240, **kwargs)
+    return SimpleNamespace(code=result.returncode, out=result.stdout, err=result.stderr)
 
 
 def flags(args):
@@ -495,6 +503,7 @@ def test_defaults_are_cleanrls(algorithm, defaults):
 # COMPILATION
 
 
+@pytest.mark.slow
 @each_script
 def test_compiled_and_plain_updates_agree(algorithm, tmp_path, capsys, monkeypatch):
     graphs, real = [], torch.compile
@@ -522,7 +531,9 @@ def test_compiled_and_plain_updates_agree(algorithm, tmp_path, capsys, monkeypat
 
     if algorithm == "PPO":
         return  # too small for bfloat16 to be an option
-    rough = run(algorithm, tmp_path / "bf16", matmul_precision="bf16", compile=True, **short)
+    # One of the two compiles bfloat16: a compiler needs 10 CPU seconds for a graph
+    bf16 = {"matmul_precision": "bf16", "compile": algorithm == "TD3"}
+    rough = run(algorithm, tmp_path / "bf16", **bf16, **short)
     assert json.loads((rough / "config.json").read_text())["matmul_precision"] == "bf16"
     exact, rough = (torch.cat([x.flatten() for x in policy(r).values()]) for r in (plain, rough))
     assert 1e-5 < (rough - exact).abs().max() < 0.05
@@ -781,19 +792,20 @@ def test_cuda_without_a_gpu(algorithm, tmp_path, capsys):
 def test_bad_command(algorithm, options, word, tmp_path):
     """As test_bad_input, in a process of its own."""
     result = command(algorithm, *options, cwd=tmp_path)
-    assert result.returncode == 2
-    assert_one_line(result.stderr, word)
-    assert result.stdout == ""
+    assert result.code == 2
+    assert_one_line(result.err, word)
+    assert result.out == ""
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_module_beside_the_caller_and_steps_as_1e2(tmp_path):
     (tmp_path / "my_envs.py").write_text("from toy_envs import *\n")
     options = ["--env-id", "my_envs:Tiny-v0", "--total-timesteps", "1.2E2", "--no-compile"]
     options += ["--learning-starts=5e1", "--eval-frequency", "0", "--eval-episodes", "1"]
     options += ["--exp-name", "1e3", "--runs-dir=2e1"]  # these are names
-    result = command("SAC", *options, cwd=tmp_path)
-    assert (result.returncode, result.stderr) == (0, "")
+    result = real_command("SAC", *options, cwd=tmp_path)
+    assert (result.code, result.err) == (0, "")
     [run_dir] = (tmp_path / "2e1").iterdir()
     assert run_dir.name.endswith("__1e3")
     args = json.loads((run_dir / "config.json").read_text())["args"]
@@ -805,27 +817,23 @@ def test_a_module_of_the_callers_wins_over_one_of_ours(tmp_path):
     (tmp_path / "analyze.py").write_text("from toy_envs import *\n")
     options = ["--total-timesteps", "20", "--eval-episodes", "1", "--runs-dir", tmp_path / "runs"]
     result = command("SAC", "--env-id", "analyze:Tiny-v0", *options, cwd=tmp_path)
-    assert (result.returncode, result.stderr) == (0, "")
+    assert (result.code, result.err) == (0, "")
     (tmp_path / "tqdm.py").write_text("from toy_envs import *\n")
     result = command("SAC", "--env-id", "tqdm:Tiny-v0", *options, cwd=tmp_path)
-    assert result.returncode == 2
-    assert_one_line(result.stderr, f"a module 'tqdm' is loaded already, from {tqdm.__file__}")
+    assert result.code == 2
+    assert_one_line(result.err, f"a module 'tqdm' is loaded already, from {tqdm.__file__}")
 
 
 def test_training_goes_on_when_its_reader_has_left(tmp_path):
     options = ["--env-id", "toy_envs:Tiny-v0", "--total-timesteps", "60", "--eval-frequency", "10"]
     options += ["--no-compile", "--learning-starts", "20", "--eval-episodes", "1"]
     alone = command("SAC", *options, "--runs-dir", tmp_path / "alone")
-    assert alone.stdout.count("\n") > 6
-    path = os.pathsep.join([str(ROOT), str(Path(__file__).parent)])
-    line = [sys.executable, sac.__file__, *options, "--runs-dir", str(tmp_path / "runs")]
-    with subprocess.Popen(
-        line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ | {"PYTHONPATH": path}
-    ) as process:
-        process.stdout.readline()
-        process.stdout.close()
-        assert process.stderr.read() == b""
-        assert process.wait(120) == 0
+    assert alone.out.count("\n") > 6
+    process = commands.start(sac.__file__, [*options, "--runs-dir", tmp_path / "runs"])
+    os.read(process.out.fileno(), 1)
+    process.out.close()
+    result = commands.ended(process)
+    assert (result.code, result.err) == (0, "")
     one, other = (next((tmp_path / name).iterdir()) / "eval.csv" for name in ("alone", "runs"))
     assert one.read_bytes() == other.read_bytes()
 
@@ -845,8 +853,8 @@ def test_ctrl_c_during_the_imports_is_no_traceback(tmp_path):
 @each_script
 def test_help_has_examples_and_noises(algorithm):
     result = command(algorithm, "--help")
-    assert result.returncode == 0
-    text = result.stdout
+    assert result.code == 0
+    text = result.out
     assert f"python {algorithm.lower()}_continuous_noisy.py --env-id HalfCheetah-v5" in text
     assert "module:Name-v0" in text
     for signature in signatures():
@@ -859,9 +867,9 @@ def test_help_has_examples_and_noises(algorithm):
 )
 def test_bad_command_of_tyros(algorithm, options, word, tmp_path):
     result = command(algorithm, *options, cwd=tmp_path)
-    assert result.returncode == 2
-    assert word in result.stderr + result.stdout
-    assert "Traceback" not in result.stderr + result.stdout
+    assert result.code == 2
+    assert word in result.err + result.out
+    assert "Traceback" not in result.err + result.out
     assert list(tmp_path.iterdir()) == []
 
 
@@ -897,16 +905,16 @@ def test_a_bug_of_an_environment_is_shown(algorithm, env_id, error, note, tmp_pa
 def test_a_bug_of_an_environments_module_is_shown(source, last_line, tmp_path):
     (tmp_path / "buggy_module.py").write_text(source)
     result = command("PPO", "--env-id", "buggy_module:Env-v0", cwd=tmp_path)
-    *traceback, error, note = result.stderr.splitlines()
-    assert result.returncode == 1 and traceback[0] == "Traceback (most recent call last):"
+    *traceback, error, note = result.err.splitlines()
+    assert result.code == 1 and traceback[0] == "Traceback (most recent call last):"
     assert error.startswith(last_line) and note == "(training stopped)"
     assert any("buggy_module.py" in line for line in traceback)
 
 
 def test_a_bug_in_a_step_is_shown_by_a_command(tmp_path):
     result = command("PPO", "--env-id", "toy_envs:BuggyStep-v0", "--no-compile", cwd=tmp_path)
-    *traceback, error, note = result.stderr.splitlines()
-    assert (result.returncode, error, note) == (1, "KeyError: 'missing'", "(training stopped)")
+    *traceback, error, note = result.err.splitlines()
+    assert (result.code, error, note) == (1, "KeyError: 'missing'", "(training stopped)")
     assert traceback[0] == "Traceback (most recent call last):"
 
 
@@ -967,8 +975,8 @@ CHARTS += "noise/RandomEarlyTermination/applied_fraction noise/RandomEarlyTermin
 
 
 @pytest.fixture(scope="module")
-def commands(tmp_path_factory):
-    """Return a folder with a run of each script, made by real commands, and their results."""
+def three_runs(tmp_path_factory):
+    """Return a folder with a run of each script, made by commands, and their results."""
     runs_dir = tmp_path_factory.mktemp("commands")
     results = {}
     for algorithm in SCRIPTS:
@@ -978,12 +986,12 @@ def commands(tmp_path_factory):
 
 
 @each_script
-def test_command_line(algorithm, commands):
-    runs_dir, results = commands
+def test_command_line(algorithm, three_runs):
+    runs_dir, results = three_runs
     line, result = results[algorithm]
-    assert (result.returncode, result.stderr) == (0, "")
+    assert (result.code, result.err) == (0, "")
     [run_dir] = runs_dir.glob(f"*__{algorithm.lower()}_continuous_noisy")
-    lines = result.stdout.splitlines()
+    lines = result.out.splitlines()
     noises = "RandomEarlyTermination(2, 4) at 0.25 + RandomNormalNoisyReward(0.5) at 0.5"
     begun = (
         f"{algorithm} on toy_envs:Tiny-v0 | noise: {noises} | seed 1 | 240 steps | cpu | {run_dir}"
@@ -995,14 +1003,14 @@ def test_command_line(algorithm, commands):
     assert re.fullmatch(rf"{re.escape(str(run_dir))} is finished: mean test return .*", finished)
     assert json.loads((run_dir / "config.json").read_text())["args"]["seed"] == 1
     again = command(algorithm, *line)
-    assert (again.returncode, again.stderr) == (0, "")
-    assert again.stdout == f"{finished}\n{curves}\n"
+    assert (again.code, again.err) == (0, "")
+    assert again.out == f"{finished}\n{curves}\n"
 
 
 @pytest.fixture(scope="module")
-def tensorboard(commands):
+def tensorboard(three_runs):
     """Serve the runs and return a function from a path of the HTTP API to its JSON."""
-    line = [sys.executable, "-m", "tensorboard.main", "--logdir", commands[0]]
+    line = [sys.executable, "-m", "tensorboard.main", "--logdir", three_runs[0]]
     line += ["--host", "127.0.0.1", "--port", "0", "--load_fast", "false"]
     with subprocess.Popen(line, stderr=subprocess.PIPE, text=True) as process:
         try:
@@ -1023,11 +1031,11 @@ def tensorboard(commands):
 
 
 @pytest.fixture
-def scalars(tensorboard, commands):
+def scalars(tensorboard, three_runs):
     """Return a function from an algorithm to the name of its run and {tag: {step: value}}."""
 
     def read(algorithm):
-        [run_dir] = commands[0].glob(f"*__{algorithm.lower()}_continuous_noisy")
+        [run_dir] = three_runs[0].glob(f"*__{algorithm.lower()}_continuous_noisy")
         tags = tensorboard("/data/plugin/scalars/tags")[run_dir.name]
         values = {}
         for tag in tags:
@@ -1080,8 +1088,8 @@ def test_tensorboard_shows_the_curves(algorithm, scalars):
     assert min(values["charts/SPS"].values()) > 0
 
 
-def test_tensorboard_knows_the_hyperparameters(tensorboard, commands):
-    names = {path.name for path in commands[0].iterdir()}
+def test_tensorboard_knows_the_hyperparameters(tensorboard, three_runs):
+    names = {path.name for path in three_runs[0].iterdir()}
     assert set(tensorboard("/data/runs")) == names  # no runs besides
     texts = tensorboard("/data/plugin/text/tags")
     assert all("hyperparameters/text_summary" in texts[name] for name in names)
@@ -1114,29 +1122,26 @@ MILD = {
     "noise": ("RandomNormalNoisyReward(0.001)", "RandomUniformScaleReward(0.8, 1.2)"),
     "noise_rate": (0.1, 0.2),
 }
-FAST = {"buffer_size": 10_000, "learning_starts": 400, "batch_size": 64, "tau": 0.02}
-FAST |= {"gamma": 0.95, "eval_frequency": 500, "eval_episodes": 10}
+FAST = {"buffer_size": 1000, "learning_starts": 200, "batch_size": 64, "tau": 0.02}
+FAST |= {"gamma": 0.9, "eval_frequency": 100, "eval_episodes": 10}
 LEARNERS = {
-    "SAC": FAST | {"total_timesteps": 3000, "policy_lr": 1e-3, "q_lr": 2e-3},
-    "TD3": FAST
-    | {"total_timesteps": 4000, "learning_starts": 1000, "batch_size": 128}
-    | {"learning_rate": 1e-3, "exploration_noise": 0.3},
-    "PPO": {"total_timesteps": 16384, "num_steps": 1024, "num_minibatches": 16}
-    | {"learning_rate": 1e-3, "update_epochs": 10, "eval_frequency": 2048},
+    "SAC": FAST | {"total_timesteps": 700, "policy_lr": 1e-3, "q_lr": 2e-3},
+    "TD3": FAST | {"total_timesteps": 900, "learning_rate": 1e-3, "exploration_noise": 0.3},
+    "PPO": {"total_timesteps": 6000, "num_steps": 500, "num_minibatches": 10, "gamma": 0.9}
+    | {"learning_rate": 2e-3, "update_epochs": 10, "eval_frequency": 500, "eval_episodes": 10},
 }
 
 
+@pytest.mark.slow
 @each_script
-@pytest.mark.parametrize("noise", [{}, MILD], ids=["baseline", "noisy"])
-def test_learning(algorithm, noise, tmp_path):
-    """Within the budget, the mean return of one evaluation shows that the task is solved."""
-    env_id = "InvertedPendulum-v5" if algorithm == "PPO" else "Pendulum-v1"
-    run_dir = run(algorithm, tmp_path, **LEARNERS[algorithm] | noise, env_id=env_id)
-    means = {}
-    for step, _, episodic_return, _ in evaluations(run_dir):
-        means.setdefault(step, []).append(episodic_return)
-    means = {step: np.mean(returns) for step, returns in means.items()}
-    assert max(means.values()) > (500 if algorithm == "PPO" else -250), means
+def test_learning(algorithm, tmp_path):
+    """The mean return of the last three tests shows that the task is solved, in spite of noise.
+
+    With seeds 1 and 2 it is -1.4 to -2.4. It is -9 or less with gamma = 0, about -10 for an agent
+    that never pushes and about -20 for one that has not learned yet.
+    """
+    run_dir = run(algorithm, tmp_path, **LEARNERS[algorithm] | MILD, env_id="toy_envs:Push-v0")
+    assert np.mean([row[2] for row in evaluations(run_dir)[-30:]]) > -4
     result = json.loads((run_dir / "result.json").read_text())
-    for name, rate in zip(result["noise_applied"], noise.get("noise_rate", ()), strict=True):
-        assert result["noise_applied_fraction"][name] == pytest.approx(rate, rel=0.2)
+    for name, rate in zip(result["noise_applied"], MILD["noise_rate"], strict=True):
+        assert result["noise_applied_fraction"][name] == pytest.approx(rate, rel=0.3)

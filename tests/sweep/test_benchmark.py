@@ -495,8 +495,8 @@ def test_a_dry_run_of_choose_prints_the_batch_that_is_due(tmp_path, stub):
     assert (
         first.out.count("\n") == 3 and "13 runs in all, 5 to search and 8 to confirm" in first.err
     )
-    # 13 runs of 1000 steps at 5,700 steps per second, and 10 seconds to start: 132 s
-    assert "0 are done, about 0.037 core-hours are left" in first.err
+    # 13 runs of 4000 steps at 5,700 steps per second, and 10 seconds to start: 139 s
+    assert "0 are done, about 0.039 core-hours are left" in first.err
     for line in first.out.splitlines():
         subprocess.run(line, shell=True, check=True)
     second = run(*command, "--dry-run", env=stub)

@@ -159,7 +159,7 @@ def test_rates_of_ones_own_and_pairs():
 
 
 def test_status_arithmetic(tmp_path):
-    grid = ["baseline", "--algos", "ppo", "--envs", "Hopper-v5", "--seeds", "1-6"]
+    grid = ["baseline", "--algos", "sac", "--envs", "Hopper-v5", "--seeds", "1-6"]
     grid += ["--total-timesteps", "1000", "--runs-dir", tmp_path]
     done, running, slow, failed, stopped, lost = folders(*grid)
     (tmp_path / "logs").mkdir()
@@ -175,7 +175,7 @@ def test_status_arithmetic(tmp_path):
         stopped: "step=500/1000 sps=100\n# now host: exit=143\n",
         lost: "step=500/1000 sps=100\n",
     }.items():
-        log_of(folder).write_text("# now host: python ppo_continuous_noisy.py --seed 1\n" + text)
+        log_of(folder).write_text("# now host: python sac_continuous_noisy.py --seed 1\n" + text)
     os.utime(log_of(lost), (time.time() - 300,) * 2)
     result = view("status", *grid)
     assert result.code == 0
@@ -192,7 +192,7 @@ def test_status_arithmetic(tmp_path):
 
 
 def test_a_finished_run_of_another_length_is_not_taken_for_done(tmp_path):
-    grid = ["baseline", "--algos", "ppo", "--envs", "Hopper-v5", "--seeds", "1"]
+    grid = ["baseline", *GRID]
     grid += ["--total-timesteps", "1000", "--runs-dir", tmp_path]
     [folder] = folders(*grid)
     folder.mkdir()

@@ -32,7 +32,9 @@ def view(name, *words, caller=ROOT):
 
 def folders(*words):
     """Return the run folders of a grid."""
-    return [Path(line.split("\t")[0]) for line in view("list", *words).out.splitlines()]
+    found = view("list", *words)
+    assert found.code == 0, found.err
+    return [Path(line.split("\t")[0]) for line in found.out.splitlines()]
 
 
 def log_of(folder):
