@@ -62,34 +62,6 @@ RATES = [0.01, 0.05, 0.1, 0.2, 0.5, 1.0]
 # The paper's 15 noises by what they perturb; its text calls early termination dynamics noise.
 KINDS = {"observation": 8, "reward": 5, "dynamics": 2}
 
-# Training returns of PPO in CleanRL's documentation: mean and standard deviation of three seeds,
-# the population's, as its rlops takes it (np.std). The first two at commit 2d660b6 (October 2023),
-# the last since commit 35896b1 (November 2023).
-CLEANRL = {
-    "CleanRL, v2": {
-        "HalfCheetah": (2262.50, 1196.81),
-        "Hopper": (2311.49, 440.99),
-        "Humanoid": (676.34, 78.68),
-        "Pusher": (-60.49, 4.37),
-        "Walker2d": (3312.32, 429.87),
-    },
-    "CleanRL, v4": {
-        "HalfCheetah": (2905.85, 1129.37),
-        "Hopper": (2051.80, 313.94),
-        "Humanoid": (742.19, 155.77),
-        "Pusher": (-55.60, 3.98),
-        "Walker2d": (2890.97, 231.40),
-    },
-    "CleanRL, v4, newer": {
-        "HalfCheetah": (1442.64, 46.03),
-        "Hopper": (2382.86, 271.74),
-        "Humanoid": (716.11, 49.08),
-        "Pusher": (-40.38, 7.15),
-        "Walker2d": (2287.95, 571.78),
-    },
-}
-CLEANRL_TD3 = {"Walker2d": (4057.59, 658.78)}  # v4, the same documentation at commit fe8d8a0
-CLEANRL_SEEDS = 3
 CHEETAH_SEEDS = range(11, 51)
 FAR_ABOVE = 3000  # of PPO on HalfCheetah; chosen after seeds 1 to 10 were seen
 
@@ -108,20 +80,7 @@ def fixed_beforehand(runs, chosen):
     return runs[wanted & runs["seed"].isin(FIXED_SEEDS)]
 
 
-def cleanrl(returns):
-    """Return CleanRL's {environment: (mean, std)} as a frame with the sample's deviation."""
-    table = pd.DataFrame(returns, index=["mean", "std"]).T
-    table["std"] *= np.sqrt(CLEANRL_SEEDS / (CLEANRL_SEEDS - 1))
-    return table.assign(n=CLEANRL_SEEDS)
-
-
 # --------------------------------------------------------------------------------------- statistics
-
-
-def variance_share(runs):
-    """Return the percent of the variance between seeds that the test's few episodes make."""
-    groups = runs.groupby("environment")
-    return 100 * groups["error"].mean() / groups["test"].var(ddof=1)
 
 
 def power(effect, std, n, other_std, other_n, level=0.05):
@@ -353,67 +312,6 @@ def paper_speed(paper):
 
 
 # ------------------------------------------------------------------------------------ PPO, our runs
-
-
-def baselines(base, paper_base):
-    """PPO without noise, ours against the paper's."""
-    ours = sample(base, "test")
-    errors, p = welch(ours, paper_base)
-    share = variance_share(base)
-    text = markdown(
-        {
-            "": ours.index,
-            "n": ours["n"],
-            "ours, v5": spell(ours),
-            "of the variance, the test's": cells("{:.0f} %", share),
-            "the paper, v2": spell(paper_base),
-            "difference in SE": cells("{:+.1f}", errors),
-            "p": p,
-        }
-    )
-    return {"table": text, "errors": errors, "share": share}
-
-
-def against_cleanrl(training):
-    """Return columns with CleanRL's training returns, and ours minus them in standard errors."""
-    columns = {}
-    for title in CLEANRL:
-        theirs = cleanrl(CLEANRL[title]).loc[training.index]
-        errors, _ = welch(training, theirs)
-        columns[f"{title} (SE)"] = cells("{} ({:+.1f})", spell(theirs), errors)
-    return columns
-
-
-def cleanrl_tables(base, older, paper_base):
-    """PPO's training returns on v5 and v4 against CleanRL's, and CleanRL's against the paper."""
-    training, older_training = sample(base, "training"), sample(older, "training")
-    older_test = sample(older, "test")
-    apart = [
-        (p, f"{se:+.1f} on {environment} ({title.removeprefix('CleanRL, ')}, p = {p:.2g})")
-        for title in CLEANRL
-        for environment, se, p in zip(
-            training.index, *welch(training, cleanrl(CLEANRL[title])), strict=True
-        )
-    ]
-    to_paper, p_to_paper = welch(cleanrl(CLEANRL["CleanRL, v2"]), paper_base)
-    older_errors, older_p = welch(older_test, paper_base)
-    v5 = {"": training.index, "ours, v5": spell(training)} | against_cleanrl(training)
-    v4 = {
-        "": [f"{name}-v4" for name in older_test.index],
-        "n": older_test["n"],
-        "test": spell(older_test),
-        "from the paper's in SE": cells("{:+.1f} (p = {:.2g})", older_errors, older_p),
-        "training": spell(older_training),
-    }
-    return {
-        "v5": markdown(v5),
-        "v4": markdown(v4),
-        "v2_to_paper": pd.DataFrame({"se": to_paper, "p": p_to_paper}).to_dict("index"),
-        "v4_p": dict(zip(older_test.index, older_p, strict=True)),
-        "smallest_p": min(apart)[0],
-        "number": len(apart),
-        "clearest": ", ".join(text for _, text in sorted(apart)[:3]),
-    }
 
 
 def improvements(table):
@@ -693,33 +591,6 @@ def td3(runs, paper):
     return {"table": markdown(pd.DataFrame(rows).rename(columns=names)), **found}
 
 
-def long_td3(folder, paper):
-    """TD3 on Walker2d without noise after a million steps: the paper's return, and CleanRL's.
-
-    `low`, `high`: the interval of the difference from each, in percent of theirs.
-    """
-    runs = read_returns(folder).query("environment == 'Walker2d'")
-    theirs = plain(paper["best"]).query("algorithm == 'TD3'").set_index("environment")
-    theirs = theirs[["baseline_mean", "baseline_std"]].set_axis(["mean", "std"], axis=1)
-    theirs = theirs.assign(n=PAPER_SEEDS["TD3"]).loc[["Walker2d"]]
-    test, training = sample(runs, "test"), sample(runs, "training")
-    others = {
-        "the paper, v2, test": (test, theirs),
-        "CleanRL, v4, training": (training, cleanrl(CLEANRL_TD3)),
-    }
-    rows, found = [], {}
-    for name, (ours, other) in others.items():
-        _, p = welch(ours, other)
-        low, high = (limit.iloc[0] for limit in welch_interval(ours, other))
-        their_mean = other["mean"].iloc[0]
-        difference = ours["mean"].iloc[0] - their_mean
-        interval = f"{difference:+,.0f} [{low:,.0f}, {high:,.0f}]"
-        rows.append([name, *spell(ours), *spell(other), interval, f"{p[0]:.2g}"])
-        found[name] = {"low": 100 * low / their_mean, "high": 100 * high / their_mean}
-    columns = ["", "ours, v5", "theirs", "difference [95 %]", "p (Welch)"]
-    return {"table": markdown(pd.DataFrame(rows, columns=columns)), **found}
-
-
 # ----------------------------------------------------------------------------------------- SAC, all
 
 
@@ -801,7 +672,6 @@ def numbers():
     five = make_tables(make_studies(five_runs)[0])
     five_statistics, five_summary = (plain(five[n].frame) for n in ("statistics", "summary_PPO"))
     five_statistics = five_statistics[five_statistics["p"].notna()]
-    shares = variance_share(base), variance_share(noisy)
     counts = returns.groupby("algorithm").size()
     return {
         "runs": ", ".join(f"{name} {n}" for name, n in counts.items()),
@@ -810,8 +680,6 @@ def numbers():
         "normal": NORMAL,
         "mixup": MIXUP,
         "plain_mixup": PLAIN_MIXUP,
-        "noisy_share": shares[1],
-        "highest_share": max(share.drop("Humanoid").max() for share in shares),
         "luck": luck_of_the_best(paper) | {"winners": luck_with_the_winners_spread(paper)},
         "smallest_consistent": paper["consistent"]["p_luck"].min(),
         "consistent": luck_of_the_consistent(luck),
@@ -822,8 +690,6 @@ def numbers():
         "mixture": mixture(paper),
         "paper_spread": paper_spread(paper),
         "paper_speed": paper_speed(paper),
-        "baselines": baselines(base, paper_base),
-        "cleanrl": cleanrl_tables(base, read_returns(DATA / "v4"), paper_base),
         "five": five_noises(
             base, noisy, paper_base, paper_noisy, best["improvement_percent"], five_statistics
         ),
@@ -834,7 +700,6 @@ def numbers():
         "worse_noises": worse_noises(ppo, paper),
         "mixtures": mixtures(ppo, paper),
         "td3": td3(returns.query("algorithm == 'TD3'"), paper),
-        "long_td3": long_td3(DATA / "long", paper),
         "sac": sac(early, statistics),
         "rate_error": noise_rates(DATA / "runs"),
         "commits": commits(five_runs["run"]),

@@ -5,12 +5,15 @@ PPO without noise on Hopper and Walker2d returns much less in the paper than her
 and Pusher it does not, and with noise the paper gains 89.6 % on Walker2d.
 """
 
+import sys
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 from scipy import stats
 
-from sweep.grid import best_pairs
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+from sweep.grid import best_pairs  # noqa: E402
 
 # The statistics that normalize the observations of a test: those of training, frozen; the test
 # environment's own, accumulated over all tests of a run; its own, begun anew in each test.

@@ -1,0 +1,379 @@
+"""Write results/baselines.md and its figure from the runs in data/: what trains without noise.
+
+    python results/pages/baselines.py
+
+The three algorithms beside the paper and CleanRL, and which way of testing PPO would explain the
+paper's returns. baselines.md.jinja has the text, this file and ways.py every number in it.
+"""
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+import ways
+from claims import ENVIRONMENTS, FIXED_SEEDS
+from common import (
+    DATA,
+    RESULTS,
+    cells,
+    markdown,
+    plain,
+    read_returns,
+    render,
+    sample,
+    spell,
+    welch,
+    welch_interval,
+)
+
+from analysis.paper import PAPER_SEEDS, read_paper
+from analysis.runs import KEYS, read_runs
+from analysis.statistics import MIN_SEEDS, holm
+
+plt.rcParams["svg.hashsalt"] = "noisy"  # equal figures are equal files
+
+# Training returns in CleanRL's documentation: mean and standard deviation over three seeds, the
+# population's, as its rlops takes it (np.std). PPO: the first two at commit 2d660b6 (October 2023),
+# the last since commit 35896b1 (November 2023). SAC and TD3: at commit fe8d8a0.
+CLEANRL_PPO = {
+    "v2": {
+        "HalfCheetah": (2262.50, 1196.81),
+        "Hopper": (2311.49, 440.99),
+        "Humanoid": (676.34, 78.68),
+        "Pusher": (-60.49, 4.37),
+        "Walker2d": (3312.32, 429.87),
+    },
+    "v4": {
+        "HalfCheetah": (2905.85, 1129.37),
+        "Hopper": (2051.80, 313.94),
+        "Humanoid": (742.19, 155.77),
+        "Pusher": (-55.60, 3.98),
+        "Walker2d": (2890.97, 231.40),
+    },
+    "v4, newer": {
+        "HalfCheetah": (1442.64, 46.03),
+        "Hopper": (2382.86, 271.74),
+        "Humanoid": (716.11, 49.08),
+        "Pusher": (-40.38, 7.15),
+        "Walker2d": (2287.95, 571.78),
+    },
+}
+CLEANRL_SAC = {
+    "v2": {
+        "HalfCheetah": (9634.89, 1423.73),
+        "Hopper": (2310.46, 342.82),
+        "Walker2d": (3591.45, 911.33),
+    },
+    "v4": {"Humanoid": (4996.29, 686.40), "Pusher": (-22.45, 0.51)},
+}
+CLEANRL_TD3 = {
+    "v4": {
+        "HalfCheetah": (9583.22, 126.09),
+        "Hopper": (3134.61, 360.18),
+        "Humanoid": (5035.36, 21.67),
+        "Pusher": (-30.92, 1.05),
+        "Walker2d": (4057.59, 658.78),
+    }
+}
+# The one that stands beside ours: the newest of each
+CLEANRL = {"PPO": {"v4": CLEANRL_PPO["v4, newer"]}, "SAC": CLEANRL_SAC, "TD3": CLEANRL_TD3}
+CLEANRL_SEEDS = 3
+FULL_LENGTH = 1_000_000
+COLORS = {"PPO": "C0", "SAC": "C1", "TD3": "C2"}
+VALUES = ["mean", "std", "n"]
+
+
+# ------------------------------------------------------------------------------------------ reading
+
+
+def read_baselines():
+    """Return one row per finished run without noise: configuration, curve, test, training return.
+
+    Of PPO on v5 these are seeds 1 to 10, as in its comparisons with noise.
+    """
+    found = []
+    for folder in ("runs", "long", "v4"):
+        runs = read_runs(DATA / folder).query("status == 'finished' and noise == ''")
+        version = "v" + runs["environment"].str.split("-v").str[1]
+        curves = plain(runs)[[*KEYS, "seed", "total", "steps", "returns"]].assign(version=version)
+        found.append(curves.merge(read_returns(DATA / folder), on=[*KEYS, "seed"]))
+    runs = pd.concat(found, ignore_index=True)
+    ours = (runs["algorithm"] != "PPO") | runs["seed"].isin(FIXED_SEEDS)
+    return runs[ours].assign(algorithm=runs["algorithm"].str.split().str[0])
+
+
+def groups(runs):
+    """Yield ((algorithm, total steps, environment, version), its runs), with enough seeds each."""
+    for key, group in runs.groupby(["algorithm", "total", "environment", "version"]):
+        if len(group) >= MIN_SEEDS:
+            yield key, group
+
+
+def cleanrl(returns):
+    """Return CleanRL's {environment: (mean, std)} as a frame with the sample's deviation."""
+    table = pd.DataFrame(returns, index=["mean", "std"]).T
+    table["std"] *= np.sqrt(CLEANRL_SEEDS / (CLEANRL_SEEDS - 1))
+    return table.assign(n=CLEANRL_SEEDS)
+
+
+def paper_baselines(paper):
+    """Return the paper's final returns without noise, by (algorithm, environment)."""
+    best = plain(paper["best"])
+    best = best.assign(n=best["algorithm"].map(PAPER_SEEDS))
+    table = best.set_index(["algorithm", "environment"])[["baseline_mean", "baseline_std", "n"]]
+    return table.set_axis(VALUES, axis=1)
+
+
+def published(paper, algorithm, environment, total):
+    """Return what is published for a row: (the paper's sample, CleanRL's, CleanRL's version).
+
+    A sample is a frame of one row, or None. The paper's table of SAC's early performance has
+    HalfCheetah after fewer steps, too.
+    """
+    name = [environment]
+    if total < FULL_LENGTH:
+        early = plain(paper["early_performance"]).query(
+            "algorithm == @algorithm and environment == @environment and noise_rate == '0.00'"
+        )
+        early = early[np.isclose(early["steps_millions"] * 1e6, total)]
+        sample = early.assign(n=PAPER_SEEDS[algorithm]).set_index("environment")[VALUES]
+        return sample if len(sample) else None, None, None
+    sample = paper_baselines(paper).loc[algorithm].loc[name]
+    for version, returns in CLEANRL[algorithm].items():
+        if environment in returns:
+            return sample, cleanrl(returns).loc[name], version
+    return sample, None, None
+
+
+# ----------------------------------------------------------------------------------------- the rows
+
+
+def compare(ours, theirs):
+    """Compare two samples, frames of one row: a text, the difference in standard errors, and p."""
+    difference = ours["mean"].iloc[0] - theirs["mean"].iloc[0]
+    low, high = (limit.iloc[0] for limit in welch_interval(ours, theirs))
+    errors, p = welch(ours, theirs)
+    d = 0 if abs(theirs["mean"].iloc[0]) >= 100 else 1
+    text = f"{difference:+,.{d}f} [{low:,.{d}f}, {high:,.{d}f}]"
+    return text, {"se": errors.iloc[0], "p": p[0]}
+
+
+def table(runs, paper, total):
+    """Compare runs of this many steps with the paper and CleanRL: a table, and its numbers.
+
+    The numbers are {"PPO on Walker2d-v5": {"paper": {"se": ..., "p": ...}, "cleanrl": {...}}}.
+    """
+    rows, numbers = [], {}
+    for (algorithm, length, environment, version), group in groups(runs):
+        if length != total:
+            continue
+        test, training = sample(group, "test"), sample(group, "training")
+        theirs, cleanrls, their_version = published(paper, algorithm, environment, total)
+        name, found = f"{algorithm} on {environment}-{version}", {}
+        row = {"": name, "n": len(group), "test return": spell(test)[0]}
+        row |= {"the paper, v2 (n)": "\u2013", "difference [95 %]": "\u2013"}
+        if theirs is not None:
+            row["the paper, v2 (n)"] = f"{spell(theirs)[0]} ({theirs['n'].iloc[0]})"
+            row["difference [95 %]"], found["paper"] = compare(test, theirs)
+        row["training return"] = spell(training)[0]
+        if total == FULL_LENGTH:  # CleanRL's documentation has nothing shorter
+            row |= {"CleanRL (version, n)": "\u2013", "difference [95 %] ": "\u2013"}
+        if cleanrls is not None:
+            row["CleanRL (version, n)"] = f"{spell(cleanrls)[0]} ({their_version}, {CLEANRL_SEEDS})"
+            row["difference [95 %] "], found["cleanrl"] = compare(training, cleanrls)
+        rows.append(row)
+        numbers[name] = found
+    return {"table": markdown(rows), "numbers": numbers}
+
+
+def far_from_both(numbers):
+    """Name the rows that are more than two standard errors from the paper and from CleanRL."""
+    return [
+        name
+        for name, found in numbers.items()
+        if len(found) == 2 and all(abs(other["se"]) > 2 for other in found.values())
+    ]
+
+
+def too_few(runs):
+    """Say which runs are not in the tables, because there are fewer than three seeds of them."""
+    keys = ["algorithm", "total", "environment", "version"]
+    return [
+        f"{algorithm} on {environment}-{version} ({len(group)} of {total:,} steps)"
+        for (algorithm, total, environment, version), group in runs.groupby(keys)
+        if len(group) < MIN_SEEDS
+    ]
+
+
+def cleanrls_versions(runs, paper):
+    """PPO's training returns against all that CleanRL has published, and CleanRL's v2 and paper."""
+    base = runs.query("algorithm == 'PPO' and version == 'v5'")
+    training = sample(base, "training")
+    columns, apart = {"": training.index, "ours, v5": spell(training)}, []
+    for version, returns in CLEANRL_PPO.items():
+        theirs = cleanrl(returns).loc[training.index]
+        errors, p = welch(training, theirs)
+        columns[f"CleanRL, {version} (SE)"] = cells("{} ({:+.1f})", spell(theirs), errors)
+        for name, se, value in zip(training.index, errors, p, strict=True):
+            apart.append((value, f"{se:+.1f} on {name} ({version}, p = {value:.2g})"))
+    ppo = paper_baselines(paper).loc["PPO"]
+    errors, p = welch(cleanrl(CLEANRL_PPO["v2"]), ppo)
+    return {
+        "table": markdown(columns),
+        "v2_to_paper": pd.DataFrame({"se": errors, "p": p}).to_dict("index"),
+        "smallest_p": min(apart)[0],
+        "number": len(apart),
+        "clearest": ", ".join(text for _, text in sorted(apart)[:3]),
+    }
+
+
+def corrected(numbers):
+    """Return Holm's p of PPO's differences from the paper, over the five environments on v5."""
+    names = [f"PPO on {environment}-v5" for environment in ENVIRONMENTS]
+    p = np.array([numbers[name]["paper"]["p"] for name in names])
+    return dict(zip(ENVIRONMENTS, holm(p), strict=True))
+
+
+def variance_share(runs):
+    """Return the percent of the variance between seeds that the test's few episodes make."""
+    by_environment = runs.groupby("environment")
+    return 100 * by_environment["error"].mean() / by_environment["test"].var(ddof=1)
+
+
+# ------------------------------------------------------------------------- how the paper tested PPO
+
+
+def read_tests(folder):
+    """Return the final test returns of paper_tests.py: a row per run, a column per way.
+
+    The other columns are environment, noise (whether there was any) and seed. Only whole seeds
+    count: those of which all planned runs are there.
+    """
+    rows = []
+    runs = read_runs(folder).query("status == 'finished'") if folder.exists() else pd.DataFrame()
+    for run in runs.itertuples():
+        path = folder / run.run / "tests.csv"
+        if not path.exists():
+            continue
+        tests = pd.read_csv(path)
+        last = tests[tests["step"] == tests["step"].max()]
+        means = last.groupby("way")["episodic_return"].mean()
+        name = run.environment.split("-")[0]
+        rows.append({"environment": name, "noise": run.noise != "", "seed": run.seed, **means})
+    table = pd.DataFrame(rows, columns=["environment", "noise", "seed", *ways.WAYS])
+    planned = pd.Series([seed for *_, seed in ways.planned_runs()]).value_counts()
+    there = table["seed"].value_counts().reindex(planned.index, fill_value=0)
+    return table[table["seed"].isin(planned.index[there == planned])]
+
+
+def judge_ways(tests, paper):
+    """Judge each way of testing: a table, and {way: verdict}; None without three whole seeds."""
+    seeds = sorted(set(tests["seed"]))
+    if len(seeds) < MIN_SEEDS:
+        return None
+    ppo = paper_baselines(paper).loc["PPO"]
+    gain = plain(paper["best"]).set_index(["algorithm", "environment"])["improvement_percent"]
+    gain = gain["PPO", ways.GAINING]
+    rows, verdicts = [], {}
+    for way in ways.WAYS:
+        returns = {
+            key: group[way].to_numpy() for key, group in tests.groupby(["environment", "noise"])
+        }
+        found = {
+            name: ways.from_paper(returns[name, False], tuple(ppo.loc[name]))
+            for name in (*ways.COMPARED, *ways.CONTROLS)
+        }
+        noisy, baseline = returns[ways.GAINING, True], returns[ways.GAINING, False]
+        ours = 100 * (noisy.mean() / baseline.mean() - 1)
+        p_none, p_paper = (ways.p_of_gain(noisy, baseline, percent) for percent in (0, gain))
+        verdicts[way] = ways.verdict(
+            [found[name] for name in ways.COMPARED],
+            [found[name] for name in ways.CONTROLS],
+            ours,
+            p_none,
+            p_paper,
+        )
+        row = {"statistics, actions": way.replace("_", " ").replace("-", ", ")}
+        row |= {
+            f"{name} (SE)": f"{returns[name, False].mean():,.0f} ({found[name][0]:+.1f})"
+            for name in found
+        }
+        row["gain on Walker2d"] = f"{ours:+.0f} %"
+        row |= {"p of no gain": f"{p_none:.2g}", "p of the paper's": f"{p_paper:.2g}"}
+        rows.append(row | {"the paper's way?": f"**{verdicts[way]}**"})
+    return {"table": markdown(rows), "verdicts": verdicts, "gain": gain}
+
+
+# ----------------------------------------------------------------------------------------- the page
+
+
+def numbers():
+    """Compute all that the page says."""
+    paper, runs = read_paper(RESULTS / "paper"), read_baselines()
+    ppo = runs.query("algorithm == 'PPO' and version == 'v5'")
+    share = variance_share(ppo)
+    full, short = table(runs, paper, FULL_LENGTH), table(runs, paper, 200_000)
+    tests = read_tests(DATA / "paper_tests")
+    return {
+        "full": full,
+        "short": short,
+        "far": far_from_both(full["numbers"]),
+        "holm": corrected(full["numbers"]),
+        "too_few": too_few(runs),
+        "share": share.to_dict(),
+        "highest_share": share.drop("Humanoid").max(),
+        "cleanrl": cleanrls_versions(runs, paper),
+        "ways": judge_ways(tests, paper),
+        "whole_seeds": len(set(tests["seed"])),
+        "planned_seeds": len(ways.SEEDS),
+        "planned_runs": len(ways.planned_runs()),
+        "level": ways.LEVEL,
+    }
+
+
+def page():
+    """Return the text of baselines.md."""
+    return render("baselines.md.jinja", numbers())
+
+
+def draw():
+    """Draw the learning curves without noise, a panel an environment, with published end points."""
+    paper = paper_baselines(read_paper(RESULTS / "paper"))
+    runs = read_baselines().query("version == 'v5'")
+    fig, axes = plt.subplots(2, 3, figsize=(10, 6), layout="constrained")
+    panels = dict(zip(ENVIRONMENTS, axes.flat, strict=False))
+    for environment, ax in panels.items():
+        for place, (algorithm, color) in enumerate(COLORS.items()):
+            mean, std, _ = paper.loc[algorithm, environment]
+            ax.errorbar(1.04 + 0.025 * place, mean, std, fmt="o", color=color, markersize=4)
+            for returns in CLEANRL[algorithm].values():
+                if environment in returns:
+                    mean, std, _ = cleanrl(returns).loc[environment]
+                    ax.errorbar(1.14 + 0.025 * place, mean, std, fmt="x", color=color, markersize=5)
+        ax.set_title(environment)
+        ax.set_xlabel("training steps (millions)")
+    for (algorithm, total, environment, _), group in groups(runs):
+        curves = np.stack(list(group["returns"]))
+        mean, std = curves.mean(axis=0), curves.std(axis=0, ddof=1)
+        steps = group["steps"].iloc[0] / 1e6
+        line = "-" if total == FULL_LENGTH else ":"
+        ax, color = panels[environment], COLORS[algorithm]
+        ax.plot(steps, mean, line, color=color)
+        ax.fill_between(steps, mean - std, mean + std, color=color, alpha=0.15, linewidth=0)
+    for ax in axes[:, 0]:
+        ax.set_ylabel("test return")
+    last = axes.flat[-1]
+    last.axis("off")
+    for algorithm, color in COLORS.items():
+        last.plot([], [], color=color, label=algorithm)
+    last.plot([], [], ":", color="grey", label="a run of 200,000 steps")
+    last.plot([], [], "o", color="grey", markersize=4, label="the paper, v2, test")
+    last.plot([], [], "x", color="grey", markersize=5, label="CleanRL, v2 or v4, training")
+    last.legend(loc="center", frameon=False)
+    fig.savefig(RESULTS / "figures/baselines.svg", metadata={"Date": None})
+    plt.close(fig)
+
+
+if __name__ == "__main__":
+    draw()
+    (RESULTS / "baselines.md").write_text(page())
+    print(f"Wrote {RESULTS / 'baselines.md'}")

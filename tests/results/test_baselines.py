@@ -1,0 +1,148 @@
+"""The page of the baselines agrees with the committed runs, and grows with them."""
+
+import json
+import shutil
+
+import baselines
+import common
+import numpy as np
+import pandas as pd
+import pytest
+import ways
+
+from analysis.paper import read_paper
+
+RESULTS, DATA = common.RESULTS, common.DATA
+PAPER = read_paper(RESULTS / "paper")
+
+
+def cells(table):
+    """Return {first cell of a row: its other cells} of a Markdown table."""
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()[2:]]
+    return {row[0]: row[1:] for row in rows}
+
+
+def test_the_page_is_what_its_command_writes():
+    assert (RESULTS / "baselines.md").read_text() == baselines.page()
+
+
+@pytest.mark.parametrize(
+    "name, pattern, seeds, length",
+    [
+        ("PPO on Hopper-v5", "runs/Hopper-v5__ppo_*__baseline__*", range(1, 11), "full"),
+        ("PPO on Walker2d-v4", "v4/Walker2d-v4__ppo_*__baseline__*", range(1, 4), "full"),
+        ("TD3 on Walker2d-v5", "long/Walker2d-v5__td3_*__baseline__*", range(1, 4), "full"),
+        ("SAC on HalfCheetah-v5", "runs/HalfCheetah-v5__sac_*__baseline__*", range(1, 6), "short"),
+    ],
+)
+def test_the_returns_are_those_of_the_runs(name, pattern, seeds, length):
+    results = [
+        json.loads((folder / "result.json").read_text())
+        for folder in DATA.glob(pattern)
+        if int(folder.name.rsplit("_", 1)[1]) in seeds
+    ]
+    runs = baselines.read_baselines()
+    total = {"full": 1_000_000, "short": 200_000}[length]
+    row = cells(baselines.table(runs, PAPER, total)["table"])[name]
+    assert row[0] == str(len(results)) == str(len(seeds))
+    test = [result["final_return_mean"] for result in results]
+    training = [result["train_return_mean_last_100"] for result in results]
+    for returns, cell in ((test, row[1]), (training, row[4])):
+        assert cell == f"{np.mean(returns):,.0f} ± {np.std(returns, ddof=1):,.0f}"
+    assert {result["total_timesteps"] for result in results} == {total}
+
+
+def test_what_is_published():
+    paper, cleanrl, version = baselines.published(PAPER, "SAC", "Pusher", 1_000_000)
+    assert paper.loc["Pusher"].tolist() == [-22.7, 1.8, 5] and version == "v4"
+    assert cleanrl.loc["Pusher"].tolist() == pytest.approx([-22.45, 0.51 * 1.5**0.5, 3])
+    assert baselines.published(PAPER, "SAC", "Hopper", 1_000_000)[2] == "v2"
+    paper, cleanrl, _ = baselines.published(PAPER, "SAC", "HalfCheetah", 200_000)
+    assert paper.loc["HalfCheetah"].tolist() == [7295, 899, 5] and cleanrl is None
+    assert baselines.published(PAPER, "TD3", "HalfCheetah", 200_000) == (None, None, None)
+
+
+def test_cleanrls_deviations_are_those_of_a_population():
+    """Three seeds: their sample standard deviation is sqrt(3/2) times what CleanRL prints."""
+    returns = np.array([1.0, 2, 6])
+    printed = {"Hopper": (returns.mean(), returns.std())}
+    assert baselines.cleanrl(printed).loc["Hopper"].tolist() == [3, returns.std(ddof=1), 3]
+
+
+def test_fewer_than_three_seeds_are_named_and_not_compared():
+    runs = baselines.read_baselines()
+    fewer = runs[(runs["algorithm"] != "TD3") | (runs["total"] < 1_000_000) | (runs["seed"] < 3)]
+    assert "TD3 on Walker2d-v5" not in cells(baselines.table(fewer, PAPER, 1_000_000)["table"])
+    assert baselines.too_few(fewer) == ["TD3 on Walker2d-v5 (2 of 1,000,000 steps)"]
+
+
+def test_far_from_both():
+    far, near, one = {"se": -2.1}, {"se": 1.9}, {"a": {"paper": {"se": 9.0}}}
+    numbers = {"b": {"paper": far, "cleanrl": {"se": 3.0}}, "c": {"paper": far, "cleanrl": near}}
+    assert baselines.far_from_both(numbers | one) == ["b"]
+
+
+def test_the_share_of_the_test_in_the_variance(tmp_path):
+    """Episodes of 1, 2, 3: variance 1, of their mean 1/3; between seeds 2 and 4: variance 2."""
+    lines = ["step,episode,episodic_return,episodic_length", "10,0,9,1", "10,1,0,1", "10,2,5,1"]
+    lines += ["20,0,1,1", "20,1,2,1", "20,2,3,1"]
+    (tmp_path / "eval.csv").write_text("\n".join(lines) + "\n")
+    assert common.test_error(tmp_path) == pytest.approx(1 / 3)
+    runs = pd.DataFrame({"environment": ["a", "a"], "test": [2.0, 4.0], "error": [1 / 3, 1 / 3]})
+    assert baselines.variance_share(runs)["a"] == pytest.approx(100 / 3 / 2)
+
+
+# ------------------------------------------------------------------------- how the paper tested PPO
+
+
+def test_only_whole_seeds_are_read(tmp_path, monkeypatch):
+    """Seed 1 has both planned runs, seed 2 one of them, and one of seed 3 has no tests.csv yet."""
+    names = ("Hopper-v5", "Pusher-v5")
+    plan = [(name, (), (), seed) for seed in (1, 2, 3) for name in names]
+    monkeypatch.setattr(ways, "planned_runs", lambda: plan)
+    assert len(baselines.read_tests(tmp_path / "absent")) == 0
+    for name, _, _, seed in plan:
+        if (name, seed) == ("Pusher-v5", 2):
+            continue
+        folder = f"{name}__ppo_continuous_noisy__baseline__{seed}"
+        shutil.copytree(DATA / "runs" / folder, tmp_path / folder)
+        lines = [
+            f"{way},{step},{i},{step / 1e6 + i}"
+            for way in ways.WAYS
+            for step in (9, 99)
+            for i in (0, 1)
+        ]
+        if (name, seed) != ("Hopper-v5", 3):
+            text = "\n".join(["way,step,episode,episodic_return", *lines])
+            (tmp_path / folder / "tests.csv").write_text(text)
+    tests = baselines.read_tests(tmp_path)
+    assert tests["seed"].tolist() == [1, 1] and sorted(tests["environment"]) == ["Hopper", "Pusher"]
+    assert tests["own-mean"].tolist() == pytest.approx([0.5 + 99 / 1e6] * 2)
+
+
+def made_up(means, gain):
+    """Ten seeds of every planned run, the same in all ways; `gain` in percent."""
+    rows = []
+    for env_id, noise, _, seed in ways.planned_runs():
+        name = env_id.split("-")[0]
+        spread = abs(means[name]) * 0.02 * (seed - 5.5)
+        value = means[name] * (1 + gain / 100 * bool(noise)) + spread
+        rows.append([name, bool(noise), seed] + [value] * 6)
+    return pd.DataFrame(rows, columns=["environment", "noise", "seed", *ways.WAYS])
+
+
+def test_ways_by_hand():
+    """The paper's own means reproduce it; a way with another return or gain does not."""
+    means = {"HalfCheetah": 1686, "Hopper": 1470, "Pusher": -57.6, "Walker2d": 1806}
+    tests = made_up(means, 89.6)
+    hopper = tests["environment"] == "Hopper"
+    tests.loc[hopper, "own-mean"] *= 3
+    walker = (tests["environment"] == "Walker2d") & tests["noise"]
+    tests.loc[walker, "own-sampled"] /= 1.896
+    found = baselines.judge_ways(tests, PAPER)
+    wanted = dict.fromkeys(ways.WAYS, "reproduces")
+    wanted |= {"own-mean": "excluded", "own-sampled": "excluded"}
+    assert found["verdicts"] == wanted and found["gain"] == 89.6
+    row = cells(found["table"])["training, mean"]
+    assert row[:2] == ["1,470 (+0.0)", "1,806 (+0.0)"] and row[4] == "+90 %"
+    assert baselines.judge_ways(tests[tests["seed"] < 3], PAPER) is None
