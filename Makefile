@@ -5,11 +5,12 @@ BIN := .venv/bin
 .PHONY: demo test lint results clean
 
 demo: $(BIN)/.run
+	@echo "Ten runs of PPO, five of them with noise: about three minutes on one core"
 	PYTHON=$(BIN)/python ./benchmark.sh demo
 	$(BIN)/python analyze.py --runs-dir runs/demo >runs/demo/logs/analysis.txt
 	@echo
 	@head -n 1 runs/demo/logs/analysis.txt
-	@echo "The picture: runs/demo/results/curves_PPO_RandomEarlyTermination_50.svg"
+	@echo "The picture: runs/demo/results/curves_PPO_RandomNormalNoisyObservation_1.0.svg"
 	@echo "All tables and figures: runs/demo/results/report.html"
 	@echo "The curves in TensorBoard: .venv/bin/tensorboard --logdir runs/demo"
 

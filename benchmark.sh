@@ -13,7 +13,8 @@ Presets
              name, runs the noises with more and more seeds, drops the worse half again and again,
              compares the winner with no noise on fresh seeds, and says what came out; the runs
              go into runs/choose
-  demo       PPO on Pusher-v5, without and with one noise, 5 seeds, 100,000 steps, into runs/demo
+  demo       PPO on InvertedPendulum-v5, without and with one noise, 5 seeds, 50,000 steps, into
+             runs/demo
   baseline   no noise: 3 algorithms, 5 environments, the paper's seeds
   best       the paper's best noise for each algorithm and environment
   paper      15 noises at 6 rates, 9,100 runs

@@ -61,9 +61,9 @@ ABLATION += [
 PRESETS = {  # the grid options that a preset sets; its noises are in preset_pairs
     "demo": {
         "algos": ["ppo"],
-        "envs": ["Pusher-v5"],
+        "envs": ["InvertedPendulum-v5"],
         "seeds": [range(1, 6)],
-        "total_timesteps": 100_000,
+        "total_timesteps": 50_000,
         "runs_dir": "runs/demo",  # never into a sweep's folders: these runs are shorter
     },
     "baseline": {},
@@ -313,7 +313,7 @@ def check(args):
 def preset_pairs(preset, algorithm, env_id):
     """Return a preset's (noise, rate) pairs for one algorithm and environment."""
     if preset == "demo":
-        return [("RandomEarlyTermination(50)", 1.0)]  # the paper's best for PPO on Pusher
+        return [("RandomNormalNoisyObservation(1.0)", 1.0)]  # harms with any five seeds
     if preset == "paper":
         return list(itertools.product(NOISES, RATES))
     if preset == "choose":

@@ -109,16 +109,18 @@ def test_other_presets():
             assert float(low) == pytest.approx(2 - float(high) if scale else -float(high))
             assert line.noise_rate == (["0.05"] if scale else ["1.0"])
     assert {(x.script[:3], x.env_id, x.runs_dir) for x in dry_run("demo")} == {
-        ("ppo", "Pusher-v5", "runs/demo")
+        ("ppo", "InvertedPendulum-v5", "runs/demo")
     }
     chosen = view("list", *C.split())
     assert all(line.endswith("--runs-dir runs/choose") for line in chosen.out.splitlines())
     assert view("status", *C.split()).out.startswith("runs/choose: ")
     assert [(x.seed, x.noise, x.total_timesteps) for x in dry_run("demo")] == [
-        (seed, noise, 100_000)
+        (seed, noise, 50_000)
         for seed in range(1, 6)
-        for noise in ([], ["RandomEarlyTermination(50)"])
+        for noise in ([], ["RandomNormalNoisyObservation(1.0)"])
     ]
+    picture = "runs/demo/results/curves_PPO_RandomNormalNoisyObservation_1.0.svg"
+    assert picture in (ROOT / "Makefile").read_text()
 
 
 def test_spellings_and_rate_zero_are_one_run():
