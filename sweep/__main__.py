@@ -25,16 +25,8 @@ from datetime import timedelta
 from pathlib import Path
 from typing import NamedTuple
 
-from sweep.grid import (
-    check,
-    check_extra,
-    check_rollouts,
-    command_line,
-    grid,
-    parse_args,
-    result,
-    runs_in,
-)
+from sweep.grid import check_extra, check_rollouts, command_line, grid, result, runs_in
+from sweep.options import check, parse_args
 
 STOPPED = (129, 130, 138, 143)  # exit statuses of a run that was told to stop, by signal
 END = re.compile(r"# .* exit=(\d+)")

@@ -1,9 +1,8 @@
-"""The runs of a sweep: the arguments of benchmark.sh, the runs that they name, their commands.
+"""The runs of a sweep: the presets, the runs that the arguments name, their commands.
 
-`./benchmark.sh --help` explains the arguments. __main__.py shows how far the runs have come.
+options.py reads the arguments, __main__.py shows how far the runs have come.
 """
 
-import argparse
 import ast
 import csv
 import difflib
@@ -11,14 +10,13 @@ import functools
 import itertools
 import json
 import os
-import re
 import shlex
 import subprocess
 import sys
 from pathlib import Path
 from typing import NamedTuple
 
-from noisy_wrappers import MAY_DIFFER_IN_A_RUN, canonical_env_id, canonical_noises, run_folder
+from noisy_wrappers import MAY_DIFFER_IN_A_RUN, canonical_noises, run_folder
 
 PROJECT = Path(__file__).resolve().parent.parent
 SEEDS = {"sac": range(1, 6), "td3": range(1, 6), "ppo": range(1, 11)}  # the paper's
@@ -73,10 +71,6 @@ PRESETS = {  # the grid options that a preset sets; its noises are in preset_pai
     "custom": {},
     "choose": {"runs_dir": "runs/choose"},  # apart: analyze.py judges its runs otherwise
 }
-GRID_OPTIONS = ["--algos", "--envs", "--noises", "--noise-rates", "--seeds", "--total-timesteps"]
-GRID_OPTIONS += ["--runs-dir", "--combine", "--exclude", "--budget", "--confirm"]
-EXECUTOR_OPTIONS = ["--dry-run", "--executor", "--jobs", "--sshlogin", "--remote-dir"]
-EXECUTOR_OPTIONS += ["--slurm-args", "--wait", "--help"]  # benchmark.sh reads these
 GIVEN_BY_THE_GRID = {  # options of the scripts, and those of the sweep that set them
     "env-id": "--envs",
     "seed": "--seeds",
@@ -99,54 +93,7 @@ class Run(NamedTuple):
     options: dict[str, object]  # the script's own, by name: what "--" gives, else the defaults
 
 
-# ------------------------------------------------------------------------------------ the arguments
-
-
-def parse_args(view, caller, argv):
-    """Return the grid's arguments; `extra` are the scripts' own, after "--"."""
-    parser = argparse.ArgumentParser(prog="benchmark.sh", add_help=False, allow_abbrev=False)
-    parser.error = lambda message: fail(message.removeprefix("argument "))
-    parser.add_argument("preset", nargs="?")
-    parser.add_argument("--algos", nargs="+", type=str.lower, default=list(SEEDS))
-    parser.add_argument("--envs", nargs="+", default=ENVS)
-    parser.add_argument("--noises", nargs="+", type=entry, default=[])
-    parser.add_argument("--noise-rates", nargs="+", type=rate, default=[])
-    parser.add_argument("--seeds", nargs="+", type=seeds)
-    parser.add_argument("--total-timesteps", type=whole_number, default=1_000_000)
-    parser.add_argument("--runs-dir", default="runs")
-    parser.add_argument("--combine", action="store_true")
-    parser.add_argument("--exclude", nargs="+", type=entry, default=[])
-    parser.add_argument("--budget", type=whole_number)
-    parser.add_argument("--confirm", type=whole_number, default=25)
-    split = argv.index("--") if "--" in argv else len(argv)
-    words, extra = argv[:split], argv[split + 1 :]
-    given = {word.partition("=")[0] for word in words if word.startswith("--")}
-    preset = words[0] if words and not words[0].startswith("--") else None
-    if preset not in PRESETS and not (preset is None and view == "status"):
-        named = words[0] if words else ""
-        fail(f"unknown preset {named!r}; choose one of {', '.join(PRESETS)}")
-    for name in sorted(given.difference(GRID_OPTIONS)):
-        fail(unknown_option(name))
-    parser.set_defaults(**PRESETS.get(preset, {}))
-    args = parser.parse_args(words)
-    args.given, args.extra = given, extra
-    args.runs_dir = from_project(caller, args.runs_dir)
-    return args
-
-
-def unknown_option(name):
-    """Say what to write instead of an option that the grid does not have."""
-    scripts = PROJECT.glob(script_of("*"))
-    known = {f"--{option}" for script in scripts for option in defaults(script.name)}
-    if name in known:
-        return f"{name} is an option of the scripts: put it at the end, after --"
-    if name in EXECUTOR_OPTIONS:  # benchmark.sh reads it, unless it is written with a value
-        return f"{name} takes no value"
-    near = difflib.get_close_matches(name, [*GRID_OPTIONS, *EXECUTOR_OPTIONS, *known], n=1)
-    if not near:
-        return f"unknown option {name}; ./benchmark.sh --help lists them"
-    after = ", an option of the scripts, at the end after --" if near[0] in known else ""
-    return f"unknown option {name}; did you mean {near[0]}{after}?"
+# ---------------------------------------------------------------------------- the scripts' options
 
 
 def script_of(algorithm):
@@ -208,105 +155,6 @@ def option_value(text):
     return None if text == "None" else text
 
 
-def from_project(caller, text):
-    """Return a path that counts from the caller's folder as one that counts from the project's.
-
-    It is relative where it lies in the project, so that it means the same on other machines.
-    """
-    path = os.path.normpath(os.path.join(caller, text))
-    if Path(path).is_relative_to(os.getcwd()):
-        path = os.path.relpath(path)
-    if not re.fullmatch(r"[^-\t\n][^\t\n]*", path):
-        fail("--runs-dir must be a path without tabs and newlines that begins with no dash")
-    return path
-
-
-def whole_number(text):
-    """Read "1000000" or "1e6"."""
-    try:
-        value = float(text)
-        if value != int(value):
-            raise ValueError
-    except (ValueError, OverflowError):
-        reason = f"{text!r} is not a whole number, such as 1000000 or 1e6"
-        raise argparse.ArgumentTypeError(reason) from None
-    return int(value)
-
-
-def seeds(text):
-    """Read a seed, "3", or a range of seeds, "1-5"."""
-    match = re.fullmatch(r"(\d+)(?:-(\d+))?", text)
-    values = range(0)
-    if match:
-        first, last = match.groups(default=match[1])
-        values = range(int(first), int(last) + 1)
-    if not values:
-        fail(f"--seeds takes numbers and ranges, separated by spaces: 1 2 3 or 1-3, not {text!r}")
-    return values
-
-
-def rate(text):
-    """Read a noise rate: a number, or "start:end" for one that changes during training."""
-    if ":" in text:
-        return text  # canonical_noises reads it
-    try:
-        return float(text)
-    except ValueError:
-        reason = f"{text!r} is no rate: give a number from 0 to 1, or two as in 1.0:0.0"
-        raise argparse.ArgumentTypeError(reason) from None
-
-
-def entry(text):
-    """Read an entry of --noises, "A(..)", "A(..)+B(..)" or "A(..)@0.1+B(..)@0.2".
-
-    Returns a list of (noise, rate); the rate is None where --noise-rates will give it.
-    """
-    pairs = []
-    for part in re.split(r"\s*\+\s*(?=[A-Za-z_])", text.strip()):
-        noise, at, own = part.partition("@")
-        pairs.append((noise, rate(own) if at else None))
-    if len({own is None for _, own in pairs}) > 1:
-        reason = f"{text!r}: give each of these noises a rate with @, or none of them"
-        raise argparse.ArgumentTypeError(reason)
-    return pairs
-
-
-def check(args):
-    """Exit with one line about the first argument that no run could be started with.
-
-    Environments get their full names on the way.
-    """
-    for algorithm in args.algos:
-        if algorithm not in SEEDS:
-            fail(f"unknown algorithm {algorithm!r}; choose from {', '.join(SEEDS)}")
-    if args.total_timesteps <= 0:
-        fail(f"--total-timesteps must be greater than 0, not {args.total_timesteps}")
-    try:
-        args.envs = list(dict.fromkeys(map(canonical_env_id, args.envs)))
-    except ValueError as error:
-        fail(f"--envs: {error}")
-    for name in ("--exclude", "--budget", "--confirm"):
-        if name in args.given and args.preset != "choose":
-            fail(f"{name} belongs to choose")
-    if args.combine and args.preset != "custom":
-        fail("--combine belongs to custom")
-    if args.preset == "choose":
-        if not {"--algos", "--envs"} <= args.given:
-            fail("choose needs --algos and --envs: the noise is chosen for each of them")
-        if "--seeds" in args.given:
-            fail("choose takes the seeds that it needs: leave out --seeds; see --budget, --confirm")
-    if {"-h", "--help"} & set(args.extra):
-        fail("--help after the -- would start nothing: ask the script itself")
-    for word in args.extra:
-        if not word.startswith("--"):
-            continue
-        name = word.partition("=")[0].removeprefix("--").replace("_", "-")
-        if name in GIVEN_BY_THE_GRID:
-            fail(f"--{name} is part of the grid: use {GIVEN_BY_THE_GRID[name]}, before the --")
-        if name == "overwrite":
-            fail("--overwrite would start interrupted runs afresh: delete their folders instead")
-
-
 # ----------------------------------------------------------------------------------------- the runs
 
 
@@ -348,7 +196,7 @@ def canonical(noises, rates):
 
 def cells(args, algorithm, env_id):
     """Return the noises and the rates of every noisy cell of the grid, in the order given."""
-    of_the_paper = args.noises == [entry("paper")]
+    of_the_paper = args.noises == [[("paper", None)]]  # --noises paper, as options.entry reads it
     given = [] if of_the_paper else args.noises
     pairs = preset_pairs("paper" if of_the_paper else args.preset, algorithm, env_id)
     entries, rates = [[pair] for pair in pairs], []

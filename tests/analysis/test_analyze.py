@@ -24,6 +24,7 @@ from scipy import stats
 
 import analysis.figures
 import analysis.formatting
+import analysis.rows
 import analysis.runs
 import analysis.statistics
 import analysis.tables
@@ -486,7 +487,7 @@ def test_five_against_five_cannot_reach_significance_alone_among_90(tmp_path):
         "SAC", "", "", ["Hopper-v5"], [1, 2, 3, 4, 5], np.array([1]), returns
     )
     table = analysis.tables.adjust(
-        analysis.tables.frame("statistics", analysis.tables.statistics_rows(study))
+        analysis.tables.frame("statistics", analysis.rows.statistics_rows(study))
     )
     assert table["p"].iloc[1] == pytest.approx(2 / 252)
     assert table["smallest_p_adjusted"].iloc[1] == pytest.approx(90 * 2 / 252)

@@ -5,6 +5,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
+import analysis.rows
 import analysis.runs
 import analysis.tables
 import analysis.verdicts
@@ -32,7 +33,7 @@ def judge(baseline, noisy):
     """The statistics table and the sentences of such a study."""
     one = study(baseline, noisy)
     table = analysis.tables.adjust(
-        analysis.tables.frame("statistics", analysis.tables.statistics_rows(one))
+        analysis.tables.frame("statistics", analysis.rows.statistics_rows(one))
     )
     return table[table["p"].notna()], analysis.verdicts.sentences([one], table)
 

@@ -28,7 +28,7 @@ import stub_run
 from views import ROOT, attempts, folders, log_of, view
 
 from sweep import choose
-from sweep.grid import check, parse_args
+from sweep.options import check, parse_args
 
 PATH = f"{os.environ['PATH']}:/usr/sbin:/sbin"
 ENV = {**os.environ, "PYTHON": sys.executable, "PATH": PATH}

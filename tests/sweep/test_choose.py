@@ -16,7 +16,6 @@ import stub_run
 from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED
 from analysis.statistics import holm
 from sweep import choose
-from sweep.grid import check, parse_args
 from sweep.halving import (
     BASELINE,
     Comparison,
@@ -30,6 +29,7 @@ from sweep.halving import (
     score,
     verdict,
 )
+from sweep.options import check, parse_args
 
 SEARCH_SEEDS, CONFIRM = 50, 10  # columns of a table of returns
 A = "RandomNormalNoisyReward(1.0)"
