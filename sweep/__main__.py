@@ -120,7 +120,7 @@ def summary(runs, progresses):
             seconds += remaining(run, progress) / expected
         now = sum(p.log.steps_per_second for p in progresses if p.state == "running")
         left = timedelta(seconds=round(seconds / count["running"]))
-        text += f"; {now:,.0f} steps/s now, about {left} left"
+        text += f"; about {left} left, {now:,.0f} steps/s"  # a narrow terminal cuts the end off
     return text
 
 

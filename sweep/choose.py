@@ -219,10 +219,17 @@ def describe(choice):
 
 
 def standing(found):
-    """Yield lines that say where each choice stands, which noises survive, and what is left."""
+    """Yield lines that say where each choice stands, which noises survive, and what is left.
+
+    When all choices are finished, these are the verdicts.
+    """
+    if not any(choice.state.due for choice in found):
+        yield from verdicts(found, judged(found))
+        return
     for choice in found:
         yield describe(choice)
-        if choice.state.rounds:
+        if choice.state.due and choice.state.rounds:
+            yield f"  mean return after round {len(choice.state.rounds)}:"
             scores = choice.state.rounds[-1].scores
             for noise in sorted(choice.state.noises, key=scores.get, reverse=True):
                 yield f"  {scores[noise]:10.2f}  {halving.spelled(noise)}"
@@ -238,18 +245,29 @@ def conclusion(found, runs_dir):
         for choice in found:
             yield obstacle(choice) if choice.state.due else describe(choice)
         return
+    rows = []
+    judgements = judged(found)
+    for choice, (comparison, p) in zip(found, judgements, strict=True):
+        names = choice.algorithm.upper(), choice.env_id
+        helped = halving.helps(comparison, p)
+        rows += halving.rows(*names, choice.state, choice.returns, helped)
+    write_choice(Path(runs_dir, "choice.csv"), rows)
+    yield from verdicts(found, judgements)
+
+
+def judged(found):
+    """Return each finished choice's comparison, and its p corrected for all of them."""
     comparisons = []
     for choice in found:
         [winner] = choice.state.noises
         comparisons.append(halving.compare(winner, choice.state.seeds, choice.returns))
     corrected = holm([comparison.p for comparison in comparisons])
-    rows = []
-    for choice, comparison, p in zip(found, comparisons, corrected, strict=True):
-        names = choice.algorithm.upper(), choice.env_id
-        helped = halving.helps(comparison, p)
-        rows += halving.rows(*names, choice.state, choice.returns, helped)
-    write_choice(Path(runs_dir, "choice.csv"), rows)
-    for choice, comparison, p in zip(found, comparisons, corrected, strict=True):
+    return list(zip(comparisons, corrected, strict=True))
+
+
+def verdicts(found, judgements):
+    """Yield what came out, one line for each choice."""
+    for choice, (comparison, p) in zip(found, judgements, strict=True):
         noises = choice.schedule[0][0] if choice.schedule else 1
         yield halving.verdict(choice.name, noises, comparison, p, len(found))
 

@@ -491,8 +491,15 @@ def test_status_says_who_survives(tmp_path):
             stub_run.train([choice.runs[run].script, *choice.runs[run].arguments])
     assert list(choose.standing(choose.choices(args))) == [
         "PPO on Pendulum-v1, round 2 of 2: 2 of 3 noises, seeds 1 to 3; runs to do: 4",
+        "  mean return after round 1:",
         f"  {scores[best]:10.2f}  {best} at 1.0",
         f"  {scores[second]:10.2f}  {second} at 1.0",
         # Twelve runs are left; each of the three has taken 36 seconds
         "15 runs in all, 7 to search and 8 to confirm; 3 are done, about 0.1 core-hours are left",
     ]
+    batches(args)
+    finished = choose.choices(args)
+    [verdict] = choose.standing(finished)
+    assert verdict.startswith("PPO on Pendulum-v1: ") and "4 fresh seeds" in verdict
+    assert not (tmp_path / "choice.csv").exists()  # the status only looks
+    assert [verdict] == list(choose.conclusion(finished, tmp_path))

@@ -183,7 +183,7 @@ def test_status_arithmetic(tmp_path):
     assert result.code == 0
     # 800 + 800 + 400 + 500 + 500 steps are left. At 200, 100, 10, 100, 100 and 100 steps per second
     # the mean time of a step is 0.145 / 6 seconds, and two runs run at a time: 36.25 seconds.
-    state = "6 runs: 1 done, 2 running, 1 failed, 2 to do; 110 steps/s now, about 0:00:36 left"
+    state = "6 runs: 1 done, 2 running, 1 failed, 2 to do; about 0:00:36 left, 110 steps/s"
     assert state in result.out
     assert re.search(rf"exit 1 +{log_of(failed)} +ValueError: broken\n", result.out)
     slowest = result.out.partition("slowest")[2].splitlines()[1:]
