@@ -10,9 +10,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import ways
-from claims import ENVIRONMENTS, FIXED_SEEDS
+from claims import FIXED_SEEDS
 from common import (
     DATA,
+    ENVIRONMENTS,
     RESULTS,
     cells,
     markdown,

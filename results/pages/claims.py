@@ -7,10 +7,13 @@ p-values are corrected with Holm's method over them. The seeds from 11 on are an
 
 import json
 
+import ablation
+import headline
 import numpy as np
 import pandas as pd
 from common import (
     DATA,
+    ENVIRONMENTS,
     RESULTS,
     cells,
     compare_rows,
@@ -50,7 +53,6 @@ PLAIN_MIXUP = "RandomMixupObservation(0.0)"
 SCALE = "RandomUniformScaleReward(0.5, 1.5)"
 NORMAL = "RandomNormalNoisyObservation(1.0)"
 FEW_SEEDS = range(1, 6)
-ENVIRONMENTS = ["HalfCheetah", "Hopper", "Humanoid", "Pusher", "Walker2d"]
 # Noises of PPO at p = 1 that the paper finds worse everywhere, and mixup without a memory of the
 # mixture beside: which of the two did the paper run?
 WORSE = {
@@ -701,6 +703,8 @@ def numbers():
         "mixtures": mixtures(ppo, paper),
         "td3": td3(returns.query("algorithm == 'TD3'"), paper),
         "sac": sac(early, statistics),
+        "ablation": ablation.numbers(ablation.read_ablation(), paper),
+        "headline": headline.numbers(headline.read_curves()),
         "rate_error": noise_rates(DATA / "runs"),
         "commits": commits(five_runs["run"]),
         "scale": reward_scale(),
@@ -713,5 +717,6 @@ def page():
 
 
 if __name__ == "__main__":
+    ablation.draw_if_whole()
     (RESULTS / "README.md").write_text(page())
     print(f"Wrote {RESULTS / 'README.md'}")

@@ -12,6 +12,7 @@ from tabulate import tabulate
 
 RESULTS = Path(__file__).resolve().parent.parent
 DATA = RESULTS / "data"
+ENVIRONMENTS = ["HalfCheetah", "Hopper", "Humanoid", "Pusher", "Walker2d"]  # without version
 sys.path.insert(0, str(RESULTS.parent))
 from analysis.runs import KEYS, read_runs  # noqa: E402
 from analysis.statistics import holm, improvement_percent, mann_whitney  # noqa: E402

@@ -1,0 +1,135 @@
+"""How sensitive PPO is to the scale of the noise: the runs in data/ablation/, and their figure.
+
+`./benchmark.sh ablation` trains them: two noises, five values of beta each, five environments. The
+paper calls PPO sensitive and shows bars without numbers. claims.py has the verdict on its page. The
+rule was fixed before any run: for each noise, is the return the same at all values of beta?
+"""
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from common import DATA, ENVIRONMENTS, RESULTS, markdown, plain, read_returns
+from scipy import stats
+
+from analysis.statistics import MIN_SEEDS, holm, improvement_percent
+from noisy_wrappers import canonical_noises
+from sweep.grid import ABLATION, SEEDS
+
+FOLDER = DATA / "ablation"
+PLANNED_SEEDS = SEEDS["ppo"]
+SHUFFLES = 10_000
+plt.rcParams["svg.hashsalt"] = "noisy"  # equal figures are equal files
+
+
+def scales():
+    """Return {wrapper: {beta: noise}}, all in canonical notation."""
+    found = {}
+    for noise, rate in ABLATION:
+        [noise], _ = canonical_noises([noise], [rate])
+        wrapper, arguments = noise.rstrip(")").split("(")
+        found.setdefault(wrapper, {})[float(arguments.split(",")[1])] = noise
+    return found
+
+
+def read_ablation(folder=FOLDER):
+    """Return environment, noise, seed and test return of all runs of whole seeds.
+
+    A seed is whole when every noise and the baseline are there in every environment.
+    """
+    columns = ["environment", "noise", "seed", "test"]
+    if not folder.exists():
+        return pd.DataFrame(columns=columns)
+    runs = read_returns(folder)[columns]
+    planned = len(ENVIRONMENTS) * (1 + len(ABLATION))
+    return runs[runs.groupby("seed")["seed"].transform("size") == planned]
+
+
+def same_at_all_scales(returns):
+    """Test "the scale does not matter" -> p.
+
+    returns (environments x scales x seeds). The statistic is Kruskal and Wallis's H, summed over
+    environments; its null distribution comes from shuffling the runs within each environment.
+    """
+    rng = np.random.default_rng(0)
+    ranks = stats.rankdata(returns.reshape(len(returns), -1), axis=1)
+
+    def spread(ranks):  # of the scales' mean ranks; H is this times a constant
+        return ranks.reshape(*ranks.shape[:-1], *returns.shape[1:]).mean(-1).var(-1).sum(-1)
+
+    shuffled = rng.permuted(np.broadcast_to(ranks, (SHUFFLES, *ranks.shape)), axis=-1)
+    at_least = (spread(shuffled) >= spread(ranks) - 1e-9).sum()
+    return (1 + at_least) / (1 + SHUFFLES)
+
+
+def verdict(p):
+    """Return the verdict on "sensitive to the scale" from {wrapper: p after Holm's correction}."""
+    sensitive = [wrapper for wrapper, value in p.items() if value <= 0.05]
+    if len(sensitive) == len(p):
+        return "**Holds** for both noises"
+    if sensitive:
+        return f"**Holds** for `{sensitive[0]}`, not shown for the other noise"
+    return "**Not shown**"
+
+
+def numbers(runs, paper):
+    """Compute what the page says; "p" and "table" are None without three whole seeds.
+
+    runs is a frame of read_ablation.
+    """
+    seeds = sorted(set(runs["seed"]))
+    found = {"whole_seeds": len(seeds), "planned_seeds": len(PLANNED_SEEDS)}
+    if len(seeds) < MIN_SEEDS:
+        return found | {"table": None, "p": None, "verdict": "**Not decided**: too few runs"}
+    by = runs.pivot(index=["environment", "noise"], columns="seed", values="test")
+    averages = paper["consistent"].query("algorithm == 'PPO'").set_index(["noise", "noise_rate"])
+    rows, p = [], {}
+    for wrapper, noises in scales().items():
+        returns = [[by.loc[env, noise] for noise in noises.values()] for env in ENVIRONMENTS]
+        p[wrapper] = same_at_all_scales(np.array(returns))
+        rate = next(rate for noise, rate in ABLATION if noise.startswith(wrapper))
+        for noise in noises.values():
+            change = pd.Series(
+                {
+                    env: improvement_percent(by.loc[env, noise].mean(), by.loc[env, ""].mean())
+                    for env in ENVIRONMENTS
+                }
+            )
+            row = {"noise": f"`{noise}`"}
+            row |= {env: f"{value:+.0f} %" for env, value in change.items()}
+            row["average"] = f"{change.mean():+.0f} ± {change.std(ddof=1):.0f} %"
+            row["the paper"] = "\u2013"
+            if (noise, f"{rate:.2f}") in averages.index:
+                theirs = averages.loc[noise, f"{rate:.2f}"]
+                average, std = theirs[["average_improvement_percent", "std_improvement_percent"]]
+                row["the paper"] = f"{average:+.0f} ± {std:.0f} %"
+            rows.append(row)
+    corrected = dict(zip(p, holm(np.array(list(p.values()))), strict=True))
+    return found | {"table": markdown(rows), "p": corrected, "verdict": verdict(corrected)}
+
+
+def draw(runs):
+    """Draw the paper's bars from our runs: a row per noise, a panel per environment."""
+    fig, axes = plt.subplots(
+        2, len(ENVIRONMENTS), figsize=(12, 5), sharey="col", layout="constrained"
+    )
+    for row, (wrapper, noises) in zip(axes, scales().items(), strict=True):
+        for ax, environment in zip(row, ENVIRONMENTS, strict=True):
+            here = runs[runs["environment"] == environment].groupby("noise")["test"]
+            bars = {"None": here.get_group("")}
+            bars |= {f"{beta:g}": here.get_group(noise) for beta, noise in noises.items()}
+            heights = [returns.mean() for returns in bars.values()]
+            errors = [returns.std(ddof=1) for returns in bars.values()]
+            colors = ["grey"] + ["C0"] * len(noises)
+            ax.bar(list(bars), heights, yerr=errors, color=colors)
+            ax.set_title(environment)
+            ax.set_xlabel("\u03b2")
+        row[0].set_ylabel(f"{wrapper}\ntest return")
+    fig.savefig(RESULTS / "figures/ablation.svg", metadata={"Date": None})
+    plt.close(fig)
+
+
+def draw_if_whole():
+    """Draw the figure if the page shows it."""
+    runs = plain(read_ablation())
+    if runs["seed"].nunique() >= MIN_SEEDS:
+        draw(runs)

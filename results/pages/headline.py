@@ -1,0 +1,113 @@
+"""The paper's headline: SAC on HalfCheetah reaches the baseline's final return in half the steps.
+
+With RandomUniformScaleReward(0.5, 1.5) at p = 0.01, the paper's figure and its table of early
+performance. Our runs are in data/long/; claims.py shows what is here.
+"""
+
+import numpy as np
+import pandas as pd
+from common import DATA, markdown, plain
+from scipy import optimize, stats
+
+from analysis.runs import read_runs
+from analysis.statistics import MIN_SEEDS, steps_to_reach
+
+NOISE, RATE = "RandomUniformScaleReward(0.5, 1.5)", "0.01"
+TOTAL = 1_000_000
+LEVEL, POWER = 0.05, 0.8
+
+
+def read_curves(folder=DATA / "long"):
+    """Return (steps, without noise, with noise), curves (steps x seeds) of the whole seeds.
+
+    A seed is whole when both runs are there. None without three of them.
+    """
+    runs = plain(read_runs(folder)).query(
+        "status == 'finished' and algorithm == 'SAC' and environment == 'HalfCheetah'"
+        " and total == @TOTAL"
+    )
+    found = {
+        noise: group.set_index("seed")["returns"]
+        for (noise, rate), group in runs.groupby(["noise", "noise_rate"])
+        if (noise, rate) in (("", "0.00"), (NOISE, RATE))
+    }
+    seeds = sorted(set.intersection(*(set(found.get(n, pd.Series()).index) for n in ("", NOISE))))
+    if len(seeds) < MIN_SEEDS:
+        return None
+    curves = [np.stack([found[noise][seed] for seed in seeds], axis=1) for noise in ("", NOISE)]
+    return runs["steps"].iloc[0], *curves
+
+
+def smallest_shown(x, y):
+    """Return the difference of means that a two-sided t-test finds with 80 % power at 5 %.
+
+    x (n) and y (m) give the common standard deviation.
+    """
+    n, m = len(x), len(y)
+    df = n + m - 2
+    pooled = np.sqrt(((n - 1) * np.var(x, ddof=1) + (m - 1) * np.var(y, ddof=1)) / df)
+    critical = stats.t.ppf(1 - LEVEL / 2, df)
+
+    def missing_power(shift):  # the other tail is negligible
+        return stats.nct.sf(critical, df, shift) - POWER
+
+    return optimize.brentq(missing_power, 0, 10) * pooled * np.sqrt(1 / n + 1 / m)
+
+
+def numbers(curves):
+    """Compute steps and final returns from the result of read_curves; None where that is None.
+
+    The target is the baseline's final mean. A run that never reaches it counts with all of its
+    steps, so the mean with noise is a lower limit then.
+    """
+    if curves is None:
+        return None
+    steps, without, noisy = curves
+    target = without[-1].mean()
+    reached = {}
+    for name, returns in (("without", without), ("noisy", noisy)):
+        first = [steps_to_reach(run[:, None], steps, target) for run in returns.T]
+        reached[name] = {
+            "mean_curve": steps_to_reach(returns, steps, target),
+            "never": int(np.isnan(first).sum()),
+            "runs": np.where(np.isnan(first), steps[-1], first),
+        }
+    x, y = reached["noisy"]["runs"], reached["without"]["runs"]
+    final = stats.ttest_ind(noisy[-1], without[-1], equal_var=False)
+    low, high = final.confidence_interval(0.95)
+    p_steps = stats.ttest_ind(x, y, equal_var=False).pvalue
+    rows = [
+        {
+            "": name,
+            "final return": f"{returns[-1].mean():,.0f} ± {returns[-1].std(ddof=1):,.0f}",
+            "the mean is there after": spell_steps(reached[key]["mean_curve"]),
+            "each run": ", ".join(f"{value:,.0f}" for value in reached[key]["runs"]),
+            "never": reached[key]["never"],
+        }
+        for name, key, returns in (("no noise", "without", without), ("noise", "noisy", noisy))
+    ]
+    return {
+        "n": without.shape[1],
+        "table": markdown(rows),
+        "target": target,
+        "difference": noisy[-1].mean() - target,
+        "low": low,
+        "high": high,
+        "p": final.pvalue,
+        "shown": smallest_shown(noisy[-1], without[-1]),
+        "p_steps": p_steps,
+        "steps_shown": smallest_shown(x, y),
+        "verdict": verdict(reached["noisy"]["mean_curve"], x.mean() < y.mean(), p_steps),
+    }
+
+
+def spell_steps(value):
+    """Write a number of steps, or a dash for never."""
+    return "\u2013" if np.isnan(value) else f"{value:,.0f}"
+
+
+def verdict(steps_with_noise, is_faster, p):
+    """Return the verdict: the mean curve is there before half of the steps, and not by chance."""
+    if not steps_with_noise < TOTAL / 2:
+        return "**Not seen**"
+    return "**Holds**" if is_faster and p <= LEVEL else "**Seen, not beyond chance**"

@@ -1,0 +1,170 @@
+"""Runs that are still to come, made up: the scale of PPO's noise, and SAC's steps to a return."""
+
+import ablation
+import claims
+import common
+import headline
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+
+from analysis.paper import read_paper
+
+PAPER = read_paper(common.RESULTS / "paper")
+SCALED, UNIFORM = ablation.scales()
+
+
+def made_up(seeds, effect=0.0):
+    """Whole seeds: returns of about 100; beta costs `effect` each with the first noise."""
+    rng, rows = np.random.default_rng(0), []
+    for environment in common.ENVIRONMENTS:
+        cells = [("", 0)]
+        for wrapper, noises in ablation.scales().items():
+            cells += [(noise, i * (wrapper == SCALED)) for i, noise in enumerate(noises.values())]
+        for noise, place in cells:
+            for seed in seeds:
+                rows.append([environment, noise, seed, 100 - effect * place + rng.normal()])
+    return pd.DataFrame(rows, columns=["environment", "noise", "seed", "test"])
+
+
+def test_the_scales_are_those_of_the_preset():
+    scales = ablation.scales()
+    assert list(scales) == ["RandomUniformScaleReward", "RandomUniformNoisyObservation"]
+    assert list(scales[SCALED]) == [1.1, 1.2, 1.5, 1.8, 2.0]
+    assert scales[SCALED][2.0] == "RandomUniformScaleReward(0.0, 2.0)"
+    assert scales[UNIFORM][0.001] == "RandomUniformNoisyObservation(-0.001, 0.001)"
+
+
+def test_only_whole_seeds_of_the_ablation_count(tmp_path, monkeypatch):
+    assert len(ablation.read_ablation(tmp_path / "absent")) == 0
+    runs = made_up([1, 2]).iloc[:-1]  # the last run of seed 2 is not there
+    monkeypatch.setattr(ablation, "read_returns", lambda folder: runs)
+    assert set(ablation.read_ablation(tmp_path)["seed"]) == {1}
+    found = ablation.numbers(ablation.read_ablation(tmp_path), PAPER)
+    assert found["whole_seeds"] == 1 and found["table"] is None
+    assert found["verdict"].startswith("**Not decided**")
+
+
+def test_the_test_of_the_scales_is_kruskal_and_wallis():
+    """For one environment its p is scipy's, up to the chi-squared approximation."""
+    rng = np.random.default_rng(1)
+    for shift in (0.0, 0.4, 0.8):
+        returns = rng.normal(size=(1, 5, 8)) + shift * np.arange(5)[:, None]
+        expected = stats.kruskal(*returns[0]).pvalue
+        assert ablation.same_at_all_scales(returns) == pytest.approx(expected, abs=0.03)
+
+
+def test_useless_scales_are_seldom_found():
+    """Without an effect p is uniform, also where environments have scales of their own."""
+    rng = np.random.default_rng(2)
+    size = np.array([1.0, 1000.0])[:, None, None]
+    p = [ablation.same_at_all_scales(size * rng.normal(size=(2, 5, 3))) for _ in range(40)]
+    assert 0.3 < np.mean(p) < 0.7 and np.mean(np.array(p) <= 0.05) < 0.2
+
+
+def test_a_noise_whose_scale_matters():
+    found = ablation.numbers(made_up([1, 2, 3], effect=5), PAPER)
+    assert found["p"][SCALED] == pytest.approx(2 / 10_001) and found["p"][UNIFORM] > 0.05
+    assert found["verdict"] == f"**Holds** for `{SCALED}`, not shown for the other noise"
+    rows = {line.split("|")[1].strip(): line for line in found["table"].splitlines()[2:]}
+    assert "| +20 ± 40 %" in rows["`RandomUniformScaleReward(0.8, 1.2)`"]
+    assert "| +8 ± 19 %" in rows["`RandomUniformNoisyObservation(-0.001, 0.001)`"]
+    assert rows["`RandomUniformScaleReward(0.0, 2.0)`"].count("-20 %") >= 2
+
+
+def test_verdicts_on_the_scale():
+    assert ablation.verdict({SCALED: 0.05, UNIFORM: 0.001}) == "**Holds** for both noises"
+    assert ablation.verdict({SCALED: 0.06, UNIFORM: 0.5}) == "**Not shown**"
+
+
+# ------------------------------------------------------------------------------------- the headline
+
+STEPS = np.arange(1, 11) * 100_000
+
+
+def curves(*lengths):
+    """A return that rises by 1,000 every 100,000 steps up to each run's own end."""
+    return np.stack([np.minimum(STEPS / 100, end) for end in lengths], axis=1)
+
+
+def test_steps_to_the_baselines_return_by_hand():
+    """The baselines end at 7,900, 8,000 and 8,100; with noise one of the runs never gets there."""
+    without, noisy = curves(7900, 8000, 8100), np.minimum(2.5 * curves(9900, 9900, 2000), 9900)
+    found = headline.numbers((STEPS, without, noisy))
+    assert found["target"] == 8000 and found["n"] == 3
+    rows = [line.split("|")[2:-1] for line in found["table"].splitlines()[2:]]
+    rows = [[cell.strip() for cell in row] for row in rows]
+    assert rows[0] == ["8,000 ± 100", "900,000", "1,000,000, 800,000, 800,000", "1"]
+    assert rows[1] == ["8,267 ± 2,829", "400,000", "400,000, 400,000, 1,000,000", "1"]
+    expected = stats.ttest_ind(noisy[-1], without[-1], equal_var=False)
+    assert (found["difference"], found["p"]) == pytest.approx((800 / 3, expected.pvalue))
+    assert found["verdict"] == "**Seen, not beyond chance**"
+
+
+def test_the_smallest_difference_that_is_shown():
+    """Simulated: three against three runs find it in 80 % of the draws."""
+    x, y = np.array([1.0, 2, 3]), np.array([11.0, 12, 13])
+    shift = headline.smallest_shown(x, y)
+    rng = np.random.default_rng(0)
+    draws = rng.normal(size=(20_000, 2, 3))
+    p = stats.ttest_ind(draws[:, 0] + shift, draws[:, 1], axis=1).pvalue
+    assert np.mean(p <= 0.05) == pytest.approx(0.8, abs=0.01)
+
+
+def test_verdicts_on_the_headline():
+    assert headline.verdict(400_000, True, 0.04) == "**Holds**"
+    assert headline.verdict(400_000, True, 0.06) == "**Seen, not beyond chance**"
+    assert headline.verdict(500_000, True, 0.04) == headline.verdict(np.nan, True, 0.04)
+    assert headline.verdict(500_000, True, 0.04) == "**Not seen**"
+
+
+def made_up_runs(seeds_of_noise):
+    rows = [
+        ["finished", "SAC", "HalfCheetah-v5", noise, rate, seed, 1_000_000, STEPS, STEPS + seed]
+        for noise, rate, seeds in seeds_of_noise
+        for seed in seeds
+    ]
+    names = [
+        "status",
+        "algorithm",
+        "environment",
+        "noise",
+        "noise_rate",
+        "seed",
+        "total",
+        "steps",
+        "returns",
+    ]
+    return pd.DataFrame(rows, columns=names)
+
+
+def test_only_whole_seeds_of_the_headline_count(monkeypatch):
+    runs = made_up_runs([("", "0.00", (1, 2, 3, 4)), (headline.NOISE, "0.01", (2, 3, 4, 5))])
+    monkeypatch.setattr(headline, "read_runs", lambda folder: runs)
+    steps, without, noisy = headline.read_curves()
+    assert (steps == STEPS).all() and (without == noisy).all()
+    assert (without[0] - STEPS[0]).tolist() == [2, 3, 4]
+    for left in (runs[runs["seed"] != 3], runs[runs["noise"] == ""], runs.iloc[:0]):
+        monkeypatch.setattr(headline, "read_runs", lambda folder, left=left: left)
+        assert headline.read_curves() is None
+
+
+def test_the_sections_appear_with_the_runs(monkeypatch, tmp_path):
+    runs = made_up([1, 2, 3], effect=5)
+    monkeypatch.setattr(ablation, "read_ablation", lambda: runs)
+    found = (STEPS, curves(7900, 8000, 8100), 2 * curves(9000, 9100, 3000))
+    monkeypatch.setattr(headline, "read_curves", lambda: found)
+    page = claims.page()
+    for text in (
+        "3 of 10 seeds are complete",
+        "`RandomUniformScaleReward`: p = 0.0002",
+        "**Holds**",
+    ):
+        assert text in page
+    assert "1,000,000, 800,000, 800,000" in page and "figures/ablation.svg" in page
+    assert "not complete" not in page
+    (tmp_path / "figures").mkdir()
+    monkeypatch.setattr(ablation, "RESULTS", tmp_path)
+    ablation.draw_if_whole()
+    assert (tmp_path / "figures/ablation.svg").stat().st_size > 10_000
