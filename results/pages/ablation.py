@@ -110,7 +110,7 @@ def numbers(runs, paper):
 def draw(runs):
     """Draw the paper's bars from our runs: a row per noise, a panel per environment."""
     fig, axes = plt.subplots(
-        2, len(ENVIRONMENTS), figsize=(12, 5), sharey="col", layout="constrained"
+        2, len(ENVIRONMENTS), figsize=(12, 6), sharey="col", layout="constrained"
     )
     for row, (wrapper, noises) in zip(axes, scales().items(), strict=True):
         for ax, environment in zip(row, ENVIRONMENTS, strict=True):
@@ -123,6 +123,7 @@ def draw(runs):
             ax.bar(list(bars), heights, yerr=errors, color=colors)
             ax.set_title(environment)
             ax.set_xlabel("\u03b2")
+            ax.tick_params(axis="x", labelrotation=60)
         row[0].set_ylabel(f"{wrapper}\ntest return")
     fig.savefig(RESULTS / "figures/ablation.svg", metadata={"Date": None})
     plt.close(fig)

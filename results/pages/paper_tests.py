@@ -130,7 +130,8 @@ def main():
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
     options = parser.parse_args()
     if options.jobs < 1:
-        parser.error(f"--jobs must be at least 1, not {options.jobs}")
+        print(f"error: --jobs must be at least 1, not {options.jobs}", file=sys.stderr)
+        return 2
     runs = [
         ppo.Args(env_id, seed, noise=noise, noise_rate=rate, runs_dir=options.runs_dir)
         for env_id, noise, rate, seed in planned_runs()

@@ -127,6 +127,12 @@ def test_finished_runs_are_skipped_and_others_begin_anew(tested, monkeypatch, ca
     assert "50 of 50 runs are finished" in capsys.readouterr().out
 
 
+def test_bad_input(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["paper_tests.py", "--jobs", "0"])
+    assert paper_tests.main() == 2
+    assert capsys.readouterr().err == "error: --jobs must be at least 1, not 0\n"
+
+
 def test_sigterm_ends_the_program_and_its_runs(tmp_path):
     line = [sys.executable, paper_tests.__file__, "--runs-dir", str(tmp_path), "--jobs", "1"]
     with open(tmp_path / "out", "w") as out:
