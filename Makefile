@@ -20,8 +20,8 @@ test: $(BIN)/.dev
 lint: $(BIN)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	bash -n benchmark.sh .ci/run
-	$(BIN)/shellcheck benchmark.sh .ci/run
+	for script in benchmark.sh sweep/executors.sh .ci/run; do bash -n $$script || exit; done
+	$(BIN)/shellcheck --external-sources --check-sourced benchmark.sh .ci/run
 
 # What one command can make again, from the runs in results/data. Only what the pages show is kept
 # in git; results/report has everything.

@@ -1,0 +1,117 @@
+# shellcheck shell=bash
+# How benchmark.sh, which sources this file, has commands executed: `run_one` is a run, and for each
+# executor NAME there are run_NAME, which returns when all commands of the file $list are over, and
+# stop_NAME, which has them write their checkpoints and end. Slurm's run_slurm only waits: `submit`
+# submits.
+
+# ------------------------------------------------------------------------------------------ one run
+
+log_of() { echo "${1%/*}/logs/${1##*/}.log"; }
+
+# FOLDER COMMAND: one run, its output framed by two lines that begin with "#"; returns its status.
+# TERM and INT reach all processes of a run, from whoever sends them. USR1 reaches this shell
+# only, and means: have the run write its checkpoint and end. It sets `asked`.
+# The log is locked while the run lives, even if only the run itself survives: whoever else wants
+# to start the same run waits for it, and goes on with it if it was stopped.
+run_one() {
+  asked=
+  mkdir -p "${1%/*}/logs"
+  exec 9>>"$(log_of "$1")"
+  if ! flock --nonblock 9; then
+    echo "$1 is running already: waiting for it" >&2
+    flock 9 >/dev/null 2>&1 || return
+  fi
+  [ ! -e "$1/result.json" ] || return 0
+  export OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 PYTHONUNBUFFERED=1
+  echo "# $(date '+%F %T') $HOSTNAME: $2"
+  bash -c "exec $2" 2>&1 &
+  local child=$! status=0
+  trap : TERM INT
+  trap '[ -n "$asked" ] || kill -TERM "$child" || true; asked=1' USR1
+  while kill -0 "$child" 2>/dev/null; do wait "$child" || true; done # a signal interrupts wait
+  wait "$child" || status=$?
+  echo "# $(date '+%F %T') $HOSTNAME: exit=$status"
+  return "$status"
+}
+
+slurm_task() { # LINES OFFSET: one task of a job array, requeued if it was stopped by USR1
+  local folder command status=0
+  IFS=$'\t' read -r folder command < <(sed -n "$(($2 + SLURM_ARRAY_TASK_ID + 1))p" "$1")
+  run_one "$folder" "$command" >>"$(log_of "$folder")" || status=$?
+  if [ -n "$asked" ] && [ "$status" -eq 143 ]; then scontrol requeue "$SLURM_JOB_ID"; fi
+  exit "$status"
+}
+
+# -------------------------------------------------------------------------------------------- local
+
+run_local() { # nproc obeys OMP_NUM_THREADS, which is about the threads of one process
+  local cores folder command
+  cores=$(env -u OMP_NUM_THREADS -u OMP_THREAD_LIMIT nproc 2>/dev/null) ||
+    cores=$(getconf _NPROCESSORS_ONLN)
+  while IFS=$'\t' read -r folder command; do
+    while [ "$(jobs -pr | wc -l)" -ge "${jobs:-$cores}" ]; do wait -n || true; done
+    run_one "$folder" "$command" >>"$(log_of "$folder")" &
+  done <"$list"
+  wait
+}
+stop_local() { kill -TERM -- "-$group"; } # run_local ends at once, the runs after their checkpoint
+
+# ----------------------------------------------------------------------------------------- parallel
+
+run_parallel() { # --termseq: where a connection is lost, the runs get TERM and are left in peace
+  trap '' HUP
+  local chatter='^parallel: (SIGHUP|Waiting for|\./benchmark)|will not be transferred'
+  local options=(--jobs "${jobs:-100%}" --joblog "+$logs/joblog.tsv")
+  options+=(--termseq "TERM,600000")
+  [ -z "$remote_dir" ] || options+=(--transferfile '{1}' --return '{1}')
+  parallel "${parallel_options[@]}" "${options[@]}" --line-buffer --tagstring '{1}' --colsep '\t' \
+    ./benchmark.sh run-one "$sweep" '{1}' '{2}' :::: "$list" 2> >(grep -Ev "$chatter" >&2) |
+    while IFS= read -r line; do
+      printf '%s\n' "${line#*$'\t'}" >>"$(log_of "${line%%$'\t'*}")"
+    done
+}
+stop_parallel() { # HUP: parallel starts no more runs, and waits for those that USR1 stops
+  local pattern="^bash ./benchmark.sh run-one $sweep" seconds=0
+  while kill -HUP -- "-$group" 2>/dev/null && [ $seconds -lt 3600 ]; do # again for late starters
+    if [ -z "$sshlogin" ]; then
+      pkill -USR1 -f "$pattern" || true
+    else
+      parallel "${parallel_options[@]}" --nonall pkill -USR1 -f "'$pattern'" || true
+    fi
+    sleep 1
+    seconds=$((seconds + 1))
+  done
+}
+
+# -------------------------------------------------------------------------------------------- slurm
+
+submit() { # the array's indices are line numbers, counted from the offset of its part
+  local size offset n id
+  size=$(scontrol show config | awk '$1 == "MaxArraySize" {print $3}') || true
+  [ "$stopped" -eq 0 ] || return 0
+  [ "${size:-0}" -gt 0 ] || fail "scontrol show config does not tell MaxArraySize"
+  read -ra slurm_options <<<"$slurm_args"
+  for ((offset = 0; offset < count && stopped == 0; offset += size)); do
+    n=$((count - offset < size ? count - offset : size))
+    id=$(sbatch --parsable --array="0-$((n - 1))${jobs:+%$jobs}" --requeue --signal=B:USR1@180 \
+      --ntasks=1 --cpus-per-task=1 --job-name=noisy-sweep \
+      --open-mode=append --output="$logs/slurm-%A.out" \
+      ${slurm_options[@]+"${slurm_options[@]}"} \
+      --wrap "exec ./benchmark.sh slurm-task $(printf %q "$list") $offset") || {
+      [ "$stopped" -eq 0 ] || break # Ctrl-C ends sbatch, too
+      fail "sbatch refused runs $((offset + 1)) to $((offset + n)); submitted before: ${ids[*]}"
+    }
+    ids+=("${id%%;*}")
+  done
+  if [ "$stopped" -eq 0 ]; then
+    echo "submitted; to stop: scancel ${ids[*]}" >&2
+  elif [ "${#ids[@]}" -gt 0 ]; then
+    stop_slurm
+  fi
+}
+run_slurm() { # the arrays are over when squeue answers and does not name them
+  local queue
+  until queue=$(squeue --noheader --user="$(id -un)" --format=%F 2>/dev/null) &&
+    ! grep -qxF "$(printf '%s\n' "${ids[@]}")" <<<"$queue"; do sleep 5; done
+}
+stop_slurm() { scancel "${ids[@]}"; }
