@@ -29,8 +29,8 @@ from sweep.grid import check_extra, check_rollouts, command_line, grid, result, 
 from sweep.options import check, parse_args
 
 STOPPED = (129, 130, 138, 143)  # exit statuses of a run that was told to stop, by signal
-END = re.compile(r"# .* exit=(\d+)")
-PROGRESS = re.compile(r"step=(\d+)/\d+ sps=(\d+)")
+END = re.compile(r"# .* exit=(\d+)")  # the last line of run_one in executors.sh
+PROGRESS = re.compile(r"step=(\d+)/\d+ sps=(\d+)")  # the line of _show_progress in the scripts
 
 
 class Log(NamedTuple):

@@ -30,7 +30,7 @@ run_one() {
   trap '[ -n "$asked" ] || kill -TERM "$child" || true; asked=1' USR1
   while kill -0 "$child" 2>/dev/null; do wait "$child" || true; done # a signal interrupts wait
   wait "$child" || status=$?
-  echo "# $(date '+%F %T') $HOSTNAME: exit=$status"
+  echo "# $(date '+%F %T') $HOSTNAME: exit=$status" # python -m sweep reads this line
   return "$status"
 }
 

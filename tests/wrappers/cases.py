@@ -1,0 +1,207 @@
+"""What the tests of the wrappers share: noises with their formulas, and environments."""
+
+import zlib
+
+import gymnasium as gym
+import numpy as np
+from hypothesis import settings
+
+from noisy_wrappers import (
+    WRAPPERS,
+    RandomDropoutObservation,
+    RandomMixupObservation,
+    RandomNormalNoisyObservation,
+    RandomNormalNoisyReward,
+    RandomUniformNoisyObservation,
+    RandomUniformNoisyReward,
+    RandomUniformScaleObservation,
+    RandomUniformScaleReward,
+)
+
+# Derandomized: a failure in CI is a failure on every machine.
+hypothesis_settings = settings(deadline=None, derandomize=True, max_examples=150)
+
+# wrapper, arguments, keywords, formula(noise generator, o_t, o_(t-1))
+OBSERVATION_CASES = [
+    (RandomNormalNoisyObservation, (0.3,), {}, lambda g, o, _: o + g.normal(0, 0.3, o.shape)),
+    (
+        RandomNormalNoisyObservation,
+        (0.3,),
+        {"loc": -0.5},
+        lambda g, o, _: o + g.normal(-0.5, 0.3, o.shape),
+    ),
+    (
+        RandomNormalNoisyObservation,
+        ((0.3, 0.0, 2.0),),
+        {},
+        lambda g, o, _: o + g.normal(0, [0.3, 0.0, 2.0]),
+    ),
+    (RandomUniformNoisyObservation, (-0.2, 0.7), {}, lambda g, o, _: o + g.uniform(-0.2, 0.7, 3)),
+    (RandomUniformScaleObservation, (0.5, 1.7), {}, lambda g, o, _: o * g.uniform(0.5, 1.7)),
+    (
+        RandomUniformScaleObservation,
+        (0.5, 1.7),
+        {"per_dimension": True},
+        lambda g, o, _: o * g.uniform(0.5, 1.7, o.shape),
+    ),
+    (RandomMixupObservation, (0.3,), {}, lambda g, o, previous: 0.3 * o + 0.7 * previous),
+    (RandomMixupObservation, (0.0,), {}, lambda g, o, previous: previous),
+    (RandomDropoutObservation, (0.3,), {}, lambda g, o, _: (g.random(o.shape) < 0.3) * o),
+]
+
+REWARD_CASES = [
+    (RandomNormalNoisyReward, (0.3,), {}, lambda g, r: r + g.normal(0, 0.3)),
+    (RandomNormalNoisyReward, (0.3,), {"loc": 2.0}, lambda g, r: r + g.normal(2.0, 0.3)),
+    (RandomUniformNoisyReward, (-0.2, 0.7), {}, lambda g, r: r + g.uniform(-0.2, 0.7)),
+    (RandomUniformScaleReward, (0.5, 1.7), {}, lambda g, r: r * g.uniform(0.5, 1.7)),
+]
+
+# One configuration per wrapper, and the variants.
+NOISES = [
+    "RandomNormalNoisyObservation(0.3)",
+    "RandomUniformNoisyObservation(-0.2, 0.7)",
+    "RandomUniformScaleObservation(0.5, 1.7)",
+    "RandomUniformScaleObservation(-1.0, 0.0, per_dimension=True)",
+    "RandomMixupObservation(0.3)",
+    "RandomMixupObservation(0.3, recursive=True)",
+    "RandomDropoutObservation(0.3)",
+    "RandomNormalNoisyReward(0.3)",
+    "RandomUniformNoisyReward(-0.2, 0.7)",
+    "RandomUniformScaleReward(0.5, 1.7)",
+    "RandomEarlyTermination(3, 9)",
+    "RandomEarlyTermination(3, 9, truncate=True)",
+    "RandomEarlyTermination(each_step=True)",
+    "RandomNormalNoisyAction(0.3)",
+    "RandomNormalNoisyAction(0.3, loc=-0.5)",
+]
+
+STEP_NOISES = [text for text in NOISES if not text.startswith("RandomEarlyTermination(3")]
+
+BOX = gym.spaces.Box(-10.0, 10.0, (3,), np.float64)
+
+
+class GenericEnv(gym.Env):
+    """An endless environment of random observations and rewards, with functions to replace."""
+
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+
+    def __init__(self, observation_space=BOX, reset=None, step=None):
+        self.observation_space = observation_space
+        self._reset = reset or (lambda env: (env.draw(), {}))
+        self._step = step or (
+            lambda env, action: (env.draw(), float(env.np_random.normal()), False, False, {})
+        )
+
+    def draw(self):
+        space = self.observation_space
+        return self.np_random.uniform(-5, 5, space.shape).astype(space.dtype)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self._reset(self)
+
+    def step(self, action):
+        return self._step(self, action)
+
+
+def constant_env(value=2.0, shape=(3,)):
+    space = gym.spaces.Box(-np.inf, np.inf, shape, np.float64)
+    return GenericEnv(
+        space,
+        reset=lambda env: (np.full(shape, value), {}),
+        step=lambda env, action: (np.full(shape, value), value, False, False, {}),
+    )
+
+
+def episodes_env(lengths):
+    """An environment whose episodes have the given lengths (None: endless), in turn."""
+
+    def reset(env):
+        env.episode = getattr(env, "episode", -1) + 1
+        env.t = 0
+        return np.zeros(3), {}
+
+    def step(env, action):
+        env.t += 1
+        done = env.t == lengths[env.episode % len(lengths)]
+        return np.zeros(3), 1.0, done, False, {}
+
+    return GenericEnv(reset=reset, step=step)
+
+
+def build(text, env, rate):
+    """Build a wrapper from the notation, without the module's parser."""
+    name, arguments = text.split("(", 1)
+    return eval(f"wrapper(env, rate, {arguments}", {"wrapper": WRAPPERS[name]} | locals())
+
+
+def registered(text):
+    """A registered environment that a noise can work on, and an action."""
+    if "Action" in text:
+        return "Pendulum-v1", np.array([0.5], np.float32)
+    return "CartPole-v1", 0
+
+
+def streams(wrapper, seed, position=0):
+    """The documented seeding: the gate's and the noise's generator."""
+    entropy = [seed, zlib.crc32(wrapper.__name__.encode()), position]
+    return [np.random.default_rng(child) for child in np.random.SeedSequence(entropy).spawn(2)]
+
+
+def rollout(env, seed=None, steps=100, action=0):
+    """What a reset and ``steps`` steps return, with resets where episodes end."""
+    observation, info = env.reset(seed=seed)
+    out = [(observation, None, False, False, info)]
+    for _ in range(steps):
+        out.append(env.step(action))
+        if out[-1][2] or out[-1][3]:
+            observation, info = env.reset()
+            out.append((observation, None, False, False, info))
+    return out
+
+
+def same(first, second):
+    """Two rollouts are equal bit for bit, types included."""
+    return len(first) == len(second) and all(
+        a[0].dtype == b[0].dtype
+        and a[0].shape == b[0].shape
+        and a[0].tobytes() == b[0].tobytes()
+        and type(a[1]) is type(b[1])
+        and a[1:] == b[1:]
+        for a, b in zip(first, second, strict=True)
+    )
+
+
+def numbered_env(reuse=False):
+    """Observations 1, 2, 3, ... from the first reset on; with ``reuse`` all in one array."""
+    buffer = np.zeros(3)
+
+    def observe(env):
+        env.count = getattr(env, "count", 0) + 1
+        if not reuse:
+            return np.full(3, float(env.count))
+        buffer[:] = env.count
+        return buffer
+
+    return GenericEnv(
+        reset=lambda env: (observe(env), {}),
+        step=lambda env, action: (observe(env), 0.0, False, False, {}),
+    )
+
+
+A, B, C = (
+    "RandomNormalNoisyReward(1)",
+    "RandomDropoutObservation(.5)",
+    "RandomEarlyTermination(9,9)",
+)
+
+
+def layers(env):
+    names = []
+    while isinstance(env, gym.Wrapper):
+        names.append(type(env).__name__)
+        env = env.env
+    return names[::-1]
+
+
+BOX = gym.spaces.Box(-1, 1, (3,), np.float32)

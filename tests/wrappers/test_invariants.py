@@ -1,0 +1,103 @@
+"""What no noise may change."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from cases import (
+    NOISES,
+    REWARD_CASES,
+    GenericEnv,
+    build,
+    constant_env,
+    registered,
+    rollout,
+    same,
+    streams,
+)
+
+from noisy_wrappers import (
+    RandomEarlyTermination,
+    RandomNormalNoisyObservation,
+    RandomUniformScaleReward,
+)
+
+
+@pytest.mark.parametrize("text", NOISES)
+@pytest.mark.parametrize("env_id", ["Pendulum-v1", None, "InvertedPendulum-v5"])
+def test_rate_zero_is_the_bare_environment(text, env_id):
+    env_id = env_id or registered(text)[0]
+    env = gym.make(env_id)
+    env.action_space.seed(0)
+    action = env.action_space.sample()
+    bare = rollout(env, seed=3, steps=50, action=action)
+    assert same(rollout(build(text, gym.make(env_id), 0.0), 3, 50, action), bare)
+
+
+@pytest.mark.parametrize("text", NOISES)
+def test_unperturbed_data_are_the_very_same_objects(text):
+    data = (np.ones(3), 1.5, False, False, {"key": 1})
+    env = GenericEnv(reset=lambda env: (data[0], data[4]), step=lambda env, action: data)
+    env = build(text, env, 0.0)
+    observation, info = env.reset(seed=0)
+    assert observation is data[0] and info is data[4]
+    assert all(got is given for got, given in zip(env.step(0), data, strict=True))
+
+
+@pytest.mark.parametrize("text", NOISES)
+def test_data_of_the_environment_are_never_mutated(text):
+    owned = np.arange(1.0, 4.0)
+    owned.flags.writeable = False
+    info = {"key": "value"}
+    reward = np.array(1.5)
+    reward.flags.writeable = False
+    env = GenericEnv(
+        reset=lambda env: (owned, info),
+        step=lambda env, action: (owned, reward, False, False, info),
+    )
+    env = build(text, env, 1.0)
+    for step in rollout(env, seed=0, steps=20):
+        name = type(env).__name__
+        assert step[4] in ({"key": "value"}, {"key": "value", "noise": (name,)})  # no pile-up
+    assert info == {"key": "value"}
+    assert env.times_applied > 0
+
+
+def test_info_names_the_wrappers_innermost_first():
+    env = RandomNormalNoisyObservation(constant_env(), 1.0, 0.1)
+    env = RandomEarlyTermination(env, 1.0, 2)
+    env = RandomUniformScaleReward(env, 1.0, 0.5, 1.5)
+    assert env.reset(seed=0)[1] == {"noise": ("RandomNormalNoisyObservation",)}
+    both = ("RandomNormalNoisyObservation", "RandomUniformScaleReward")
+    assert env.step(0)[4] == {"noise": both}
+    assert env.step(0)[4]["noise"] == (both[0], "RandomEarlyTermination", both[1])
+
+
+@pytest.mark.parametrize(("wrapper", "args", "kwargs", "formula"), REWARD_CASES)
+@pytest.mark.parametrize(
+    ("reward", "kind"),
+    [(1.5, float), (np.float64(1.5), np.float64), (np.float32(1.5), np.float32), (2, float)],
+)
+def test_reward_type(wrapper, args, kwargs, formula, reward, kind):
+    env = GenericEnv(step=lambda env, action: (np.zeros(3), reward, False, False, {}))
+    env = wrapper(env, 1.0, *args, **kwargs)
+    env.reset(seed=0)
+    got = env.step(0)[1]
+    assert type(got) is kind
+    assert got == pytest.approx(formula(streams(wrapper, 0)[1], float(reward)), rel=1e-6)
+
+
+@pytest.mark.parametrize(("wrapper", "args", "kwargs", "formula"), REWARD_CASES)
+@pytest.mark.parametrize("rate", [0.5, 1.0])
+def test_a_reward_of_shape_one_is_a_number(wrapper, args, kwargs, formula, rate):
+    reward = np.array([1.5], np.float32)
+    env = GenericEnv(step=lambda env, action: (np.zeros(3), reward, False, False, {}))
+    env = wrapper(env, rate, *args, **kwargs)
+    env.reset(seed=0)
+    gate, noise = streams(wrapper, 0)
+    for _ in range(20):
+        got = env.step(0)[1]
+        if gate.random() < rate:
+            assert type(got) is float and got == pytest.approx(formula(noise, 1.5))
+        else:
+            assert got is reward
+    assert reward == 1.5

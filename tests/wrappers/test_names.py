@@ -1,0 +1,149 @@
+"""Names of runs and of environments."""
+
+import re
+import sys
+
+import pytest
+from cases import A, B, C, hypothesis_settings
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from noisy_wrappers import WRAPPERS, canonical_env_id, canonical_noises, run_folder, run_name
+from sweep.grid import NOISES as NOISES_OF_THE_PAPER
+
+
+def test_run_names():
+    assert run_name("Hopper-v5", "sac", [], [], 1) == "baseline_s1__Hopper-v5__sac"
+    assert run_name("Hopper-v5", "sac", [A], [0], 1) == "baseline_s1__Hopper-v5__sac"
+    assert run_name("ALE/Pong-v5", "my exp", [], [], 2) == "baseline_s2__ALE-Pong-v5__my--exp"
+    assert run_name("module:Env-v0", "x", [], [], 2) != run_name("module/Env-v0", "x", [], [], 2)
+    noises = ["RandomMixupObservation(0, recursive=True)", "RandomUniformNoisyReward(-.5, 1)", C]
+    assert run_name("E", "x", noises, [1, 0.05, 0.2], 3) == (
+        "p0.2+1.0+0.05_s3_EarlyTermination_9+MixupObservation_0.0_recursive=True"
+        "+UniformNoisyReward_-0.5_1.0__E__x"
+    )
+
+    name = run_name("E", "x", [A, C, B], ["1:0", 0.5, "0:.25"], 3)
+    assert name == (
+        "p0.5+1.0to0.0+0.0to0.25_s3_EarlyTermination_9+NormalNoisyReward_1.0"
+        "+DropoutObservation_0.5__E__x"
+    )
+
+
+@pytest.mark.parametrize("noise", NOISES_OF_THE_PAPER)
+@pytest.mark.parametrize("seed", [1, 10])
+def test_31_characters_of_a_name_tell_rate_seed_and_kind(noise, seed):
+    """TensorBoard's list shows no more. Kinds are told apart even where a name is cut."""
+    kinds = {noise.partition("(")[0].removeprefix("Random") for noise in NOISES_OF_THE_PAPER}
+    shown = run_name("HalfCheetah-v5", "ppo_continuous_noisy", [noise], [0.01], seed)[:31]
+    rate, shown_seed, text = shown.split("_", 2)
+    assert (rate, shown_seed) == ("p0.01", f"s{seed}")
+    [kind] = [kind for kind in kinds if text.startswith(kind) or kind.startswith(text)]
+    assert noise.startswith(f"Random{kind}(")
+
+
+def test_a_folder_of_version_0_1_is_found(tmp_path):
+    run = ("ALE/Pong-v5", "x", [A, C], ["1:0", 0.5], 3)
+    new = tmp_path / "p0.5+1.0to0.0_s3_EarlyTermination_9+NormalNoisyReward_1.0__ALE-Pong-v5__x"
+    assert run_folder(tmp_path, *run) == new
+    name = "ALE-Pong-v5__x__RandomEarlyTermination_9_p0.5+RandomNormalNoisyReward_1.0_p1.0to0.0__3"
+    (tmp_path / name).mkdir()
+    assert run_folder(tmp_path, *run) == tmp_path / name
+    (tmp_path / "Hopper-v5__x__baseline__1").mkdir()
+    found = run_folder(str(tmp_path), "Hopper-v5", "x", [], [], 1)
+    assert found == tmp_path / "Hopper-v5__x__baseline__1"
+
+
+def test_long_run_names_fit_into_a_file_system():
+    def name(last):
+        scale = tuple(i / 1000 for i in range(1, 60)) + (last,)
+        return run_name("Humanoid-v5", "sac", [f"RandomNormalNoisyObservation({scale})"], [1], 3)
+
+    assert len(name(0.5)) <= 240 and name(0.5) != name(0.6)
+    assert name(0.5) == name(0.50)
+    assert name(0.5).startswith("p1.0_s3_NormalNoisyObservation_0.001_0.002_")
+    assert name(0.5).endswith("__Humanoid-v5__sac") and re.fullmatch(
+        r"[A-Za-z0-9._=+-]+", name(0.5)
+    )
+
+
+@st.composite
+def configurations(draw):
+    """Noises and rates from few values, so that equal ones come up."""
+    few = st.sampled_from([0.0, -0.0, 0.05, 0.5, 1.0, 1e-7, 12.0, 1e16])
+    noises = []
+    for _ in range(draw(st.integers(0, 2))):
+        name = draw(st.sampled_from(list(WRAPPERS)))
+        if name == "RandomEarlyTermination":
+            steps = sorted(draw(st.lists(st.sampled_from([1, 2, 12]), min_size=1, max_size=2)))
+            arguments = [str(k) for k in steps] if draw(st.booleans()) else ["each_step=True"]
+            arguments += draw(st.sampled_from([[], ["truncate=True"], ["truncate=False"]]))
+        elif "Uniform" in name:
+            arguments = [str(x) for x in sorted(draw(st.tuples(few, few)))]
+        else:
+            most = 1 if "Mixup" in name or "Dropout" in name else 1e16
+            arguments = [str(min(draw(few), most))]
+            if name == "RandomNormalNoisyObservation" and draw(st.booleans()):
+                arguments = [str(tuple(draw(st.lists(few, min_size=2, max_size=3))))]
+            if "Normal" in name and draw(st.booleans()):
+                arguments.append(f"loc={draw(few)}")
+        noises.append(f"{name}({', '.join(arguments)})")
+    rates = [draw(st.sampled_from([0.0, 0.05, 0.5, 1.0, "0:0", "1:0", "0:.5"])) for _ in noises]
+    return noises, rates
+
+
+@settings(hypothesis_settings, max_examples=400)
+@given(configurations(), configurations())
+def test_names_are_equal_exactly_if_the_configurations_are(one, two):
+    names = [run_name("Hopper-v5", "sac", *configuration, 1) for configuration in (one, two)]
+    assert (names[0] == names[1]) == (canonical_noises(*one) == canonical_noises(*two))
+    assert all(re.fullmatch(r"[A-Za-z0-9._=+-]+", name) for name in names)
+    assert run_name("Hopper-v5", "sac", *canonical_noises(*one), 1) == names[0]
+
+
+def test_canonical_env_id():
+    toy = "toy_envs:Tiny-v0"
+    for env_id, canonical in [
+        ("Hopper", "Hopper-v5"),
+        ("Hopper-v5", "Hopper-v5"),
+        ("Hopper-v4", "Hopper-v4"),
+        ("Pendulum", "Pendulum-v1"),
+        ("phys2d/CartPole", "phys2d/CartPole-v1"),
+        (toy, toy),
+        ("toy_envs:Tiny", toy),
+    ]:
+        assert canonical_env_id(env_id) == canonical
+        assert canonical_env_id(canonical) == canonical
+
+
+@pytest.mark.parametrize(
+    ("env_id", "reason"),
+    [
+        ("Hoper-v5", "Did you mean: `Hopper`"),
+        ("Hopper-v77", "v77"),
+        ("Hopper v5", "Malformed"),
+        ("", "Malformed"),
+        ("no_such_module:Env-v0", "No module named 'no_such_module'"),
+        ("toy_envs:Nothing-v0", "Nothing"),
+        ("toy_envs.nothing:Env-v0", "toy_envs.nothing"),
+        ("..toy_envs:Tiny-v0", "'..toy_envs' is no module's name"),
+    ],
+)
+def test_unknown_environments(env_id, reason):
+    with pytest.raises(ValueError) as error:
+        canonical_env_id(env_id)
+    message = str(error.value)
+    assert repr(env_id) in message and reason in message and "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("source", "error"),
+    [("{}[1]", KeyError), ("import no_such_module", ModuleNotFoundError), ("x = ][", SyntaxError)],
+)
+def test_what_a_module_raises_passes_through(source, error, tmp_path, monkeypatch):
+    (tmp_path / "buggy_module.py").write_text(source)
+    monkeypatch.syspath_prepend(tmp_path)
+    path = sys.path[:]
+    with pytest.raises(error):
+        canonical_env_id("buggy_module:Env-v0")
+    assert sys.path == path

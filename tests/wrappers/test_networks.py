@@ -1,0 +1,187 @@
+"""Environments for networks."""
+
+import copy
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from cases import BOX, A, B, numbered_env
+from gymnasium.wrappers import FlattenObservation
+
+from noisy_wrappers import (
+    EnvState,
+    FiniteNumbers,
+    NotFiniteError,
+    make_flat,
+    make_noisy,
+    noise_wrappers,
+)
+
+
+class Given(gym.Env):
+    """Observes and rewards what it is told to."""
+
+    def __init__(self, observation_space, action_space=gym.spaces.Box(-1, 1, (2,))):  # noqa: B008
+        self.observation_space, self.action_space = observation_space, action_space
+        self.observation, self.reward = observation_space.sample(), 1.0
+
+    def reset(self, *, seed=None, options=None):
+        return self.observation, {}
+
+    def step(self, action):
+        return self.observation, self.reward, True, False, {"some": "info"}
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        BOX,
+        gym.spaces.Box(0, 255, (2, 3), np.uint8),
+        gym.spaces.Dict({"a": BOX, "b": gym.spaces.Discrete(4)}),
+        gym.spaces.Tuple([gym.spaces.MultiBinary(2), BOX]),
+        gym.spaces.Discrete(5),
+    ],
+)
+def test_make_flat_makes_observations_vectors(space):
+    inner = Given(space)
+    env = make_flat(inner)
+    assert isinstance(env.observation_space, gym.spaces.Box)
+    assert len(env.observation_space.shape) == 1
+    for observation in (env.reset()[0], env.step(None)[0]):
+        np.testing.assert_array_equal(observation, gym.spaces.flatten(space, inner.observation))
+        assert env.observation_space.contains(observation)
+    flattened = isinstance(env.env, FlattenObservation)
+    assert flattened == (space is not BOX)  # a vector passes as it is
+
+
+@pytest.mark.parametrize(
+    ("observations", "actions", "word"),
+    [
+        (gym.spaces.Sequence(BOX), BOX, "Box observations of numbers"),
+        (gym.spaces.Box(0, 1, (1,), np.bool_), BOX, "Box observations of numbers"),
+        (BOX, gym.spaces.Discrete(3), "Box actions of floats"),
+        (BOX, gym.spaces.Box(-1, 1, (1,), np.int32), "Box actions of floats"),
+        (BOX, gym.spaces.Box(-1, 1, (2, 2)), "in one dimension"),
+    ],
+)
+def test_make_flat_refuses_what_networks_cannot_take(observations, actions, word):
+    with pytest.raises(ValueError, match=word) as error:
+        make_flat(Given(observations, actions))
+    assert str(actions if "actions" in word or "dim" in word else observations) in str(error.value)
+
+
+@pytest.mark.parametrize("reward", [2, np.float32(2), np.array([2.0], np.float32), np.array(2)])
+def test_rewards_are_floats(reward):
+    env = FiniteNumbers(Given(BOX))
+    env.env.reward = reward
+    observation, number, terminated, truncated, info = env.step(None)
+    assert (number, type(number)) == (2, float)
+    np.testing.assert_array_equal(observation, env.env.observation)
+    assert observation.dtype == np.float32
+    assert (terminated, truncated, info) == (True, False, {"some": "info"})
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_finite_numbers_stop_at_what_is_not_finite(bad):
+    env = make_noisy(make_flat(Given(BOX)), [A], [1.0])  # beneath noise
+    for _ in range(2):  # steps are those of the episode
+        env.reset()
+        for _ in range(3):
+            env.step(None)
+    env.unwrapped.reward = bad
+    with pytest.raises(NotFiniteError, match=f"step 4 of an episode.*reward {bad}"):
+        env.step(None)
+    env.unwrapped.reward, env.unwrapped.observation = 1.0, np.array([0.5, bad, 0.5])
+    with pytest.raises(NotFiniteError, match=rf"observation \[0.5, {bad}, 0.5\]"):
+        env.step(None)
+    with pytest.raises(NotFiniteError, match="step 0 of an episode"):
+        env.reset()
+
+
+def test_finite_numbers_tell_a_divergence_from_a_broken_environment():
+    env = FiniteNumbers(Given(BOX))
+    env.env.reward = np.nan
+    with pytest.raises(NotFiniteError, match=r"was given the action \[0.0, nan\]"):
+        env.step(np.array([0, np.nan]))
+    with pytest.raises(NotFiniteError, match="returned the reward nan"):
+        env.step(np.zeros(2))
+
+
+def test_observations_are_arrays_of_their_own():
+    """Some environments write every observation into the same array."""
+    env = FiniteNumbers(numbered_env(reuse=True))
+    seen = [env.reset()[0], *(env.step(0)[0] for _ in range(3))]
+    assert [observation.flat[0] for observation in seen] == [1, 2, 3, 4]
+
+
+def test_finite_numbers_are_part_of_the_spec():
+    env = gym.make(make_flat(gym.make("Pendulum-v1")).spec)
+    assert isinstance(env, FiniteNumbers)
+    assert env.spec.max_episode_steps == 200
+
+
+def pendulum():
+    """Return an environment whose own actions are rescaled, with noise, and a generator."""
+    env = gym.make("Pendulum-v1", max_episode_steps=7)
+    env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
+    env = make_noisy(env, [A, B, "RandomEarlyTermination(2, 5)"], [0.5, 0.5, 0.5])
+    env.action_space.seed(1)
+    env.reset(seed=1)
+    return env, np.random.default_rng(1)
+
+
+def play_on(env, rng, episodes):
+    """Return all that happens in some episodes."""
+    seen = []
+    for _ in range(episodes):
+        seen.append((*env.reset()[0].tolist(), rng.random()))
+        ended = False
+        while not ended:
+            observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+            seen.append((*observation.tolist(), reward, terminated, truncated, info.get("noise")))
+            ended = terminated or truncated
+    counts = [(w.times_applied, w.opportunities) for w in noise_wrappers(env).values()]
+    return seen, counts, list(env.get_wrapper_attr("return_queue"))
+
+
+def test_an_env_state_continues_what_was_interrupted():
+    env, rng = pendulum()
+    play_on(env, rng, 4)
+    saved = copy.deepcopy(EnvState(env, rng).state_dict())
+    expected = play_on(env, rng, 5)
+    assert len(expected[2]) == 9
+    other, other_rng = pendulum()
+    play_on(other, other_rng, 2)
+    EnvState(other, other_rng).load_state_dict(saved)
+    assert play_on(other, other_rng, 5) == expected
+
+
+def mersenne(seed):
+    return np.random.Generator(np.random.MT19937(seed))
+
+
+@pytest.mark.parametrize("make_generator", [np.random.default_rng, np.random.RandomState, mersenne])
+def test_an_env_state_has_only_pythons_own_types(make_generator):
+    """dm_control's environments have a RandomState, whose state holds an array."""
+    env, rng = pendulum()
+    env.unwrapped.np_random = make_generator(3)
+    play_on(env, rng, 2)
+    env.unwrapped.np_random.normal(size=3)  # a RandomState keeps every second one
+    saved = json.loads(json.dumps(EnvState(env, rng).state_dict()))
+    expected = env.unwrapped.np_random.normal(size=5).tolist()
+    env.unwrapped.np_random = make_generator(4)
+    EnvState(env, rng).load_state_dict(saved)
+    assert env.unwrapped.np_random.normal(size=5).tolist() == expected
+
+
+def test_an_env_state_of_another_stack_is_refused():
+    env, rng = pendulum()
+    saved = EnvState(env, rng).state_dict()
+    with pytest.raises(ValueError):
+        EnvState(env).load_state_dict(saved)
+    bare = gym.make("Pendulum-v1")
+    bare.reset(seed=1)
+    assert EnvState(bare).state_dict()["returns"] == []
+    with pytest.raises(ValueError):
+        EnvState(bare, rng).load_state_dict(saved)
