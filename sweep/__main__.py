@@ -218,7 +218,10 @@ def main(view, caller, argv):
         table([(p.reason, str(p.log.path), p.log.last_line) for p in named])
     show_slowest(runs, progresses)
     if choices and over:
-        print(*choose.conclusion(choices, args.runs_dir), sep="\n")
+        rows = choose.rows(choices)
+        if rows:
+            choose.write_choice(Path(args.runs_dir, "choice.csv"), rows)
+        print(*choose.conclusion(choices), sep="\n")
     elif choices:
         print(*choose.standing(choices), sep="\n")
     if over and any(p.state == "done" for p in progresses):

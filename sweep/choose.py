@@ -9,7 +9,6 @@ import fcntl
 import itertools
 import json
 import os
-from pathlib import Path
 from statistics import fmean
 from typing import NamedTuple
 
@@ -236,23 +235,28 @@ def standing(found):
     yield total(found)
 
 
-def conclusion(found, runs_dir):
-    """Yield the verdicts, one line for each choice, and write choice.csv.
+def conclusion(found):
+    """Yield the verdicts, one line for each choice.
 
     While runs of a choice are left, there is none: then say what to do about them.
     """
     if any(choice.state.due for choice in found):
         for choice in found:
             yield obstacle(choice) if choice.state.due else describe(choice)
-        return
-    rows = []
-    judgements = judged(found)
-    for choice, (comparison, p) in zip(found, judgements, strict=True):
+    else:
+        yield from verdicts(found, judged(found))
+
+
+def rows(found):
+    """Return the rows of choice.csv; there are none while runs of a choice are left."""
+    if any(choice.state.due for choice in found):
+        return []
+    result = []
+    for choice, (comparison, p) in zip(found, judged(found), strict=True):
         names = choice.algorithm.upper(), choice.env_id
         helped = halving.helps(comparison, p)
-        rows += halving.rows(*names, choice.state, choice.returns, helped)
-    write_choice(Path(runs_dir, "choice.csv"), rows)
-    yield from verdicts(found, judgements)
+        result += halving.rows(*names, choice.state, choice.returns, helped)
+    return result
 
 
 def judged(found):

@@ -441,7 +441,8 @@ def undisturbed(tmp_path_factory):
     """The choice that the sweeps below should make, from run folders made in this process."""
     folder = tmp_path_factory.mktemp("undisturbed")
     play(*CHOOSE, "--runs-dir", str(folder))
-    return *chosen(folder), verdicts(view("report", *CHOOSE, "--runs-dir", folder).out)
+    said = verdicts(view("report", *CHOOSE, "--runs-dir", folder).out)  # writes choice.csv
+    return *chosen(folder), said
 
 
 @pytest.mark.slow

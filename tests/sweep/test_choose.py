@@ -278,6 +278,13 @@ def arguments(text, tmp_path):
     return args
 
 
+def conclude(args, folder):
+    """What `report` does with a choice that is over: write choice.csv, and say the verdicts."""
+    found = choose.choices(args)
+    choose.write_choice(folder / "choice.csv", choose.rows(found))
+    return list(choose.conclusion(found))
+
+
 def batches(args):
     """Run a choice to its end in this process; returns the names of its folders, batch by batch."""
     found = []
@@ -311,7 +318,7 @@ def test_two_algorithms_and_environments_at_once(tmp_path):
     assert set().union(*found) == {path.name for path in tmp_path.glob("*__*")}
     assert all("_s1_" in name for name in found[0])
     assert all("_s2_" in name for name in found[1])
-    sentences = list(choose.conclusion(choose.choices(args), tmp_path))
+    sentences = conclude(args, tmp_path)
     assert [sentence.partition(":")[0] for sentence in sentences] == [
         f"{algorithm} on {env}"
         for algorithm in ("PPO", "SAC")
@@ -437,14 +444,14 @@ def test_another_choice_keeps_the_lines_of_the_first(tmp_path):
         tmp_path,
     )
     batches(first)
-    list(choose.conclusion(choose.choices(first), tmp_path))
+    conclude(first, tmp_path)
     before = read(tmp_path / "choice.csv")
     second = arguments(
         f"--algos | sac | --envs | Pendulum-v1 | --noises | {A}@1 | --confirm | 4", tmp_path
     )
     assert [len(batch) for batch in batches(second)] == [8]  # one noise needs no search
     for _ in range(2):
-        [sentence] = choose.conclusion(choose.choices(second), tmp_path)
+        [sentence] = conclude(second, tmp_path)
         assert sentence.startswith(f"SAC on Pendulum-v1: {A} at 1.0 ")
         lines = read(tmp_path / "choice.csv")
         assert lines[:-2] == before
@@ -502,4 +509,4 @@ def test_status_says_who_survives(tmp_path):
     [verdict] = choose.standing(finished)
     assert verdict.startswith("PPO on Pendulum-v1: ") and "4 fresh seeds" in verdict
     assert not (tmp_path / "choice.csv").exists()  # the status only looks
-    assert [verdict] == list(choose.conclusion(finished, tmp_path))
+    assert [verdict] == list(choose.conclusion(finished))
