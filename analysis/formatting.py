@@ -89,6 +89,9 @@ def shown(table):
         for name in frame
     }
     text = pd.DataFrame(cells, dtype=object)
+    if "n_baseline_most" in text:  # over several environments: "10 to 50"
+        most = text.pop("n_baseline_most")
+        text["n_baseline"] += (" to " + most).where(most != text["n_baseline"], "")
     for title, parts in MERGED.items():
         if parts[-1] in text:
             text[parts[0]] = merged(title, parts, frame, text)

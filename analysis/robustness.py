@@ -8,7 +8,7 @@ run's mean return under a condition and C the mean clean return of the policies 
 noise in that environment, averaged equally over the conditions. A condition counts if it is not
 clean, none of its wrappers was in training, and none is reward noise or early termination, which
 change no policy's behaviour in a test. It is compared with the score of the policies trained
-without noise under the same conditions, by the exact Mann-Whitney test, stratified over
+without noise under the same conditions, by the exact test of the mean win rate over
 environments, with Holm's correction over the training configurations of an algorithm.
 """
 
@@ -18,9 +18,16 @@ import numpy as np
 import pandas as pd
 
 from analysis.configurations import BASELINE, Configuration
-from analysis.formatting import P_VALUE, WHOLE, Table
+from analysis.formatting import P_VALUE, SHARE, WHOLE, Table
 from analysis.runs import KEYS, STUDY, study_name
-from analysis.statistics import contrast, holm, improvement_percent, mann_whitney, mean_std
+from analysis.statistics import (
+    contrast,
+    holm,
+    improvement_percent,
+    mann_whitney,
+    mean_std,
+    probability_of_improvement,
+)
 from analysis.verdicts import DETECTABLE, LEVEL, counted, p_value
 
 FILES = ("robustness.csv", "robustness.csv.gz")
@@ -31,12 +38,13 @@ RUN_COLUMNS = [*KEYS, "configuration", "seed", *CONDITION, "condition", "mean", 
 COLUMNS = [*KEYS, *CONDITION, "tested_on", "n", "mean", "std", "change_percent", "cvar"]
 SCORE_COLUMNS = [*STUDY, "scope", "environment", "noise", "noise_rate", "n", "n_baseline"]
 SCORE_COLUMNS += ["conditions", "score", "baseline_score"]
-SCORE_COLUMNS += ["difference", "difference_low", "difference_high", "p", "p_holm"]
+SCORE_COLUMNS += ["difference", "difference_low", "difference_high"]
+SCORE_COLUMNS += ["win_rate", "p", "p_holm"]
 SCORE_COLUMNS += ["smallest_p", "detectable"]
 SCORE_COLUMNS += ["clean_change_percent", "cvar_score", "baseline_cvar_score"]
 SCORE_COLUMNS += ["worst_score", "baseline_worst_score", "worst_condition"]
 FORMATS = dict.fromkeys(("n", "n_baseline", "conditions"), WHOLE)
-FORMATS |= dict.fromkeys(("p", "p_holm", "smallest_p"), P_VALUE)
+FORMATS |= dict.fromkeys(("p", "p_holm", "smallest_p"), P_VALUE) | {"win_rate": SHARE}
 
 CAPTIONS = {
     "robustness_score": """Primary figure of robustness: the score on noise that was not in
@@ -44,10 +52,11 @@ training. Score: 100 (R - C) / |C|, averaged equally over the test conditions th
 have no wrapper of the training (and neither reward noise nor early termination), where R is the
 mean return of a run under a condition and C the mean clean return of the policies trained without
 noise. Baseline score: the same of the policies trained without noise, under the same conditions.
-[ ]: 95 % interval (Welch, Satterthwaite). p: exact Mann-Whitney test between the two, stratified by
-environment; Holm: corrected for the training configurations of an algorithm; smallest p: what these
-numbers of seeds could reach at most; detectable: the difference that they find with 80 % power, for
-normal scores. Rows of one
+[ ]: 95 % interval (Welch, Satterthwaite). Win rate: how often a policy has a higher score than one
+trained without noise, averaged over environments. p: its exact two-sided test, in one environment
+Mann and Whitney's; it decides where the interval says otherwise. Holm: corrected for the training
+configurations of an algorithm; smallest p: what these numbers of seeds could reach at most;
+detectable: the difference that they find with 80 % power, for normal scores. Rows of one
 environment are secondary where there is one of all. Clean change: how much better or worse the
 policies are without any noise, so that a better policy is not taken for a more robust one. Worst:
 the lowest score under one condition. CVaR: the score of the worst tenth of the episodes of each
@@ -208,9 +217,9 @@ def score_row(study, scope, environment, config, scores):
     cells = [part["x"] for part in found] + [part["y"] for part in found]
     weights = [1 / len(found)] * len(found) + [-1 / len(found)] * len(found)
     difference, error, low, high = contrast(cells, weights)
-    p, smallest_p = mann_whitney(
-        stacked(part["x"] for part in found), stacked(part["y"] for part in found)
-    )
+    x, y = (stacked(part[name] for part in found) for name in ("x", "y"))
+    p, smallest_p = mann_whitney(x, y)
+    win_rate, _, _ = probability_of_improvement(x, y)
     worst = {
         (name, condition): value
         for name, part in scores.items()
@@ -236,6 +245,7 @@ def score_row(study, scope, environment, config, scores):
         "difference": difference,
         "difference_low": low,
         "difference_high": high,
+        "win_rate": win_rate,
         "p": p,
         "smallest_p": smallest_p,
         "detectable": DETECTABLE * error,
@@ -287,7 +297,7 @@ def robustness_sentences(scores):
         study = study_name(row.algorithm, row.settings, row.phase)
         verdict = "no clear difference in robustness to new noise"
         if row.p <= LEVEL:
-            more = "more" if row.difference > 0 else "less"
+            more = "more" if row.win_rate > 0.5 else "less"
             verdict = f"{'' if row.p_holm <= LEVEL else 'perhaps '}{more} robust to new noise"
         limit = ""
         if row.smallest_p > LEVEL:

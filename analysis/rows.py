@@ -140,6 +140,7 @@ def against_baseline(x, y):
         "environments": x.shape[1],
         "n": np.isfinite(x).sum(axis=0).min(),
         "n_baseline": np.isfinite(y).sum(axis=0).min(),
+        "n_baseline_most": np.isfinite(y).sum(axis=0).max(),
         "improvement_iqm_percent": improvement,
         "improvement_low": improvement_low,
         "improvement_high": improvement_high,

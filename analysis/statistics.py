@@ -5,7 +5,7 @@ NaN marks a run that does not exist. IQM and probability of improvement are thos
 """
 
 from functools import cache, reduce
-from math import comb, prod
+from math import comb, lcm, prod
 
 import numpy as np
 from scipy import stats
@@ -13,6 +13,8 @@ from scipy.optimize import brentq
 
 MIN_SEEDS = 3  # with fewer there is no interval
 RESAMPLES = 2000
+PERMUTATIONS = 100_000  # where a null distribution has more than MOST_VALUES
+MOST_VALUES = 20_000
 # Seeds -> percent of simulated samples whose 95 % interval holds the true IQM: the worst of normal
 # and skewed returns and of returns of which 20 % lie in a low peak; and the worst where 40 % do
 # (tests/test_statistics.py::test_coverage, 500 samples each).
@@ -146,18 +148,63 @@ def mann_whitney_null(n, m):
     return null
 
 
-def mann_whitney(x, y):
-    """Exact two-sided Mann-Whitney test, stratified by environment: p, and the smallest possible p.
+@cache
+def win_rate_null(sizes):
+    """Probabilities of the mean win rate over environments when all orders are equally likely.
 
-    The statistic is the sum of U over environments; its null distribution is the convolution of
-    theirs. x (seeds x envs), y (seeds x envs) -> p, smallest p = 2 / prod over envs of C(n+m, n).
+    sizes: (n, m) of each environment -> probabilities of 0 ... `unit`, unit: a mean win rate is one
+    of these numbers divided by `unit`. Win rates are U / (n m); the least common multiple of all
+    n m makes them whole. (None, unit) if there are more than MOST_VALUES.
+    """
+    scale = lcm(*(n * m for n, m in sizes))
+    unit = scale * len(sizes)
+    if unit > MOST_VALUES:
+        return None, unit
+    stretched = []
+    for n, m in sizes:
+        null = np.zeros(scale + 1)
+        null[:: scale // (n * m)] = mann_whitney_null(n, m)
+        stretched.append(null)
+    return reduce(np.convolve, stretched), unit
+
+
+@cache
+def permuted_win_rates(sizes):
+    """Draw the mean win rate of PERMUTATIONS random orders, with a fixed seed.
+
+    sizes: (n, m) of each environment -> (PERMUTATIONS,).
+    """
+    rng = np.random.default_rng(0)
+    rates = [
+        rng.choice(n * m + 1, PERMUTATIONS, p=mann_whitney_null(n, m)) / (n * m) for n, m in sizes
+    ]
+    return np.mean(rates, axis=0)
+
+
+def mann_whitney(x, y):
+    """Exact two-sided test of the mean win rate over environments: p, and the smallest possible p.
+
+    Every environment counts alike, whatever its number of seeds, and the direction is that of
+    probability_of_improvement, which is the same statistic. In one environment this is Mann and
+    Whitney's test. Where there are too many possible values p is from PERMUTATIONS random orders.
+
+    x (seeds x envs), y (seeds x envs) -> p, smallest p.
     """
     pairs = list(zip(columns(x), columns(y), strict=True))
-    sizes = [(len(a), len(b)) for a, b in pairs]
-    u = sum(wins(a, b) for a, b in pairs)
-    null = reduce(np.convolve, [mann_whitney_null(n, m) for n, m in sizes])
-    below, above = null[: int(np.ceil(u)) + 1].sum(), null[int(np.floor(u)) :].sum()
+    sizes = tuple((len(a), len(b)) for a, b in pairs)
     smallest = 2 / prod(comb(n + m, n) for n, m in sizes)
+    rate = np.mean([wins(a, b) / (len(a) * len(b)) for a, b in pairs])
+    null, unit = win_rate_null(sizes)
+    if null is None:
+        drawn = permuted_win_rates(sizes)
+        below = (1 + (drawn <= rate + 1e-12).sum()) / (1 + PERMUTATIONS)
+        above = (1 + (drawn >= rate - 1e-12).sum()) / (1 + PERMUTATIONS)
+        smallest = max(smallest, 2 / (1 + PERMUTATIONS))
+    else:
+        place = round(float(rate) * unit, 6)
+        possible = np.flatnonzero(null)  # between two of them, where runs are tied: the milder one
+        below = null[: possible[np.searchsorted(possible, place)] + 1].sum()
+        above = null[possible[np.searchsorted(possible, place, side="right") - 1] :].sum()
     return min(1.0, 2 * min(below, above)), min(1.0, smallest)
 
 

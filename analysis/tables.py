@@ -10,7 +10,11 @@ from analysis.formatting import P_VALUE, PLAIN, SHARE, WHOLE, Table
 from analysis.luck import (
     CONSISTENT_PERCENT,
     DRAWS,
+    FALSE_ALARMS,
+    FALSE_ALARMS_IN_THE_PAPER,
     LUCKY,
+    POWER_IN_THE_PAPER,
+    POWER_OF_BEST,
     SEEDS_TO_RESAMPLE,
     add_luck_of_best,
     add_luck_of_consistent,
@@ -31,6 +35,8 @@ from analysis.statistics import (
     COVERAGE,
     COVERAGE_OF_MIXTURES,
     MIN_SEEDS,
+    MOST_VALUES,
+    PERMUTATIONS,
     holm,
 )
 from analysis.verdicts import counted, verdict
@@ -55,13 +61,13 @@ _COLUMNS = {
     "early_performance": "environment noise steps_millions noise_rate mean std n",
     "statistics": """scope environment noise noise_rate verdict improvement_iqm_percent
         improvement_low improvement_high p p_adjusted comparisons probability_of_improvement
-        probability_low probability_high environments n n_baseline iqm iqm_low iqm_high
-        detectable_percent seeds_needed smallest_p smallest_p_adjusted""",
+        probability_low probability_high environments n n_baseline n_baseline_most
+        iqm iqm_low iqm_high detectable_percent seeds_needed smallest_p smallest_p_adjusted""",
 }
 COLUMNS = {name: [*STUDY, *text.split()] for name, text in _COLUMNS.items()}
 _COLUMNS_WITH = {
-    WHOLE: """n n_baseline environments chosen_from configurations seeds seeds_needed
-        steps_to_baseline percent_of_environments best_beyond_luck consistent
+    WHOLE: """n n_baseline n_baseline_most environments chosen_from configurations seeds
+        seeds_needed steps_to_baseline percent_of_environments best_beyond_luck consistent
         consistent_beyond_luck consistently_worse consistently_worse_beyond_luck""",
     P_VALUE: """p p_adjusted smallest_p smallest_p_adjusted p_luck paper_p_luck p_consistent
         p_consistently_worse""",
@@ -157,6 +163,11 @@ def family_notes(statistics):
     return notes
 
 
+def listed(numbers):
+    """Spell numbers for a sentence: "7, 13, 26"."""
+    return ", ".join(map(str, numbers))
+
+
 CAPTIONS = {
     "best": """Best noise tried for each algorithm and environment, which may be worse than none,
 against the baseline without noise: final test return, mean \u00b1 sample standard deviation over n
@@ -181,8 +192,12 @@ distribution with the pooled standard deviation within configurations (from {SEE
 seeds of the baseline on with the shape of their returns). By luck: the mean number of rows in the
 tables of consistent and consistently worse noise, and its 95 % quantile; p: the probability of at
 least as many rows as observed. Beyond luck: rows with a p luck of {LUCKY} or less. Configurations
-are those in two or more environments. Where returns have a long tail of high ones the best of many
-is higher by luck than a normal distribution says.""",
+are those in two or more environments. The p luck of a best noise is right for normal returns of
+equal spread: that of 90 useless configurations is then {LUCKY} or less in 5 % of simulated studies.
+Where a fifth of the runs end around a second, higher peak, it is in {FALSE_ALARMS[5]} % with five
+seeds and {FALSE_ALARMS[10]} % with ten. One configuration of 90 with a true gain of 1, 1.5 and 2
+standard deviations is beyond luck in {listed(POWER_OF_BEST[5])} % of studies with five seeds, and
+in {listed(POWER_OF_BEST[10])} % with ten.""",
     "early_performance": """Test return during training, by noise rate (0.00 is the baseline):
 mean \u00b1 sample standard deviation over (n) seeds.""",
     "summary": """Final test return of every configuration: mean \u00b1 sample standard deviation
@@ -198,12 +213,14 @@ environment they held the true IQM in at least
 {", ".join(f"{c} % (n = {n})" for n, c in COVERAGE.items())} of the cases where returns were
 normal, skewed or 20 % of them in a low peak, but in
 {", ".join(f"{c} % (n = {n})" for n, c in COVERAGE_OF_MIXTURES.items())} where 40 % were in a low
-and narrow peak. P(improvement):
-probability that a noisy run beats a baseline run, averaged over environments, with Newcombe's
-interval. No interval for n < {MIN_SEEDS}. p: exact two-sided Mann-Whitney test, stratified by
-environment. It is the primary test: where an interval says otherwise, p decides. In a full grid the
-rows of all environments together are primary: in one environment alone no configuration with five
-seeds can reach 0.05 on its own after the adjustment. p adjusted: Benjamini-Hochberg over one
+and narrow peak. P(improvement): probability that a noisy run beats a baseline run, averaged over
+environments, with Newcombe's interval. No interval for n < {MIN_SEEDS}. p: exact two-sided
+Mann-Whitney test; over several environments the test of P(improvement), in which every environment
+counts alike ({PERMUTATIONS:,} random orders with a fixed seed where the exact distribution has more
+than {MOST_VALUES:,} values). The test decides, also where an interval says otherwise: that of the
+improvement is for the interquartile mean. In a full grid the rows of all environments together are
+primary: in one environment alone no configuration with five seeds can reach 0.05 on its own after
+the adjustment. p adjusted: Benjamini-Hochberg over one
 family, all configurations of an algorithm in one environment, or in all of them together; the
 verdict is better or worse where it is at most 0.05, and perhaps so where only p is. Smallest p
 adjusted: what one configuration alone could reach at most with its number of seeds. Detectable: the
@@ -216,7 +233,8 @@ least 3 seeds (n is the smallest number), with a 95 % interval (Welch, Satterthw
 percent of |mean without noise|. Above zero, both together are better than their two effects added
 up. This is descriptive: nothing is corrected for the number of rows.""",
     "choice": """How ./benchmark.sh choose came to its noise: rounds of the search, in which the
-better half survives (score: mean over the seeds of the last three tests), and the confirmation of
+better half survives (score: mean over the seeds, and over each run's tests in the last 15 % of its
+steps), and the confirmation of
 the winner on fresh seeds (1001 and up; score: mean final test return; survives: whether it was
 shown to be better than no noise). Search and confirmation have rows of their own everywhere, and
 only the confirmation is judged: the search's seeds chose the noise, which flatters it.""",
@@ -224,7 +242,12 @@ only the confirmation is judged: the search's seeds chose the noise, which flatt
 that at least half of an algorithm's configurations with noise have, and baselines.""",
     "compare_luck": f"""The same for the paper's tables: {PAPER_CONFIGURATIONS} configurations in
 each environment. Only means and standard deviations are printed there, so returns are taken as
-normal, with the standard deviation of each baseline, known from 5 seeds (PPO 10).""",
+normal, with the standard deviation of each baseline, known from 5 seeds (PPO 10). Where a fifth of
+the runs end around a second, higher peak, the best of 90 useless configurations has a p luck of
+{LUCKY} or less in {FALSE_ALARMS_IN_THE_PAPER[5]} % of studies with five seeds and
+{FALSE_ALARMS_IN_THE_PAPER[10]} % with ten; one with a true gain of 1, 1.5 and 2 standard deviations
+in {listed(POWER_IN_THE_PAPER[5])} % and {listed(POWER_IN_THE_PAPER[10])} %, if returns are
+normal.""",
     "compare": """The paper's table (environments v2, 1,000,000 steps) beside ours, with the
 difference in standard errors where the steps are the same; listed by: whose table has the row.
 Paper: luck: see the table of luck. Ours:""",

@@ -21,7 +21,7 @@ import numpy as np
 
 from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED
 from analysis.statistics import bootstrap_iqm, mann_whitney, probability_of_improvement
-from analysis.verdicts import interval, p_value, percent, power
+from analysis.verdicts import UNCLEAR, disagrees, interval, p_value, percent, power
 
 LEVEL = 0.05  # of a verdict, two-sided, over all verdicts of one command
 BASELINE = ("", "0.0")
@@ -172,21 +172,24 @@ def verdict(name, noises, comparison, p_corrected, verdicts):
         change = f"{percent(comparison.improvement)} {interval(comparison.low, comparison.high)}"
         evidence = f"{change}, {evidence}"
     start = f"{name}:"
+    better = "better" if comparison.probability > 0.5 else "worse"
+    direction = better if comparison.p <= LEVEL else UNCLEAR
+    end = f".{disagrees(direction, comparison.low, comparison.high)}"
     if helps(comparison, p_corrected):
         chance = f"a run with it beats one without with probability {comparison.probability:.2f}"
-        return f"{start} {named} beats no noise: {seeds}, {evidence}; {chance}."
+        return f"{start} {named} beats no noise: {seeds}, {evidence}; {chance}{end}"
     if noises == 1:
         start += f" {named} could not be shown to help"
     else:
         start += f" none of {noises} noises could be shown to help; the best of them, {named}"
     if p_corrected <= LEVEL:
-        return f"{start}, is worse than no noise: {seeds}, {evidence}."
+        return f"{start}, is worse than no noise: {seeds}, {evidence}{end}"
     text = f"{start}: {seeds}, {evidence}"
     if math.isfinite(comparison.detectable):
         difference = percent(comparison.detectable, sign="")
         text += f"; with {comparison.seeds} seeds a difference of {difference} would have been seen"
-        text += " (80 % power)"
-    return f"{text}."
+        text += " (80 % power before the correction)" if verdicts > 1 else " (80 % power)"
+    return f"{text}{end}"
 
 
 def rows(algorithm, environment, state, returns, helped):

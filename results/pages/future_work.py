@@ -53,10 +53,15 @@ def comparisons(cases):
     return {"table": markdown(table), "holm": list(corrected)}
 
 
+def all_returns(runs, config):
+    """Return the test returns (n,) of a (noise, noise_rate), of all seeds."""
+    noise, noise_rate = config
+    return runs[(runs["noise"] == noise) & (runs["noise_rate"] == noise_rate)]["test"].to_numpy()
+
+
 def against_all(x, runs, config):
     """Compare x with the runs of a (noise, noise_rate) of all seeds, not of those of x alone."""
-    noise, noise_rate = config
-    y = runs[(runs["noise"] == noise) & (runs["noise_rate"] == noise_rate)]["test"]
+    y = all_returns(runs, config)
     return compare_rows("", x, y)[1] | {"n": len(y)}
 
 
@@ -145,6 +150,7 @@ def together(runs):
         "low": low,
         "high": high,
         "detectable": DETECTABLE * error,
+        "gain": against_all(all_returns(runs, ALWAYS), runs, NOTHING)["difference"],
         "all": against_all(both, runs, NOTHING),
         "cost": core_hours("schedules/*NoisyObservation_0.001*"),
     }

@@ -155,7 +155,7 @@ def own_noise(found):
     """Compare policies with those trained without noise under the noise of their own training.
 
     One rate in the test at a time: {noise: {rate: {...}}} with the difference of the scores,
-    averaged over environments, and the exact p, stratified by environment.
+    averaged over environments, and the exact p.
     """
     without = found[found["noise"] == ""]
     clean = without[without["test_noise"] == ""].groupby("environment")["mean"].mean()

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import simulate_choose
 from scipy import stats
 from test_analyze import FINALS, SCALE, row, run, small_sweep
 
@@ -161,6 +162,43 @@ def test_useless_noise_in_a_paper_is_beyond_luck_in_five_percent_of_studies(n, m
         lucks = analysis.luck.luck_of_paper(table, {"PPO": n}, 90)
         p.append(analysis.luck.add_luck_of_best(table, lucks)["p_luck"].item())
     assert 0.03 <= (np.array(p) <= 0.05).mean() <= 0.08
+
+
+@pytest.mark.parametrize("n", [5, 10])
+def test_the_captions_say_how_often_p_luck_is_wrong_and_how_often_it_finds_an_effect(
+    n, monkeypatch
+):
+    monkeypatch.setattr(analysis.luck, "DRAWS", 1000)
+    own, paper = p_of_the_best(n, 0, simulate_choose.two_peaked)
+    assert own == pytest.approx(analysis.luck.FALSE_ALARMS[n], abs=5)
+    assert paper == pytest.approx(analysis.luck.FALSE_ALARMS_IN_THE_PAPER[n], abs=6)
+    own, paper = p_of_the_best(n, 1.5, simulate_choose.normal)
+    assert own == pytest.approx(analysis.luck.POWER_OF_BEST[n][1], abs=8)
+    assert paper == pytest.approx(analysis.luck.POWER_IN_THE_PAPER[n][1], abs=8)
+    for name, found in (("luck", "POWER_OF_BEST"), ("compare_luck", "POWER_IN_THE_PAPER")):
+        powers = ", ".join(map(str, getattr(analysis.luck, found)[n]))
+        assert f"{powers} %" in analysis.tables.CAPTIONS[name]
+
+
+def p_of_the_best(n, gain, draw, studies=300):
+    """Percent of studies of 90 configurations, one with a true gain, whose best is beyond luck.
+
+    As analyze.py judges its own runs, and as it judges the paper's table.
+    """
+    rng, own, paper = np.random.default_rng(0), 0, 0
+    for _ in range(studies):
+        baseline, noisy = 20 + draw(rng, (n, 1)) / 10, 20 + draw(rng, (90, n, 1)) / 10
+        noisy[0] += gain / 10
+        best = 100 * (noisy.mean(axis=1).max() / baseline.mean() - 1)
+        lucks = analysis.luck.luck_of_study(make_study(baseline, noisy))
+        own += analysis.luck.p_value(lucks.best["Env0-v0"], best) <= analysis.luck.LUCKY
+        row = STUDY | {"environment": "Env0-v0", "improvement_percent": best}
+        row |= {"baseline_mean": baseline.mean(), "baseline_std": baseline.std(ddof=1)}
+        lucks = analysis.luck.luck_of_paper(pd.DataFrame([row]), {"PPO": n}, 90)
+        paper += (
+            analysis.luck.p_value(lucks["PPO", "", ""].best["Env0-v0"], best) <= analysis.luck.LUCKY
+        )
+    return 100 * own / studies, 100 * paper / studies
 
 
 # -------------------------------------------------------------------------------------- tables

@@ -1,5 +1,7 @@
 """The intervals of analyze.py in simulations: how often they are wrong, and for which returns."""
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -159,3 +161,86 @@ def test_seeds_that_are_all_alike_have_an_interval_of_one_point():
         50,
         50,
     )
+
+
+# ---------------------------------------------------------------- the test of the mean win rate
+
+
+def stacked(*environments):
+    """Put samples of several environments side by side: (seeds x envs), NaN where there is none."""
+    table = np.full((max(map(len, environments)), len(environments)), np.nan)
+    for e, values in enumerate(environments):
+        table[: len(values), e] = values
+    return table
+
+
+def all_mean_win_rates(*sizes):
+    """Mean win rates under every order of the runs, one array entry for each order."""
+    rates = np.zeros(1)
+    for n, m in sizes:
+        found = []
+        for chosen in combinations(range(n + m), n):
+            others = [i for i in range(n + m) if i not in chosen]
+            found.append(statistics.wins(np.array(chosen), np.array(others)) / (n * m))
+        rates = np.add.outer(rates, found).ravel()
+    return rates / len(sizes)
+
+
+def test_p_is_that_of_all_orders_where_environments_differ_in_their_seeds():
+    rng, sizes = np.random.default_rng(0), [(2, 3), (3, 3), (2, 5)]
+    null = all_mean_win_rates(*sizes)
+    for _ in range(20):
+        x = stacked(*(rng.normal(0.5, 1, n) for n, _ in sizes))
+        y = stacked(*(rng.normal(0, 1, m) for _, m in sizes))
+        rate, _, _ = statistics.probability_of_improvement(x, y)
+        tails = (null <= rate + 1e-9).mean(), (null >= rate - 1e-9).mean()
+        p, smallest = statistics.mann_whitney(x, y)
+        assert p == pytest.approx(min(1, 2 * min(tails)))
+        assert smallest == pytest.approx(2 / len(null))
+
+
+def test_the_direction_of_a_verdict_is_that_of_its_test():
+    """0.94 of 10 against 10 are won, none of 3 against 3: the sum of U would have p = 0.0022."""
+    ten = np.arange(10.0)
+    x = stacked(ten + 6.2, [1.0, 2, 3])
+    y = stacked(ten, [4.0, 5, 6])
+    assert statistics.wins(x[:, 0], y[:, 0]) == 94
+    rate, _, _ = statistics.probability_of_improvement(x, y)
+    assert rate == pytest.approx(0.47)
+    assert statistics.mann_whitney(x, y)[0] > 0.7
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        sizes = rng.integers(3, 12, (3, 2))
+        shift = rng.normal(0, 1.5, 3)
+        x = stacked(*(rng.normal(s, 1, n) for (n, _), s in zip(sizes, shift, strict=True)))
+        y = stacked(*(rng.normal(0, 1, m) for _, m in sizes))
+        p, _ = statistics.mann_whitney(x, y)
+        rate, _, _ = statistics.probability_of_improvement(x, y)
+        if p <= 0.05:
+            assert abs(rate - 0.5) > 0.1
+            assert statistics.mann_whitney(y, x)[0] == pytest.approx(p, abs=0.002)
+
+
+def test_more_baselines_in_one_environment_do_not_outweigh_the_others():
+    five = np.arange(5.0)
+    x = stacked(five, five - 10, five - 10)
+    few = stacked(five - 0.5, five, five)
+    many = stacked(np.repeat(five - 0.5, 10) + np.linspace(0, 0.1, 50), five, five)
+    before, _ = statistics.mann_whitney(x, few)
+    after, _ = statistics.mann_whitney(x, many)
+    assert after <= before < 0.05
+
+
+def test_random_orders_where_the_exact_distribution_is_too_large(monkeypatch):
+    rng, sizes = np.random.default_rng(0), [(5, 7), (4, 9)]
+    x = stacked(*(rng.normal(0, 1, n) for n, _ in sizes))
+    y = stacked(*(rng.normal(0, 1, m) for _, m in sizes))
+    exact, _ = statistics.mann_whitney(x, y)
+    statistics.win_rate_null.cache_clear()
+    monkeypatch.setattr(statistics, "MOST_VALUES", 100)
+    drawn, _ = statistics.mann_whitney(x, y)
+    again, _ = statistics.mann_whitney(x, y)
+    far, smallest = statistics.mann_whitney(x + 100, y)
+    statistics.win_rate_null.cache_clear()
+    assert exact != drawn == again == pytest.approx(exact, rel=0.05)
+    assert far == smallest == 2 / (1 + statistics.PERMUTATIONS)

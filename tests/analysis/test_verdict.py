@@ -124,6 +124,38 @@ def test_seeds_needed_is_the_first_number_that_finds_the_shift():
     assert analysis.verdicts.seeds_needed(0.3) == 183
 
 
+def test_the_power_is_said_to_be_before_the_correction():
+    """Five seeds show 20 % as "perhaps" at most: 0.0079 times ten comparisons is above 0.05."""
+    five = np.arange(100.0, 105)
+    _, said = judge(five, {f"{i / 10:.2f}": five + i / 100 for i in range(1, 11)})
+    before = "(80 % power before the correction for 10 comparisons, which no noise can pass alone)"
+    assert all(before in text for text in said["sentence"])
+    _, said = judge(TEN, {"0.10": TEN + 0.1, "0.20": TEN - 0.1})
+    assert all(
+        "(80 % power before the correction for 2 comparisons)" in t for t in said["sentence"]
+    )
+    _, said = judge(TEN, {"0.10": TEN + 0.1})
+    assert "(80 % power)" in said["sentence"].iloc[0]
+
+
+def test_a_sentence_says_which_decides_where_test_and_interval_disagree():
+    odd = " Test and interval disagree: the test decides."
+    # One run that fails lowers the interquartile mean's lower end, not the order of the others.
+    table, said = judge([*range(100, 105)], {"0.10": [60.0, 110, 111, 112, 113, 114, 115]})
+    row = table.iloc[0]
+    assert row["p"] <= 0.05 and row["improvement_low"] < 0 < row["improvement_high"]
+    assert said["sentence"].iloc[0].endswith(odd)
+    _, said = judge(TEN, {"0.10": TEN + 100})
+    assert odd not in said["sentence"].iloc[0]
+    assert analysis.verdicts.disagrees("no clear difference", 1.0, 2.0) == odd
+    assert analysis.verdicts.disagrees("better", -2.0, -1.0) == odd
+    assert (
+        analysis.verdicts.disagrees("worse", np.nan, np.nan)
+        == analysis.verdicts.disagrees("worse", -2.0, -1.0)
+        == ""
+    )
+
+
 def test_far_runs_explain_where_mean_and_iqm_disagree():
     low = np.linspace(1500, 1700, 8)
     baseline = [*low, 4095, 3602]

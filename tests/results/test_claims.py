@@ -106,6 +106,20 @@ def test_power_is_that_of_the_test():
     assert 0.02 < claims.power_of_levene(1, 10) < 0.06 and claims.power_of_levene(9, 10) > 0.9
 
 
+def test_digits_shown_of_a_power_are_those_of_a_million_samples():
+    """Of 2,000 samples they were 0.33 and 0.36."""
+    assert claims.power_of_levene(0.5, 10) == pytest.approx(0.308, abs=0.003)
+    for n in (5, 10):
+        assert detectable_shift(n, n) == pytest.approx(shift_of_many_samples(n), rel=0.004)
+
+
+def shift_of_many_samples(n):
+    """The shift that is found with 80 % power, from the power of two shifts beside it."""
+    shifts = np.array([0.99, 1.01]) * detectable_shift(n, n)
+    powers = [claims.power(shift, 1, n, 1, n) for shift in shifts]
+    return np.interp(0.8, powers, shifts)
+
+
 # ------------------------------------------------------------------------------- which runs count
 
 
@@ -240,6 +254,10 @@ def test_runs_that_end_far_above_the_rest_by_hand():
     assert found["fresh"]["high"] == pytest.approx(100 * (1 - 0.025 ** (1 / 40)))
     assert found["luck"] == pytest.approx(100 * 10 / 50, abs=1.5)
     assert claims.half_cheetah(runs, 41)["luck"] == 0
+    for seed, value in ((11, 4000.0), (12, 3500.0), (13, 1750.0), (14, 2500.0), (15, 6000.0)):
+        runs.loc[(runs["noise"] == "") & (runs["seed"] == seed), "test"] = value
+    found = claims.half_cheetah(runs, 30)  # a run above 3,000 is not between the groups as well
+    assert (found["fresh"]["count"], found["between"], found["just_above"]) == (3, 2, [1750])
 
 
 def test_the_interval_of_a_difference_is_scipys():

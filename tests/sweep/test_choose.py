@@ -227,14 +227,20 @@ def test_verdicts_in_words():
     corrected = verdict("PPO on Pusher-v5", 90, good, 0.055, 5)
     assert "none of 90 noises could be shown to help; the best of them, Random" in corrected
     assert "p = 0.011, corrected for 5 verdicts 0.055; " in corrected
-    seen = "; with 10 seeds a difference of 20 % would have been seen (80 % power)."
-    assert corrected.endswith(seen)
+    seen = "; with 10 seeds a difference of 20 % would have been seen (80 % power"
+    assert corrected.endswith(f"{seen} before the correction).")
+    alone = verdict("PPO on Pusher-v5", 90, good._replace(p=0.07, low=-1.0), 0.07, 1)
+    assert alone.endswith(f"{seen}).")
+    # An interval with zero in it beside a p below 0.05 looks like a mistake
+    odd = " Test and interval disagree: the test decides."
+    assert verdict("", 90, good._replace(low=-1.0), 0.011, 1).endswith(f"0.83.{odd}")
+    assert verdict("", 90, good._replace(p=0.07), 0.07, 1).endswith(f"{seen}).{odd}")
     falling = good._replace(winner=("RandomNormalNoisyReward(1.0)", "1.0:0.0"))
     assert "RandomNormalNoisyReward(1.0) at 1.0 to 0.0 beats" in verdict("", 2, falling, 0.011, 1)
     assert verdict("PPO on X", 1, good._replace(p=0.3), 0.3, 1).startswith(
         "PPO on X: RandomEarlyTermination(50) at 1.0 could not be shown to help: 10 fresh seeds, "
     )
-    bad = good._replace(probability=0.17)
+    bad = good._replace(probability=0.17, low=-26.6, high=-3.9)
     assert not helps(bad, bad.p) and "is worse than no noise: 10 fresh" in verdict("", 9, bad, 0, 1)
 
 
