@@ -22,6 +22,7 @@ from pathlib import Path
 
 import tyro
 
+from analysis.errors import fail
 from analysis.figures import figures, write_figure
 from analysis.formatting import text_table, wrapped, write_table
 from analysis.paper import read_paper
@@ -55,12 +56,6 @@ class Args:
     """where the tables, the figures and report.html go; by default RUNS_DIR/results"""
     compare: Path | None = None
     """a folder with the paper's tables as csv (results/paper): adds compare_* tables"""
-
-
-def fail(message):
-    """End with one line on stderr and status 2, as the training scripts do for bad input."""
-    print(f"error: {message}", file=sys.stderr)
-    sys.exit(2)
 
 
 def output_folder(args):

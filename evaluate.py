@@ -37,6 +37,7 @@ from gymnasium.wrappers import RecordVideo
 from tabulate import tabulate
 from tqdm import tqdm
 
+from analysis.errors import fail
 from analysis.runs import differing_settings, is_run, read_config, study_name
 from noisy_wrappers import (
     NotFiniteError,
@@ -72,7 +73,7 @@ class Args:
     """write a video of one episode of each condition into this folder and store nothing else"""
 
 
-class Run(NamedTuple):
+class FinishedRun(NamedTuple):
     """A finished run, as analysis.runs.read_config reads and names it."""
 
     folder: Path
@@ -81,12 +82,6 @@ class Run(NamedTuple):
     noise: str
     noise_rate: str
     arguments: str  # the others, as JSON
-
-
-def fail(message, code=2):
-    """Exit with one line that says what to do."""
-    print("error:", message, file=sys.stderr, flush=True)
-    raise SystemExit(code)
 
 
 def reason(error):
@@ -113,16 +108,16 @@ def find_runs(paths):
             fail(f"{path} is neither a run nor a folder of runs")
     if not folders:
         fail(f"there is no finished run in {', '.join(map(str, paths))}")
-    return [read_run(folder) for folder in dict.fromkeys(map(Path.absolute, folders))]
+    return [read_finished(folder) for folder in dict.fromkeys(map(Path.absolute, folders))]
 
 
-def read_run(folder):
+def read_finished(folder):
     """Read what a finished run's config.json says."""
     if not (folder / "result.json").exists():
         fail(f"{folder} is not finished: the command that started it goes on with it")
     try:
         config = read_config(folder)
-        return Run(folder, *(config[name] for name in Run._fields[1:]))
+        return FinishedRun(folder, *(config[name] for name in FinishedRun._fields[1:]))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         fail(f"cannot read {folder / 'config.json'}: {type(error).__name__}: {reason(error)}")
 
@@ -167,7 +162,7 @@ def load(run, render_mode=None):
         fail(f"{run.folder / 'policy.pt'} is no policy for {run.environment}: {reason(error)}")
 
 
-def check(run, conditions):
+def check_environment(run, conditions):
     """Exit unless the policy fits its environment and every noise can act on it."""
     env, _ = load(run)
     for noises, rates in conditions.values():
@@ -388,7 +383,7 @@ def main(args):
             fail("--video: two of these runs have the same name, and so would their videos")
         draw_without_display()
     for run in runs:
-        check(run, conditions)
+        check_environment(run, conditions)
     if args.video:
         make_folder(args.video)
     if args.video or args.render:

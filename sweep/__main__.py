@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sweep.grid import check_extra, check_rollouts, command_line, grid, result, runs_in
-from sweep.options import check, parse_args
+from sweep.options import check_arguments, parse_args
 
 STOPPED = (129, 130, 138, 143)  # exit statuses of a run that was told to stop, by signal
 END = re.compile(r"# .* exit=(\d+)")  # the last line of run_one in executors.sh
@@ -191,7 +191,7 @@ def main(view, caller, argv):
     if view == "status" and args.preset in (None, "custom") and args.given <= {"--runs-dir"}:
         runs = runs_in(args.runs_dir)
     else:
-        check(args)
+        check_arguments(args)
         if args.preset == "choose":
             from sweep import choose  # and with it SciPy: no other preset should wait for that
 

@@ -12,11 +12,12 @@ import os
 from statistics import fmean
 from typing import NamedTuple
 
+from analysis.errors import fail
 from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED, read_run
 from analysis.statistics import holm
 from analysis.verdicts import detectable_shift
 from sweep import halving
-from sweep.grid import NOISES, RATES, Run, cell, cells, fail, make_run, result
+from sweep.grid import NOISES, RATES, PlannedRun, cell, cells, make_run, result
 
 # What a run takes on one core until the finished ones tell: docs/sweeps.md
 STEPS_PER_SECOND = {"sac": 150, "td3": 265, "ppo": 5700}  # in small MuJoCo environments
@@ -33,7 +34,7 @@ class Choice(NamedTuple):
     schedule: list[tuple[int, int]]  # of its search
     confirm: int  # fresh seeds of the confirmation
     state: halving.State
-    runs: dict[tuple[str, str, int], Run]  # those that have been due so far
+    runs: dict[tuple[str, str, int], PlannedRun]  # those that have been due so far
     returns: dict[tuple[str, str, int], float]  # of those that are finished
     core_hours: float  # about what is left
 

@@ -12,10 +12,10 @@ import json
 import os
 import shlex
 import subprocess
-import sys
 from pathlib import Path
 from typing import NamedTuple
 
+from analysis.errors import fail
 from noisy_wrappers import MAY_DIFFER_IN_A_RUN, canonical_noises, run_folder
 
 PROJECT = Path(__file__).resolve().parent.parent
@@ -82,7 +82,7 @@ GIVEN_BY_THE_GRID = {  # options of the scripts, and those of the sweep that set
 }
 
 
-class Run(NamedTuple):
+class PlannedRun(NamedTuple):
     """One line of the grid."""
 
     folder: Path
@@ -236,7 +236,7 @@ def make_run(args, algorithm, env_id, noises, rates, seed):
     exp_name, kind = script.removesuffix(".py"), (algorithm, env_id)
     folder = run_folder(args.runs_dir, env_id, exp_name, noises, rates, seed)
     options = script_options(script, tuple(args.extra))
-    return Run(folder, kind, args.total_timesteps, script, arguments, options)
+    return PlannedRun(folder, kind, args.total_timesteps, script, arguments, options)
 
 
 def grid(args):
@@ -272,7 +272,7 @@ def runs_in(folder):
                 kind, steps = (args.get("exp_name"), args.get("env_id")), args["total_timesteps"]
             except (OSError, ValueError, KeyError, TypeError) as error:
                 fail(f"cannot read {path} ({type(error).__name__}: {error}); delete its folder")
-        runs.append(Run(folder / name, kind, steps, "", [], {}))
+        runs.append(PlannedRun(folder / name, kind, steps, "", [], {}))
     return runs
 
 
@@ -360,9 +360,3 @@ def script_error(text):
         if not line.startswith("\u256d"):
             told.append(line)
     return " ".join(told) or "cannot be started"
-
-
-def fail(message):
-    """Exit and say what to do."""
-    print(f"error: {message}", file=sys.stderr)
-    sys.exit(2)

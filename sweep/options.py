@@ -6,8 +6,9 @@ import os
 import re
 from pathlib import Path
 
+from analysis.errors import fail
 from noisy_wrappers import canonical_env_id
-from sweep.grid import ENVS, GIVEN_BY_THE_GRID, PRESETS, PROJECT, SEEDS, defaults, fail, script_of
+from sweep.grid import ENVS, GIVEN_BY_THE_GRID, PRESETS, PROJECT, SEEDS, defaults, script_of
 
 GRID_OPTIONS = ["--algos", "--envs", "--noises", "--noise-rates", "--seeds", "--total-timesteps"]
 GRID_OPTIONS += ["--runs-dir", "--combine", "--exclude", "--budget", "--confirm"]
@@ -125,7 +126,7 @@ def entry(text):
     return pairs
 
 
-def check(args):
+def check_arguments(args):
     """Exit with one line about the first argument that no run could be started with.
 
     Environments get their full names on the way.

@@ -294,7 +294,7 @@ def test_a_full_disk_leaves_the_previous_file(runs, monkeypatch, capsys):
 
 def test_the_table_of_known_returns(capsys):
     def a_run(noise, rate):
-        return evaluate.Run(Path(str(len(cells))), "PPO", "E", noise, rate, "{}")
+        return evaluate.FinishedRun(Path(str(len(cells))), "PPO", "E", noise, rate, "{}")
 
     cells = {}
     for noise, rate, clean, noisy in [
@@ -380,7 +380,7 @@ def test_a_folder_stands_for_its_finished_runs(runs, capsys):
     (runs / "report.html").touch()  # analyze.py --out may be the same folder
     main(Args((runs, one(runs, "TD3")), episodes=1))
     assert f"{runs}: unfinished runs are left out (1)" in capsys.readouterr().out
-    assert sum((run_dir / "robustness.csv").exists() for run_dir in runs.glob("Inv*")) == 3
+    assert sum((run_dir / "robustness.csv").exists() for run_dir in runs.glob("*Inv*")) == 3
 
 
 def test_an_environment_of_the_folder_that_it_is_called_from(runs, tmp_path):

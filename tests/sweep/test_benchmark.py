@@ -28,7 +28,7 @@ import stub_run
 from views import ROOT, attempts, folders, log_of, view
 
 from sweep import choose
-from sweep.options import check, parse_args
+from sweep.options import check_arguments, parse_args
 
 PATH = f"{os.environ['PATH']}:/usr/sbin:/sbin"
 ENV = {**os.environ, "PYTHON": sys.executable, "PATH": PATH}
@@ -306,7 +306,8 @@ def copy_project(folder):
     folder.mkdir()
     for file in ("benchmark.sh", "noisy_wrappers.py", "sac_continuous_noisy.py"):
         shutil.copy2(ROOT / file, folder)
-    shutil.copytree(ROOT / "sweep", folder / "sweep")
+    for package in ("sweep", "analysis"):
+        shutil.copytree(ROOT / package, folder / package)
     return folder
 
 
@@ -430,7 +431,7 @@ def verdicts(out):
 def play(*command):
     """Make a choice's runs in this process, until none is due."""
     args = parse_args("list", "/", command)
-    check(args)
+    check_arguments(args)
     while due := [choice.runs[run] for choice in choose.choices(args) for run in choice.state.due]:
         for one in due:
             stub_run.train([one.script, *one.arguments])
@@ -573,7 +574,7 @@ def test_a_damaged_result_fails_its_run_and_stops_no_other(file, damaged, tmp_pa
 def test_runs_may_be_in_the_projects_own_folder(tmp_path, stub):
     project = tmp_path / "project"
     project.mkdir()
-    for path in [*ROOT.glob("*.py"), ROOT / "sweep"]:
+    for path in [*ROOT.glob("*.py"), ROOT / "sweep", ROOT / "analysis"]:
         (project / path.name).symlink_to(path)
     shutil.copy(ROOT / "benchmark.sh", project)  # it works in the folder that it is in
     grid = [*GRID, "--total-timesteps", "400", "--runs-dir", "."]

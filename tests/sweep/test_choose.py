@@ -29,7 +29,7 @@ from sweep.halving import (
     score,
     verdict,
 )
-from sweep.options import check, parse_args
+from sweep.options import check_arguments, parse_args
 
 SEARCH_SEEDS, CONFIRM = 50, 10  # columns of a table of returns
 A = "RandomNormalNoisyReward(1.0)"
@@ -280,7 +280,7 @@ def test_rows_of_choice_csv():
 def arguments(text, tmp_path):
     words = [*text.split(" | "), "--total-timesteps", "1000", "--runs-dir", str(tmp_path)]
     args = parse_args("list", "/", ["choose", *words])
-    check(args)
+    check_arguments(args)
     return args
 
 
@@ -383,7 +383,7 @@ def test_the_default_noises_and_those_of_the_paper(tmp_path):
 
     def tried(more=""):
         args = parse_args("list", "/", f"{words} {more}".split())
-        check(args)
+        check_arguments(args)
         [choice] = choose.choices(args)
         return choice.state.noises
 
