@@ -32,7 +32,17 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 ROOT = Path(__file__).parents[2]
 ALGORITHMS = ("sac", "td3", "ppo")
-ENVS = ("Hopper-v5", "Pendulum-v1")
+
+
+def slow(*values):
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
+each_script = pytest.mark.parametrize("algorithm", [slow("sac"), slow("td3"), "ppo"])
+# Resuming, stopping and what is refused are in THE RUN, which is the same text in the three scripts
+# (test_scripts.py compares them): where the algorithm's own part has no say, one script is enough.
+one_script = pytest.mark.parametrize("algorithm", ["ppo"])
+
 NOISE = (
     "RandomEarlyTermination(3, 25, truncate=True)",
     "RandomEarlyTermination(30)",  # so that no episode is long
@@ -275,8 +285,8 @@ KILLS = {
 }
 
 
-@pytest.mark.parametrize("env_id", ENVS)
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("env_id", ["Hopper-v5", slow("Pendulum-v1")])
+@each_script
 def test_killed_again_and_again_it_ends_as_if_left_alone(algorithm, env_id, alone, tmp_path):
     words, steps, cut = options(algorithm, tmp_path, env_id), [], False
     for name, moment in KILLS.items():
@@ -296,7 +306,8 @@ def test_killed_again_and_again_it_ends_as_if_left_alone(algorithm, env_id, alon
     assert outcome(path) == alone(algorithm, env_id)
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.slow
+@each_script
 def test_killed_while_every_step_ends_an_episode_it_logs_each_once(algorithm, tmp_path):
     """The steps next to a checkpoint are logged too: one cut too many or too few would show."""
     noise = ("RandomEarlyTermination(1)", "RandomNormalNoisyReward(1)")
@@ -315,7 +326,8 @@ def test_killed_while_every_step_ends_an_episode_it_logs_each_once(algorithm, tm
     assert outcome(folder(tmp_path / "alone")) == outcome(next(tmp_path.glob("*__Hopper*")))
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.slow
+@one_script
 def test_events_are_on_the_disk_before_the_checkpoint_is(algorithm, alone, tmp_path):
     slow = ("tensorboard.summary.writer.record_writer.RecordWriter.write", None, wait)
     words = options(algorithm, tmp_path)
@@ -355,8 +367,8 @@ def test_killed_by_somebody_else_at_random_times_compiled(tmp_path):
 # STOPPED
 
 
-@pytest.mark.parametrize("number, code", [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("number, code", [(signal.SIGTERM, 143), slow(signal.SIGINT, 130)])
+@each_script
 def test_a_signal_ends_the_episode_and_the_run_resumes(algorithm, number, code, alone, tmp_path):
     words = options(algorithm, tmp_path)
     result = run(algorithm, words, (TRAINING_STEP, 65, send(number)))
@@ -379,14 +391,15 @@ def test_a_signal_ends_the_episode_and_the_run_resumes(algorithm, number, code, 
     "numbers, code",
     [((signal.SIGTERM, signal.SIGTERM), 143), ((signal.SIGTERM, signal.SIGINT), 130)],
 )
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@one_script
 def test_a_second_signal_exits_at_once(algorithm, numbers, code, tmp_path):
     result = run(algorithm, options(algorithm, tmp_path), (TRAINING_STEP, 30, send(*numbers)))
     assert (result.code, result.err) == (code, "")
     assert not (folder(tmp_path) / "checkpoint.pt").exists()
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.slow
+@each_script
 def test_a_signal_stops_a_run_that_has_an_evaluation_due_at_every_episode(algorithm, tmp_path):
     short = {"eval_frequency": 5, "eval_episodes": 1, "total_timesteps": 120}
     words = options(algorithm, tmp_path, **short)
@@ -401,7 +414,7 @@ def test_a_signal_stops_a_run_that_has_an_evaluation_due_at_every_episode(algori
     assert outcome(folder(tmp_path / "alone")) == outcome(next(tmp_path.glob("*__Hopper*")))
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@one_script
 def test_nan_ends_the_command_with_one_line(algorithm, tmp_path):
     result = run(algorithm, options(algorithm, tmp_path, "toy_envs:NanReward-v0", (), ()))
     line = "error: training stopped: step 6 of an episode: the environment returned the reward nan"
@@ -453,6 +466,10 @@ def paths(algorithm):
 FIELDS = {algorithm: paths(algorithm) for algorithm in ALGORITHMS}
 NEEDED = {algorithm: FIELDS[algorithm].keys() - INERT for algorithm in ALGORITHMS}
 NEEDED["ppo"] -= {"generators.actions"}  # it samples none
+# What THE RUN saves itself is tested with one script, like everything of it
+OF_THE_RUN = {name for name in NEEDED["ppo"] if name.startswith("Random")} | {"eval_csv", "returns"}
+for name in ("sac", "td3"):
+    NEEDED[name] -= OF_THE_RUN
 
 
 def leaves(algorithm, checkpoint):
@@ -486,7 +503,7 @@ def ending(algorithm, runs_dir, checkpoint, tmp_path):
     return result
 
 
-@pytest.mark.parametrize("episodes", [EARLY, EXPLORING, LATE])
+@pytest.mark.parametrize("episodes", [slow(EARLY), slow(EXPLORING), LATE])
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_an_unchanged_checkpoint_gives_the_same_run(
     algorithm, episodes, alone, checkpoints, tmp_path
@@ -496,6 +513,7 @@ def test_an_unchanged_checkpoint_gives_the_same_run(
     assert ending(algorithm, runs_dir, checkpoint, tmp_path) == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "algorithm, field", [(name, field) for name in NEEDED for field in sorted(NEEDED[name])]
 )
@@ -544,7 +562,7 @@ def stopped(algorithm, checkpoints, tmp_path):
     return options(algorithm, tmp_path / "runs"), path
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@one_script
 def test_a_flipped_bit_anywhere_in_the_data_is_found(algorithm, stopped, capsys):
     words, path = stopped
     whole = path.read_bytes()
@@ -559,7 +577,7 @@ def test_a_flipped_bit_anywhere_in_the_data_is_found(algorithm, stopped, capsys)
         assert "checkpoint.pt" in refused(algorithm, words, capsys), member.filename
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@one_script
 def test_what_is_no_whole_checkpoint_is_refused(algorithm, stopped, capsys):
     words, path = stopped
     whole = path.read_bytes()
@@ -574,7 +592,7 @@ def test_what_is_no_whole_checkpoint_is_refused(algorithm, stopped, capsys):
         assert "checkpoint.pt" in refused(algorithm, words, capsys)
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@one_script
 def test_a_checkpoint_of_another_run_is_refused(algorithm, stopped, checkpoints, tmp_path, capsys):
     words, path = stopped
     checkpoint = torch.load(path, weights_only=True)
@@ -599,7 +617,7 @@ class Intruder:
         return Path.touch, (self.path,)
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@one_script
 def test_a_checkpoint_cannot_run_code(algorithm, stopped, tmp_path, capsys):
     words, path = stopped
     trace = tmp_path / "trace"
@@ -618,7 +636,7 @@ def test_a_checkpoint_cannot_run_code(algorithm, stopped, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("damage", ["cut", "missing", "foreign"])
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@one_script
 def test_a_damaged_eval_csv_is_healed(algorithm, damage, stopped, alone):
     words, path = stopped
     log = path.with_name("eval.csv")
@@ -632,7 +650,7 @@ def test_a_damaged_eval_csv_is_healed(algorithm, damage, stopped, alone):
     assert outcome(path.parent) == alone(algorithm)
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@one_script
 def test_a_checkpoint_without_its_configuration_is_refused(algorithm, stopped, capsys):
     words, path = stopped
     config = path.with_name("config.json")
@@ -643,7 +661,7 @@ def test_a_checkpoint_without_its_configuration_is_refused(algorithm, stopped, c
     assert "config.json" in refused(algorithm, words, capsys)
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@one_script
 def test_a_folder_of_another_configuration_is_refused_until_overwritten(
     algorithm, stopped, alone, tmp_path, capsys
 ):
@@ -662,7 +680,7 @@ def test_a_folder_of_another_configuration_is_refused_until_overwritten(
     assert "gamma" in line
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@one_script
 def test_a_second_process_is_refused_while_the_first_one_lives(algorithm, tmp_path):
     long = {"total_timesteps": 10**9, "eval_frequency": 10**9, "checkpoint_frequency": 1}
     words = options(algorithm, tmp_path, **long)
@@ -694,8 +712,9 @@ FAILURES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FAILURES)
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@one_script
 def test_a_file_that_cannot_be_written_is_named_and_the_run_can_go_on(
     algorithm, name, alone, checkpoints, tmp_path
 ):
@@ -736,7 +755,8 @@ def small_disk(tmp_path):
     subprocess.run(["umount", "--lazy", str(path)], check=True)
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.slow
+@one_script
 def test_a_full_disk_costs_no_more_than_the_newest_checkpoint(
     algorithm, alone, checkpoints, small_disk
 ):
@@ -757,7 +777,7 @@ def test_a_full_disk_costs_no_more_than_the_newest_checkpoint(
 # FINISHED
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@one_script
 def test_a_finished_run_says_so_and_changes_nothing(algorithm, alone, tmp_path):
     words = options(algorithm, tmp_path)
     result = run(algorithm, words, ("pathlib.Path.unlink", None, die_removing_checkpoint))
@@ -774,7 +794,8 @@ def test_a_finished_run_says_so_and_changes_nothing(algorithm, alone, tmp_path):
     assert files(path) == before
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.slow
+@one_script
 def test_another_precision_is_said_and_recorded(algorithm, tmp_path, monkeypatch, capsys):
     words, said = options(algorithm, tmp_path), []
     for precision, episodes in (("medium", EARLY), ("highest", EARLY), ("highest", math.inf)):
@@ -796,7 +817,8 @@ def test_another_precision_is_said_and_recorded(algorithm, tmp_path, monkeypatch
     assert "is finished" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.slow
+@one_script
 def test_other_code_and_versions_are_said_and_recorded(
     algorithm, tmp_path, tmp_path_factory, monkeypatch, capsys
 ):
@@ -819,7 +841,7 @@ def test_other_code_and_versions_are_said_and_recorded(
     assert json.loads((folder(tmp_path) / "config.json").read_text()) == config
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@one_script
 def test_a_run_needs_no_git(algorithm, tmp_path):
     moments = ("gymnasium.make", 1, uninstall_git), (TRAINING_STEP, 1, send(signal.SIGTERM))
     result = run(algorithm, options(algorithm, tmp_path), *moments)
@@ -827,7 +849,8 @@ def test_a_run_needs_no_git(algorithm, tmp_path):
     assert json.loads((folder(tmp_path) / "config.json").read_text())["git_commit"] is None
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.slow
+@one_script
 def test_a_checkpoint_cut_short_by_kill_after_sigterm_leaves_nothing(algorithm, alone, tmp_path):
     words = options(algorithm, tmp_path, checkpoint_frequency=1000)
     moments = (TRAINING_STEP, 65, send(signal.SIGTERM)), ("torch.save", 1, die_half_way)
