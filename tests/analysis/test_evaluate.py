@@ -209,6 +209,7 @@ def test_another_seed_plays_everything_and_stores_nothing(runs, capsys):
     assert means[0] != default.split()[-2]
 
 
+@pytest.mark.slow
 def test_a_kill_leaves_whole_conditions_and_the_same_command_goes_on(runs):
     run_dir = one(runs, "PPO")
     options = ["--noise", OBSERVATION, ACTION, "--noise-rate", "0.3", "0.6", "--episodes", "30"]
@@ -228,6 +229,7 @@ def test_a_kill_leaves_whole_conditions_and_the_same_command_goes_on(runs):
     assert (run_dir / "robustness.csv").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_two_processes_on_one_run_lose_nothing(runs):
     """Both find nothing stored; then each stores the clean condition and a noise at 20 rates."""
     run_dir = one(runs, "PPO")
@@ -383,6 +385,7 @@ def test_a_folder_stands_for_its_finished_runs(runs, capsys):
     assert sum((run_dir / "robustness.csv").exists() for run_dir in runs.glob("*Inv*")) == 3
 
 
+@pytest.mark.slow
 def test_an_environment_of_the_folder_that_it_is_called_from(runs, tmp_path):
     run_dir = one(runs, "PPO")
     limited = "gymnasium.envs.mujoco.inverted_pendulum_v5:InvertedPendulumEnv"
@@ -405,6 +408,7 @@ def test_an_environment_that_takes_no_arguments(tmp_path):
 # Videos
 
 
+@pytest.mark.slow
 def test_videos(runs, tmp_path):
     run_dir = one(runs, "PPO")
     before = files(runs)
@@ -437,6 +441,7 @@ def register(tmp_path, name, code):
     (tmp_path / f"{name}.py").write_text(register + code)
 
 
+@pytest.mark.slow
 def test_how_to_draw_is_settled_before_environments_are_imported(runs, tmp_path):
     """As dm_control does, this one reads MUJOCO_GL when it is imported."""
     register(tmp_path, "early", "import os\nos.environ['MUJOCO_GL']\n")
@@ -447,6 +452,7 @@ def test_how_to_draw_is_settled_before_environments_are_imported(runs, tmp_path)
     assert len(list((tmp_path / "videos").iterdir())) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_run_that_cannot_be_drawn_is_skipped_and_named(runs, tmp_path, jobs):
     code = """
