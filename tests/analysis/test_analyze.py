@@ -1019,6 +1019,7 @@ def test_report_has_no_horizontal_overflow(width, sweep, tmp_path):
     assert images == 4 and broken == 0 and external == 0
 
 
+@pytest.mark.slow
 def test_no_table_of_a_large_report_scrolls_or_cuts_a_number(committed, tmp_path):
     script = """
         document.querySelectorAll("details").forEach(details => details.open = true);

@@ -353,8 +353,8 @@ def test_all_of_a_folder_with_logs_and_an_analysis(runs, capsys):
     table = [re.split(r" {2,}", line) for line in result.stdout.splitlines()]
     assert [row[1:5] for row in table[4:]] == [
         ["PPO", "no noise", "0.00", "2"],
-        ["SAC", "RandomNormalNoisyReward(0.1)", "0.50", "1"],
         ["TD3", "no noise", "0.00", "1"],
+        ["SAC", "RandomNormalNoisyReward(0.1)", "0.50", "1"],
     ]
     means = []
     for seed in (1, 2):
@@ -416,9 +416,9 @@ def test_videos(runs, tmp_path):
     result = run(run_dir, *options, "--episodes", "9")
     assert (result.returncode, result.stderr) == (0, "")
     assert files(runs) == before
-    names = ["RandomNormalNoisyAction_0.5_p1.0", "clean"]
+    names = ["p1.0_NormalNoisyAction_0.5", "clean"]
     paths = [tmp_path / "a" / "b" / f"{run_dir.name}__{name}.mp4" for name in names]
-    assert sorted((tmp_path / "a" / "b").iterdir()) == paths
+    assert set((tmp_path / "a" / "b").iterdir()) == set(paths)
     main(Args((run_dir,), (ACTION,), (1.0,), episodes=1))
     for path, row in zip(paths, reversed(stored(run_dir)), strict=True):
         video = imageio.imread(path)
@@ -471,7 +471,7 @@ gym.register("Blind-v0", lambda **given: Blind(gym.make("InvertedPendulum-v5", *
     first, second = sorted(runs.glob("*ppo_continuous_noisy*"))
     other_environment(first, "blind:Blind-v0")
     videos = tmp_path / "videos"
-    for _ in range(2):  # the second time, nothing is left of the first
+    for _ in range(3 - jobs):  # the second time, nothing is left of the first
         result = run(first, second, "--video", videos, "--jobs", jobs, cwd=tmp_path)
         assert result.returncode == 1
         cause = r"\w+Error: nothing to see \(.*blind.py, line \d+\)"

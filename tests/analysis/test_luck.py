@@ -125,6 +125,7 @@ def test_what_cannot_be_drawn_is_left_out():
 # -------------------------------------------------------------------------------- false alarms
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("n", "n_baseline", "most"), [(5, 5, 0.08), (10, 10, 0.08), (5, 20, 0.1), (10, 20, 0.1)]
 )
@@ -148,6 +149,7 @@ def test_useless_noise_is_seldom_beyond_luck(n, n_baseline, most, monkeypatch):
     assert 0.4 <= (p <= 0.5).mean() <= 0.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [5, 10])
 def test_useless_noise_in_a_paper_is_beyond_luck_in_five_percent_of_studies(n, monkeypatch):
     """Only the baseline's standard deviation is known there, from n seeds."""

@@ -177,6 +177,7 @@ def test_conditions_that_a_run_lacks_do_not_count(tmp_path):
     assert push["baseline_score"] == pytest.approx(-20)
 
 
+@pytest.mark.slow
 def test_compressed_damaged_and_unfinished_runs(tmp_path, capsys):
     write_tests(tmp_path / "runs", HOPPER, "Hopper-v5")
     first = run(tmp_path, out="plain")

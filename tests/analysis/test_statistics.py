@@ -46,6 +46,7 @@ def scipys(samples, method):
     return done.confidence_interval
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", statistics.COVERAGE)
 def test_coverage(n):
     """The caption of the table of statistics says these numbers."""
@@ -55,12 +56,14 @@ def test_coverage(n):
     assert int(covered(n, ours, MIXTURES)) == statistics.COVERAGE_OF_MIXTURES[n]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["percentile", "basic", "BCa"])
 def test_coverage_of_the_alternatives_at_five_seeds_is_lower(method):
     measured = covered(5, lambda samples: scipys(samples, method))
     assert measured < 93 < covered(5, ours)
 
 
+@pytest.mark.slow
 def test_coverage_of_the_improvement_over_environments():
     """The baseline's mean is estimated as well: taking it as known covers less than 90 %."""
     rng = np.random.default_rng(0)
@@ -83,6 +86,7 @@ def test_coverage_of_the_improvement_over_environments():
     assert inside_fixed / trials < 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*DISTRIBUTIONS, *MIXTURES])
 def test_noise_that_does_nothing_improves_nothing(name):
     """The IQM of skewed returns is not their mean; no improvement must come of that."""

@@ -19,6 +19,7 @@ from analysis.verdicts import detectable_shift
 RESULTS, DATA = common.RESULTS, common.DATA
 
 
+@pytest.mark.slow
 def test_the_page_is_what_its_command_writes():
     assert (RESULTS / "README.md").read_text() == claims.page()
     assert (RESULTS / "future_work.md").read_text() == future_work.page()

@@ -133,6 +133,7 @@ def test_bad_input(monkeypatch, capsys):
     assert capsys.readouterr().err == "error: --jobs must be at least 1, not 0\n"
 
 
+@pytest.mark.slow
 def test_sigterm_ends_the_program_and_its_runs(tmp_path):
     line = [sys.executable, paper_tests.__file__, "--runs-dir", str(tmp_path), "--jobs", "1"]
     with open(tmp_path / "out", "w") as out:

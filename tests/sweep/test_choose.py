@@ -133,6 +133,7 @@ def test_a_planted_noise_is_found_and_confirmed():
         assert helps(comparison, comparison.p)
 
 
+@pytest.mark.slow
 def test_useless_noises_are_rarely_taken_for_better():
     rng = np.random.default_rng(0)
     claims = 0
@@ -143,6 +144,7 @@ def test_useless_noises_are_rarely_taken_for_better():
     assert 1 <= claims <= 18  # 2.5 % of 400 are 10; 4.5 % are 18
 
 
+@pytest.mark.slow
 def test_the_choice_is_as_good_as_a_grid_of_ten_seeds():
     rng = np.random.default_rng(0)
     chosen, grid = [], []
