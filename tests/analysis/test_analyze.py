@@ -1129,6 +1129,7 @@ def test_runs_one_folder_deeper_are_pointed_to(tmp_path, capsys):
     assert not (tmp_path / "runs/results").exists()
 
 
+@pytest.mark.slow
 def test_a_reader_that_stops_early_is_no_error(tmp_path):
     write_run(tmp_path / "runs", [1])
     command = f"{sys.executable} {analyze.__file__} --runs-dir {tmp_path}/runs"
@@ -1155,6 +1156,7 @@ def test_what_is_printed_fits_the_terminal(width, tmp_path, capsys, monkeypatch)
     assert ("noisy" in head) == (width > 100)
 
 
+@pytest.mark.slow
 def test_a_file_gets_whole_lines(tmp_path):
     """`grep`, and `head -n 1` of the demo, take lines for sentences."""
     for seed in range(1, 5):
@@ -1229,6 +1231,7 @@ def test_committed_runs_had_the_noise_that_their_names_say():
             assert abs(applied - calls * rate) <= 4 * deviation, (folder, applied, calls)
 
 
+@pytest.mark.slow
 def test_help_names_every_option():
     command = [sys.executable, analyze.__file__, "--help"]
     text = subprocess.run(command, capture_output=True, text=True, check=True).stdout

@@ -150,6 +150,7 @@ def test_only_whole_seeds_of_the_headline_count(monkeypatch):
         assert headline.read_curves() is None
 
 
+@pytest.mark.slow
 def test_the_sections_appear_with_the_runs(monkeypatch, tmp_path):
     runs = made_up([1, 2, 3], effect=5)
     monkeypatch.setattr(ablation, "read_ablation", lambda: runs)

@@ -685,7 +685,7 @@ BAD = [  # arguments, what the message names, of which scripts
     ({"noise": NOISES, "noise_rate": (0.1, 1.1)}, "1.1", SCRIPTS),
     ({"noise": NOISES, "noise_rate": (-0.1,)}, "-0.1", SCRIPTS),
     ({"noise": NOISES, "noise_rate": (math.nan,)}, "nan", SCRIPTS),
-    ({"noise": NOISES, "noise_rate": (0.1, 0.2, 0.3)}, "3 noise rates", SCRIPTS),
+    ({"noise": NOISES, "noise_rate": (0.1, 0.2, 0.3)}, "noise rates: 3", SCRIPTS),
     ({"noise": NOISES}, "noise without a noise rate", SCRIPTS),
     ({"noise_rate": (0.1,)}, "a noise rate without noise", SCRIPTS),
     ({"noise": NOISES, "noise_rate": ("1:2",)}, "1:2", SCRIPTS),

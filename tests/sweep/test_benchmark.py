@@ -550,8 +550,9 @@ def test_status_without_a_grid_reads_the_folder(tmp_path, stub):
     assert empty.code == 2 and f"error: no runs in {tmp_path}/none" in empty.err
 
 
-@pytest.mark.parametrize("damaged", ["", "{}", "[]"])
-@pytest.mark.parametrize("file", ["result.json", "config.json"])
+@pytest.mark.parametrize(
+    ("file", "damaged"), [("result.json", ""), ("result.json", "{}"), ("config.json", "[]")]
+)
 def test_a_damaged_result_fails_its_run_and_stops_no_other(file, damaged, tmp_path, stub):
     grid = ["baseline", "--algos", "sac", "--envs", "Hopper-v5", "--seeds", "1-2"]
     grid += ["--total-timesteps", "1000", "--runs-dir", tmp_path]

@@ -167,6 +167,7 @@ def test_the_simulation_searches_by_the_rule(count):
     assert [[named(count)[i]] for i in found] == winners
 
 
+@pytest.mark.slow
 def test_the_simulation_confirms_by_the_test():
     rng = np.random.default_rng(0)
     noisy, baseline = rng.normal(0.3, 0.3, (60, CONFIRM)), rng.normal(0, 0.3, (60, CONFIRM))
