@@ -26,6 +26,11 @@ def test_the_page_is_what_its_command_writes():
     assert (RESULTS / "robustness.md").read_text() == robustness.page()
 
 
+def test_an_interaction_that_would_be_seen_is_about_as_large_as_the_noises_gain():
+    found = future_work.numbers()["together"]
+    assert found["detectable"] == pytest.approx(found["gain"], rel=0.02)  # "about as much as"
+
+
 def test_the_choice_on_the_page_is_that_of_the_runs():
     """choice.csv follows from the run folders, and the winner from its last round."""
     found = future_work.choice()
