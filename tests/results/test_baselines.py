@@ -95,6 +95,21 @@ def test_the_share_of_the_test_in_the_variance(tmp_path):
 # ------------------------------------------------------------------------- how the paper tested PPO
 
 
+def test_the_committed_runs_are_planned_ones_and_whole():
+    """tests.csv has every way, and the script's own way is that of eval.csv."""
+    planned = {(env_id, *noise, *rate, seed) for env_id, noise, rate, seed in ways.planned_runs()}
+    folders = [path.parent for path in (DATA / "paper_tests").glob("*/tests.csv")]
+    assert len(folders) == len(list((DATA / "paper_tests").iterdir())) > 0
+    for folder in folders:
+        args = json.loads((folder / "config.json").read_text())["args"]
+        assert (args["env_id"], *args["noise"], *args["noise_rate"], args["seed"]) in planned
+        tests, own = (pd.read_csv(folder / name) for name in ("tests.csv", "eval.csv"))
+        assert tests.groupby("way").size().to_dict() == dict.fromkeys(ways.WAYS, len(own))
+        columns = ["step", "episode", "episodic_return"]
+        scripts = tests.loc[tests["way"] == "training-mean", columns].reset_index(drop=True)
+        pd.testing.assert_frame_equal(scripts, own[columns])
+
+
 def test_only_whole_seeds_are_read(tmp_path, monkeypatch):
     """Seed 1 has both planned runs, seed 2 one of them, and one of seed 3 has no tests.csv yet."""
     names = ("Hopper-v5", "Pusher-v5")
