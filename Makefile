@@ -29,7 +29,7 @@ results: $(BIN)/.run
 	$(BIN)/python analyze.py --runs-dir results/data/runs --out results/report --compare results/paper
 	cp results/report/*.csv results/tables
 	cp results/report/curves_PPO_RandomEarlyTermination_50.svg results/figures
-	$(BIN)/python results/pages/claims.py
+	$(BIN)/python results/pages/readme.py
 	$(BIN)/python results/pages/baselines.py
 	$(BIN)/python results/pages/future_work.py
 	$(BIN)/python results/pages/robustness.py

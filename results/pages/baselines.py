@@ -10,10 +10,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import ways
-from claims import FIXED_SEEDS
 from common import (
     DATA,
     ENVIRONMENTS,
+    FIXED_SEEDS,
     RESULTS,
     cells,
     markdown,

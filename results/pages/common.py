@@ -12,6 +12,8 @@ from tabulate import tabulate
 
 RESULTS = Path(__file__).resolve().parent.parent
 DATA = RESULTS / "data"
+FEW_SEEDS = range(1, 6)
+FIXED_SEEDS = range(1, 11)
 ENVIRONMENTS = ["HalfCheetah", "Hopper", "Humanoid", "Pusher", "Walker2d"]  # without version
 sys.path.insert(0, str(RESULTS.parent))
 from analysis.runs import KEYS, read_runs  # noqa: E402
@@ -104,6 +106,20 @@ def spell(x):
     """Write a sample as mean ± standard deviation, with a decimal for returns of two digits."""
     digits = np.where(x["mean"].abs() >= 100, 0, 1)
     return [f"{m:,.{d}f} ± {s:,.{d}f}" for m, s, d in zip(x["mean"], x["std"], digits, strict=True)]
+
+
+def by_environment(runs, seeds):
+    """Return the test returns of these seeds: a row per seed, a column per environment."""
+    chosen = runs[runs["seed"].isin(list(seeds))]
+    return chosen.pivot(index="seed", columns="environment", values="test").reindex(
+        columns=ENVIRONMENTS
+    )
+
+
+def spell_average(row):
+    """Write a row of the paper's averages over environments: mean ± standard deviation."""
+    average, std = row["average_improvement_percent"], row["std_improvement_percent"]
+    return f"{average:+.0f} ± {std:.0f} %"
 
 
 def markdown(columns):

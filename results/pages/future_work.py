@@ -9,8 +9,8 @@ number in it.
 import json
 
 import pandas as pd
-from claims import ENDING
 from common import DATA, RESULTS, compare_rows, markdown, read_returns, render
+from helpful import ENDING
 
 from analysis.runs import FIRST_CONFIRMATION_SEED
 from analysis.statistics import contrast, holm

@@ -13,7 +13,6 @@ from functools import cache
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
-from claims import FAR_ABOVE
 from common import (
     DATA,
     RESULTS,
@@ -23,6 +22,7 @@ from common import (
     read_returns,
     render,
 )
+from helpful import FAR_ABOVE
 
 from analysis.figures import STYLE
 from analysis.robustness import (

@@ -1,12 +1,12 @@
 """Runs that are still to come, made up: the scale of PPO's noise, and SAC's steps to a return."""
 
 import ablation
-import claims
 import common
 import headline
 import numpy as np
 import pandas as pd
 import pytest
+import readme
 from scipy import stats
 
 from analysis.paper import read_paper
@@ -156,7 +156,7 @@ def test_the_sections_appear_with_the_runs(monkeypatch, tmp_path):
     monkeypatch.setattr(ablation, "read_ablation", lambda: runs)
     found = (STEPS, curves(7900, 8000, 8100), 2 * curves(9000, 9100, 3000))
     monkeypatch.setattr(headline, "read_curves", lambda: found)
-    page = claims.page()
+    page = readme.page()
     for text in (
         "3 of 10 seeds are complete",
         "`RandomUniformScaleReward`: p = 0.0002",

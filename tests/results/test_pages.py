@@ -1,18 +1,23 @@
-"""The page of results: its numbers are those of claims.py, and claims.py's are right."""
+"""The pages of results: they are what their scripts write, and their numbers are right."""
 
 import json
 
-import claims
 import common
 import future_work
+import harmful
+import helpful
 import numpy as np
 import pandas as pd
+import paper_tables
 import pytest
+import readme
+import reconstruction
 import reward_scale
 import robustness
 from gymnasium.wrappers import NormalizeReward
 from scipy import stats
 
+from analysis.paper import read_paper, with_luck
 from analysis.runs import read_runs
 from analysis.verdicts import detectable_shift
 
@@ -21,7 +26,7 @@ RESULTS, DATA = common.RESULTS, common.DATA
 
 @pytest.mark.slow
 def test_the_page_is_what_its_command_writes():
-    assert (RESULTS / "README.md").read_text() == claims.page()
+    assert (RESULTS / "README.md").read_text() == readme.page()
     assert (RESULTS / "future_work.md").read_text() == future_work.page()
     assert (RESULTS / "robustness.md").read_text() == robustness.page()
 
@@ -104,17 +109,17 @@ def test_welch_is_scipys():
 
 def test_power_is_that_of_the_test():
     """Without an effect it is the level of the exact test, which is 0.043 for ten against ten."""
-    assert claims.power(0, 1, 10, 1, 10) == pytest.approx(0.043, abs=0.012)
-    assert claims.power(3, 1, 10, 1, 10) > 0.99
-    assert claims.power(50 * detectable_shift(10, 10), 50, 10, 50, 10) == pytest.approx(
+    assert helpful.power(0, 1, 10, 1, 10) == pytest.approx(0.043, abs=0.012)
+    assert helpful.power(3, 1, 10, 1, 10) > 0.99
+    assert helpful.power(50 * detectable_shift(10, 10), 50, 10, 50, 10) == pytest.approx(
         0.8, abs=0.03
     )
-    assert 0.02 < claims.power_of_levene(1, 10) < 0.06 and claims.power_of_levene(9, 10) > 0.9
+    assert 0.02 < helpful.power_of_levene(1, 10) < 0.06 and helpful.power_of_levene(9, 10) > 0.9
 
 
 def test_digits_shown_of_a_power_are_those_of_a_million_samples():
     """Of 2,000 samples they were 0.33 and 0.36."""
-    assert claims.power_of_levene(0.5, 10) == pytest.approx(0.308, abs=0.003)
+    assert helpful.power_of_levene(0.5, 10) == pytest.approx(0.308, abs=0.003)
     for n in (5, 10):
         assert detectable_shift(n, n) == pytest.approx(shift_of_many_samples(n), rel=0.004)
 
@@ -122,7 +127,7 @@ def test_digits_shown_of_a_power_are_those_of_a_million_samples():
 def shift_of_many_samples(n):
     """The shift that is found with 80 % power, from the power of two shifts beside it."""
     shifts = np.array([0.99, 1.01]) * detectable_shift(n, n)
-    powers = [claims.power(shift, 1, n, 1, n) for shift in shifts]
+    powers = [helpful.power(shift, 1, n, 1, n) for shift in shifts]
     return np.interp(0.8, powers, shifts)
 
 
@@ -142,38 +147,38 @@ def make_runs(seeds_of_noise, shift=0.0):
 
 
 def test_fresh_seeds_are_apart_and_only_whole_sets_are_shown():
-    runs = make_runs([("", range(1, 31), 0), (claims.ENDING, range(1, 31), 20)], shift=-20)
-    found = claims.pusher(runs)
+    runs = make_runs([("", range(1, 31), 0), (helpful.ENDING, range(1, 31), 20)], shift=-20)
+    found = helpful.pusher(runs)
     assert set(found["p"]) == {"fixed", "fresh", "all"}
     assert found["p"]["fixed"] < 1e-4 and found["p"]["fresh"] == pytest.approx(1)
     assert found["percent"]["fixed"] == pytest.approx(100 * 20 / 54.5)
     assert found["percent"]["fresh"] == pytest.approx(0)
-    incomplete = claims.pusher(runs[runs["seed"] != 30])
+    incomplete = helpful.pusher(runs[runs["seed"] != 30])
     assert set(incomplete["p"]) == {"fixed"}
-    truncated = make_runs([(claims.TRUNCATING, range(1, 21), 20)])
-    found = claims.pusher(pd.concat([runs, truncated]))
+    truncated = make_runs([(helpful.TRUNCATING, range(1, 21), 20)])
+    found = helpful.pusher(pd.concat([runs, truncated]))
     assert set(found["p"]) == {"fixed", "fresh", "all", "truncated", "ways"}
     assert found["p"]["truncated"] < 1e-4
 
 
 def test_the_five_comparisons_stay_on_seeds_1_to_10():
-    runs = make_runs([("", range(1, 31), 0), (claims.ENDING, range(1, 31), 20), ("N(1)", [1], 5)])
-    kept = claims.fixed_beforehand(runs, [("Pusher", claims.ENDING, "1.00")])
-    assert set(kept["seed"]) == set(range(1, 11)) and set(kept["noise"]) == {"", claims.ENDING}
-    other = claims.fixed_beforehand(runs, [("Hopper", claims.ENDING, "1.00")])
+    runs = make_runs([("", range(1, 31), 0), (helpful.ENDING, range(1, 31), 20), ("N(1)", [1], 5)])
+    kept = helpful.fixed_beforehand(runs, [("Pusher", helpful.ENDING, "1.00")])
+    assert set(kept["seed"]) == set(range(1, 11)) and set(kept["noise"]) == {"", helpful.ENDING}
+    other = helpful.fixed_beforehand(runs, [("Hopper", helpful.ENDING, "1.00")])
     assert set(other["noise"]) == {""} and len(other) == 10
 
 
 def test_the_sets_of_runs_are_whole():
     """The page names the seeds of each comparison; a run that is lost must not go unnoticed."""
     runs = common.read_returns(DATA / "runs")
-    few, cheetah = claims.FEW_SEEDS, [*claims.FIXED_SEEDS, *claims.CHEETAH_SEEDS]
+    few, cheetah = common.FEW_SEEDS, [*common.FIXED_SEEDS, *helpful.CHEETAH_SEEDS]
     expected = [
         ("PPO", "HalfCheetah", "", "0.00", cheetah),
         ("TD3", "HalfCheetah", "", "0.00", few),
     ]
-    expected += [("TD3", "HalfCheetah", claims.NORMAL, rate, few) for rate in ("0.01", "1.00")]
-    for noise, environments in claims.WORSE.items():
+    expected += [("TD3", "HalfCheetah", harmful.NORMAL, rate, few) for rate in ("0.01", "1.00")]
+    for noise, environments in harmful.WORSE.items():
         expected += [("PPO", environment, noise, "1.00", few) for environment in environments]
     keys = ["algorithm", "environment", "noise", "noise_rate"]
     found = runs.groupby(keys)["seed"].apply(sorted)
@@ -195,9 +200,9 @@ def test_worse_noises_by_hand(monkeypatch):
         for seed in seeds
     ]
     runs = pd.DataFrame(rows, columns=list(make_runs([]).columns))
-    paper = claims.read_paper(RESULTS / "paper")
-    monkeypatch.setattr(claims, "WORSE", {plain_mixup: claims.WORSE[plain_mixup]})
-    found = claims.worse_noises(runs, paper)
+    paper = read_paper(RESULTS / "paper")
+    monkeypatch.setattr(harmful, "WORSE", {plain_mixup: harmful.WORSE[plain_mixup]})
+    found = harmful.worse_noises(runs, paper)
     assert found[plain_mixup]["average"] == pytest.approx(-50 / 3, abs=1e-3)
     assert found[plain_mixup]["lowest"] == ["HalfCheetah", "Pusher"]
     # U is 0 + 0 + 50 of 150: the null is the sum of three independent Mann-Whitney statistics
@@ -215,13 +220,13 @@ def test_the_two_mixtures_by_hand():
         for name, change in (("HalfCheetah", -5.0), ("Pusher", -2.0), ("Walker2d", 2.0))
         for noise, rate, seeds, gain, spread in (
             ("", "0.00", range(1, 31), 0.0, 0.0),
-            (claims.MIXUP, "1.00", range(1, 6), change, 0.1),
-            (claims.PLAIN_MIXUP, "1.00", range(1, 6), change - 1, 0.2),
+            (harmful.MIXUP, "1.00", range(1, 6), change, 0.1),
+            (harmful.PLAIN_MIXUP, "1.00", range(1, 6), change - 1, 0.2),
         )
         for seed in seeds
     ]
-    paper = claims.read_paper(RESULTS / "paper")
-    found = claims.mixtures(pd.DataFrame(rows, columns=list(make_runs([]).columns)), paper)
+    paper = read_paper(RESULTS / "paper")
+    found = reconstruction.mixtures(pd.DataFrame(rows, columns=list(make_runs([]).columns)), paper)
     assert found["recursive"] == pytest.approx(-50 / 3)
     assert found["plain"] == pytest.approx(-80 / 3) and found["difference"] == pytest.approx(10)
     assert found["needed"] == pytest.approx((5 * -76.4 + 80) / 2)  # the paper has -76.4 on average
@@ -232,14 +237,14 @@ def test_the_two_mixtures_by_hand():
 
 
 def test_td3_with_noise_is_compared_on_halfcheetah_and_five_seeds():
-    paper = claims.read_paper(RESULTS / "paper")
+    paper = read_paper(RESULTS / "paper")
     names = ["environment", "noise", "noise_rate", "seed", "test"]
     here, other = "HalfCheetah", "Hopper"
     rows = [(here, "", "0.00", seed, 100.0 + seed) for seed in range(1, 7)]
-    rows += [(here, claims.NORMAL, "1.00", seed, 50.0 + seed) for seed in range(1, 6)]
-    rows += [(here, claims.NORMAL, "0.01", seed, 101.5 + seed) for seed in range(1, 6)]
-    rows += [(other, claims.NORMAL, "0.01", seed, 50.0 + seed) for seed in range(1, 6)]
-    found = claims.td3(pd.DataFrame(rows, columns=names), paper)
+    rows += [(here, harmful.NORMAL, "1.00", seed, 50.0 + seed) for seed in range(1, 6)]
+    rows += [(here, harmful.NORMAL, "0.01", seed, 101.5 + seed) for seed in range(1, 6)]
+    rows += [(other, harmful.NORMAL, "0.01", seed, 50.0 + seed) for seed in range(1, 6)]
+    found = harmful.td3(pd.DataFrame(rows, columns=names), paper)
     assert "-33 ± 15 %" in found["table"] and "-92 ± 7 %" in found["table"]
     assert found["0.01"]["percent"] == pytest.approx(100 * 1.5 / 103)
     assert found["1.00"]["percent"] == pytest.approx(100 * -50 / 103)
@@ -251,7 +256,7 @@ def test_runs_that_end_far_above_the_rest_by_hand():
     runs = make_runs([("", range(1, 51), 0), ("RandomUniformNoisyReward(1)", range(1, 11), 0)])
     runs["environment"], runs["test"] = "HalfCheetah", 1000 - runs["seed"] / 1e6
     runs.loc[(runs["noise"] == "") & (runs["seed"] == 3), "test"] = 5000
-    found = claims.half_cheetah(runs, 30)
+    found = helpful.half_cheetah(runs, 30)
     assert found["fixed"]["count"] == 1 and found["tops"] == [5000]
     assert found["fixed"]["high"] == pytest.approx(44.5, abs=0.1)  # 1 of 10, Clopper and Pearson
     assert found["percent_of_rest"] == pytest.approx(0, abs=1e-3)
@@ -259,10 +264,10 @@ def test_runs_that_end_far_above_the_rest_by_hand():
     assert found["fresh"]["count"] == found["between"] == 0
     assert found["fresh"]["high"] == pytest.approx(100 * (1 - 0.025 ** (1 / 40)))
     assert found["luck"] == pytest.approx(100 * 10 / 50, abs=1.5)
-    assert claims.half_cheetah(runs, 41)["luck"] == 0
+    assert helpful.half_cheetah(runs, 41)["luck"] == 0
     for seed, value in ((11, 4000.0), (12, 3500.0), (13, 1750.0), (14, 2500.0), (15, 6000.0)):
         runs.loc[(runs["noise"] == "") & (runs["seed"] == seed), "test"] = value
-    found = claims.half_cheetah(runs, 30)  # a run above 3,000 is not between the groups as well
+    found = helpful.half_cheetah(runs, 30)  # a run above 3,000 is not between the groups as well
     assert (found["fresh"]["count"], found["between"], found["just_above"]) == (3, 2, [1750])
 
 
@@ -280,7 +285,9 @@ def test_the_interval_of_a_difference_is_scipys():
 def test_noise_and_baseline_of_a_seed_share_their_commit():
     """So that no change of the code can be taken for an effect, in the comparisons fixed before."""
     runs = read_runs(DATA / "runs").query("algorithm == 'PPO' and seed <= 10")
-    late = runs["noise"].isin([claims.NORMAL, claims.TRUNCATING, claims.MIXUP, claims.PLAIN_MIXUP])
+    late = runs["noise"].isin(
+        [harmful.NORMAL, helpful.TRUNCATING, harmful.MIXUP, harmful.PLAIN_MIXUP]
+    )
     runs = runs[~late].assign(
         commit=[
             json.loads((DATA / "runs" / run / "config.json").read_text())["git_commit"]
@@ -293,37 +300,39 @@ def test_noise_and_baseline_of_a_seed_share_their_commit():
 
 def test_the_luck_of_the_winners_spread():
     """The best of useless noises with ten times the spread is easily as good as the paper's."""
-    paper = claims.read_paper(RESULTS / "paper")
+    paper = read_paper(RESULTS / "paper")
     alike = paper["best"].assign(noisy_std=paper["best"]["baseline_std"])
-    p = claims.with_luck(paper)[0]["best"]["p_luck"].min()
-    assert claims.luck_with_the_winners_spread({"best": alike})["p"] == pytest.approx(p, abs=0.03)
+    p = with_luck(paper)[0]["best"]["p_luck"].min()
+    assert paper_tables.luck_with_the_winners_spread({"best": alike})["p"] == pytest.approx(
+        p, abs=0.03
+    )
     wide = paper["best"].assign(noisy_std=10 * paper["best"]["baseline_std"])
-    assert claims.luck_with_the_winners_spread({"best": wide})["p"] > 0.9
+    assert paper_tables.luck_with_the_winners_spread({"best": wide})["p"] > 0.9
 
 
 # ---------------------------------------------------------------------- what the paper's tables say
 
 
 def test_what_the_papers_tables_say_by_hand():
-    paper = claims.read_paper(RESULTS / "paper")
-    found = claims.rates(paper)
+    paper = read_paper(RESULTS / "paper")
+    found = paper_tables.rates(paper)
     assert [found[name]["count"] for name in found] == [6, 3, 14]
     assert found["best"]["p"] == pytest.approx(stats.binomtest(6, 15, 1 / 6).pvalue)
-    found = claims.mixture(paper)["TD3"]
+    found = reconstruction.mixture(paper)["TD3"]
     assert found["fifth"] == pytest.approx(5 * -269.8 + 400)
     assert found["std_then"] == pytest.approx((found["fifth"] + 100) / -np.sqrt(5))
     assert found["std_then"] == pytest.approx(found["std"], rel=0.01)
-    kinds = claims.kinds(paper)
+    kinds = paper_tables.kinds(paper)
     assert "| PPO | 0" in kinds["table"]
     assert kinds["fisher"] == pytest.approx({"observation": 2 / 252, "reward": 12 / 252})
-    worse = claims.worse_everywhere(paper)
+    worse = paper_tables.worse_everywhere(paper)
     assert worse["of"]["RandomNormalNoisyObservation(1.0)"] == 3 + 5 + 6
     assert (worse["at_every_rate"], worse["next"]) == (1, 5)
 
 
 def test_a_noise_in_all_three_algorithms_by_luck():
     """P(consistent at one of six rates) cubed; a single rate has 6/32."""
-    found = claims.scaled_rewards(claims.read_paper(RESULTS / "paper"))
+    found = paper_tables.scaled_rewards(read_paper(RESULTS / "paper"))
     assert (6 / 32) ** 3 < found["this"] / 100 < 0.7**3
     assert found["this"] < found["any"] < 15 * found["this"]
 
