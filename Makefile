@@ -31,6 +31,9 @@ results: $(BIN)/.run
 	cp results/report/curves_PPO_RandomEarlyTermination_50.svg results/figures
 	$(BIN)/python results/pages/readme.py
 	$(BIN)/python results/pages/baselines.py
+	$(BIN)/python results/pages/ablation.py
+	$(BIN)/python results/pages/reconstruction.py
+	$(BIN)/python results/pages/data_readme.py
 	$(BIN)/python results/pages/future_work.py
 	$(BIN)/python results/pages/robustness.py
 	$(BIN)/python results/pages/precision.py

@@ -8,9 +8,10 @@ rule was fixed before any run: for each noise, is the return the same at all val
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
-from common import DATA, ENVIRONMENTS, RESULTS, markdown, plain, read_returns
+from common import DATA, ENVIRONMENTS, RESULTS, markdown, plain, read_returns, render
 from scipy import stats
 
+from analysis.paper import read_paper
 from analysis.statistics import MIN_SEEDS, holm, improvement_percent
 from noisy_wrappers import canonical_noises
 from sweep.grid import ABLATION, SEEDS
@@ -63,12 +64,7 @@ def same_at_all_scales(returns):
 
 def verdict(p):
     """Return the verdict on "sensitive to the scale" from {wrapper: p after Holm's correction}."""
-    sensitive = [wrapper for wrapper, value in p.items() if value <= 0.05]
-    if len(sensitive) == len(p):
-        return "**Holds** for both noises"
-    if sensitive:
-        return f"**Holds** for `{sensitive[0]}`, not shown for the other noise"
-    return "**Not shown**"
+    return "confirmed" if max(p.values()) <= 0.05 else "undecided"
 
 
 def numbers(runs, paper):
@@ -79,7 +75,7 @@ def numbers(runs, paper):
     seeds = sorted(set(runs["seed"]))
     found = {"whole_seeds": len(seeds), "planned_seeds": len(PLANNED_SEEDS)}
     if len(seeds) < MIN_SEEDS:
-        return found | {"table": None, "p": None, "verdict": "**Not decided**: too few runs"}
+        return found | {"table": None, "p": None, "verdict": "not tested"}
     by = runs.pivot(index=["environment", "noise"], columns="seed", values="test")
     averages = paper["consistent"].query("algorithm == 'PPO'").set_index(["noise", "noise_rate"])
     rows, p = [], {}
@@ -129,8 +125,20 @@ def draw(runs):
     plt.close(fig)
 
 
+def page():
+    """Return the text of ablation.md."""
+    paper = read_paper(RESULTS / "paper")
+    return render("ablation.md.jinja", {"ablation": numbers(read_ablation(), paper)})
+
+
 def draw_if_whole():
     """Draw the figure if the page shows it."""
     runs = plain(read_ablation())
     if runs["seed"].nunique() >= MIN_SEEDS:
         draw(runs)
+
+
+if __name__ == "__main__":
+    draw_if_whole()
+    (RESULTS / "ablation.md").write_text(page())
+    print(f"Wrote {RESULTS / 'ablation.md'}")

@@ -76,7 +76,8 @@ def welch(x, y):
 def compare_rows(name, x, y):
     """Compare samples x and y of test returns: a row of a table, and its numbers.
 
-    They are the exact p, and the difference of the means, in percent and with its interval.
+    They are the number `n` of x, the exact p, the `difference` of the means with its interval `low`
+    to `high`, and the same in percent of the mean of y: `percent`, `low_percent`, `high_percent`.
     """
     p, _ = mann_whitney(np.array(x)[:, None], np.array(y)[:, None])
     mean, other = np.mean(x), np.mean(y)
@@ -93,7 +94,8 @@ def compare_rows(name, x, y):
         "p": f"{p:.2g}",
     }
     numbers = {"p": p, "percent": percent, "difference": mean - other}
-    return row, numbers | {"low": low, "high": high}
+    numbers |= {"low": low, "high": high, "n": len(x)}
+    return row, numbers | {f"{k}_percent": 100 * numbers[k] / abs(other) for k in ("low", "high")}
 
 
 def cells(form, *columns):

@@ -11,11 +11,12 @@ from common import (
     spell_average,
 )
 
-from analysis.statistics import improvement_percent, mann_whitney
+from analysis.statistics import contrast, improvement_percent, mann_whitney
 from analysis.verdicts import power as finds
 
 MIXUP = "RandomMixupObservation(0.0, recursive=True)"
 PLAIN_MIXUP = "RandomMixupObservation(0.0)"
+TD3_RATES = ("0.01", "1.00")  # the ends of the paper's
 NORMAL = "RandomNormalNoisyObservation(1.0)"
 # Noises of PPO at p = 1 that the paper finds worse everywhere, and mixup without a memory of the
 # mixture beside: which of the two did the paper run?
@@ -42,6 +43,11 @@ def worse_noises(runs, paper):
         change = improvement_percent(noisy.mean(), without.mean())
         p, _ = mann_whitney(noisy, without)
         found[noise] = {"change": change.to_dict(), "average": change.mean(), "p": p}
+        found[noise]["n"] = len(noisy)
+        found[noise]["interval"] = average_interval(noisy, without)
+        found[noise]["alone_interval"] = {
+            e: average_interval(noisy[[e]], without[[e]]) for e in environments
+        }
         found[noise]["lowest"] = list(change.index[noisy.max() < without.min()])
         found[noise]["alone"] = {e: mann_whitney(noisy[[e]], without[[e]])[0] for e in environments}
         found[noise]["finds"] = {e: finds(noisy[e], without[e], 0)[0] for e in environments}
@@ -56,6 +62,14 @@ def worse_noises(runs, paper):
     return {"table": markdown(rows), **found}
 
 
+def average_interval(noisy, without):
+    """Return the 95 % interval of the change in percent, averaged over environments (columns)."""
+    scale = 100 / without.mean().abs() / noisy.shape[1]
+    samples = [table[name].to_numpy() for table in (noisy, without) for name in table]
+    _, _, low, high = contrast(samples, [*scale, *-scale])
+    return low, high
+
+
 def td3(runs, paper):
     """TD3 on HalfCheetah with a noise that the paper finds worse everywhere at every rate."""
     theirs = paper["consistently_worse"].query("algorithm == 'TD3' and noise == @NORMAL")
@@ -63,10 +77,11 @@ def td3(runs, paper):
     runs = runs.query("environment == 'HalfCheetah' and seed in @FEW_SEEDS")
     base = runs[runs["noise"] == ""]["test"]
     rows, found = [], {}
-    for rate in ("0.01", "1.00"):
+    for rate in TD3_RATES:
         noisy = runs.query("noise == @NORMAL and noise_rate == @rate")["test"]
         row, found[rate] = compare_rows(f"p = {float(rate):g}", noisy, base)
         rows.append(row | {"the paper": spell_average(theirs.loc[rate])})
     names = {"first": "with noise", "second": "without", "of the second": "change"}
     names["p"] = "p (exact)"
-    return {"table": markdown(pd.DataFrame(rows).rename(columns=names)), **found}
+    table = markdown(pd.DataFrame(rows).rename(columns=names))
+    return {"table": table, "rates": TD3_RATES, **found}

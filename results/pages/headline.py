@@ -109,5 +109,5 @@ def spell_steps(value):
 def verdict(steps_with_noise, is_faster, p):
     """Return the verdict: the mean curve is there before half of the steps, and not by chance."""
     if not steps_with_noise < TOTAL / 2:
-        return "**Not seen**"
-    return "**Holds**" if is_faster and p <= LEVEL else "**Seen, not beyond chance**"
+        return "undecided"
+    return "confirmed" if is_faster and p <= LEVEL else "undecided"

@@ -104,23 +104,20 @@ def five_noises(base, noisy, paper_base, paper_noisy, percent, statistics):
             "the paper": cells("{} ({:+.1f} %)", spell(paper_noisy), percent),
             "ours": cells("{} ({:+.1f} %)", spell(x), 100 * gain / y["mean"].abs()),
             **improvements(tested),
+            "power (at 1 %)": cells("{:.2f} ({:.2f})", found, strict),
+            "gains differ by SE": cells("{:+.1f}", (gain - paper_gain) / error),
             "p": tested["p"].to_numpy(float),
         }
     )
     corrected = holm(tested["p"].to_numpy(float))
     return {
         "table": text,
-        "power": markdown(
-            {
-                "": names,
-                "the paper's gain": cells("{:+,.1f}", paper_gain),
-                "ours [95 %]": cells("{:+,.1f} [{:,.1f}, {:,.1f}]", gain, low, high),
-                "power to find the paper's": cells("{:.2f}", found),
-                "at p = 0.01": cells("{:.2f}", strict),
-                "gains differ by SE": cells("{:+.1f}", (gain - paper_gain) / error),
-            }
-        ),
         "percent": (100 * gain / y["mean"].abs()).to_dict(),
+        "low": (100 * low / y["mean"].abs()).to_dict(),
+        "high": (100 * high / y["mean"].abs()).to_dict(),
+        "n": x["n"].to_dict(),
+        "noise": noise["noise"].to_dict(),
+        "power_at_5": dict(zip(names, found, strict=True)),
         "paper_percent": percent.to_dict(),
         "p": tested["p"].to_dict(),
         "holm": dict(zip(names, corrected, strict=True)),
@@ -147,30 +144,20 @@ def spread(base, noisy, paper_base, paper_noisy):
             strict=True,
         )
     ]
-    text = markdown(
-        {
-            "": x.index,
-            "without noise": cells("{:,.1f}", y["std"]),
-            "with noise": cells("{:,.1f}", x["std"]),
-            "change": cells("{:+.0f} %", 100 * (x["std"] / y["std"] - 1)),
-            "the paper": cells("{:+.0f} %", 100 * (paper_noisy["std"] / paper_base["std"] - 1)),
-            "p": p,
-        }
-    )
-    return {"table": text, "power": power_of_levene(0.5, 10), "smallest": min(p)}
+    return {
+        "change": (100 * (x["std"] / y["std"] - 1)).to_dict(),
+        "paper_change": (100 * (paper_noisy["std"] / paper_base["std"] - 1)).to_dict(),
+        "p": dict(zip(x.index, p, strict=True)),
+        "holm": dict(zip(x.index, holm(np.array(p)), strict=True)),
+        "power": power_of_levene(0.5, 10),
+    }
 
 
 def speed(summary):
     """The first test at which PPO's mean over seeds is at the baseline's final mean."""
     start = summary[summary["noise"] == ""].set_index("environment")["steps_to_baseline"]
     noisy = summary[summary["noise"] != ""].set_index("environment")["steps_to_baseline"]
-    return markdown(
-        {
-            "": noisy.index,
-            "without noise": cells("{:,.0f}", start.loc[noisy.index]),
-            "with noise": cells("{:,.0f}", noisy),
-        }
-    )
+    return {"without": start.to_dict(), "with": noisy.to_dict()}
 
 
 def pusher(runs):
@@ -281,5 +268,9 @@ def sac(early, statistics):
     return {
         "table": text,
         "p": noisy["p"].to_dict(),
+        "percent": noisy["improvement_iqm_percent"].to_dict(),
+        "low": noisy["improvement_low"].to_dict(),
+        "high": noisy["improvement_high"].to_dict(),
+        "n": noisy["n"].to_dict(),
         "finds": noisy["detectable_percent"].to_dict(),
     }

@@ -1,13 +1,12 @@
 """Write results/README.md from the runs in data/: python results/pages/readme.py.
 
-README.md.jinja has the text; every number in it is computed here, in paper_tables.py, helpful.py,
-harmful.py and reconstruction.py.
+README.md.jinja has the text. paper_tables.py, helpful.py, harmful.py and robustness.py compute its
+numbers, and verdicts.py makes the verdicts from them.
 """
-
-import json
 
 import ablation
 import headline
+import verdicts
 from common import DATA, RESULTS, plain, read_returns, render
 from harmful import MIXUP, NORMAL, PLAIN_MIXUP, td3, worse_noises
 from helpful import (
@@ -32,31 +31,14 @@ from paper_tables import (
     scaled_rewards,
     worse_everywhere,
 )
-from reconstruction import mixture, mixtures, reward_scale
+from reconstruction import reward_scale
+from robustness import by_noise, scores, tests
 
 from analysis.luck import DRAWS, FALSE_ALARMS_IN_THE_PAPER, POWER_IN_THE_PAPER
 from analysis.paper import PAPER_SEEDS, read_paper, with_luck
+from analysis.robustness import is_unseen
 from analysis.runs import make_studies, read_runs
 from analysis.tables import make_tables
-
-
-def noise_rates(folder):
-    """The largest distance of a realised noise rate from p, in binomial standard deviations."""
-    largest = 0
-    for path in sorted(folder.glob("*/result.json")):
-        args = json.loads((path.parent / "config.json").read_text())["args"]
-        counts = json.loads(path.read_text())["noise_applied"].values()
-        for rate, (applied, calls) in zip(args["noise_rate"], counts, strict=True):
-            deviation = (calls * rate * (1 - rate)) ** 0.5
-            if deviation:
-                largest = max(largest, abs(applied - calls * rate) / deviation)
-    return largest
-
-
-def commits(names):
-    """Count the commits that the runs of these names are from."""
-    configs = [json.loads((DATA / "runs" / name / "config.json").read_text()) for name in names]
-    return len({config["git_commit"] for config in configs})
 
 
 def numbers():
@@ -85,9 +67,7 @@ def numbers():
     five = make_tables(make_studies(five_runs)[0])
     five_statistics, five_summary = (plain(five[n].frame) for n in ("statistics", "summary_PPO"))
     five_statistics = five_statistics[five_statistics["p"].notna()]
-    counts = returns.groupby("algorithm").size()
     return {
-        "runs": ", ".join(f"{name} {n}" for name, n in counts.items()),
         "draws": f"{DRAWS:,}",
         "alarms": FALSE_ALARMS_IN_THE_PAPER,
         "finds_best": POWER_IN_THE_PAPER,
@@ -102,7 +82,6 @@ def numbers():
         "kinds": kinds(paper),
         "scaled": scaled_rewards(paper),
         "worse": worse_everywhere(paper),
-        "mixture": mixture(paper),
         "paper_spread": paper_spread(paper),
         "paper_speed": paper_speed(paper),
         "five": five_noises(
@@ -113,23 +92,21 @@ def numbers():
         "pusher": pusher(ppo) | {"step": other_step(read_returns(DATA / "choice"), ppo)},
         "half_cheetah": half_cheetah(ppo, best["improvement_percent"]["HalfCheetah"]),
         "worse_noises": worse_noises(ppo, paper),
-        "mixtures": mixtures(ppo, paper),
         "td3": td3(returns.query("algorithm == 'TD3'"), paper),
         "sac": sac(early, statistics),
         "ablation": ablation.numbers(ablation.read_ablation(), paper),
         "headline": headline.numbers(headline.read_curves()),
-        "rate_error": noise_rates(DATA / "runs"),
-        "commits": commits(five_runs["run"]),
         "scale": reward_scale(),
+        "unseen": by_noise(scores(tests(), is_unseen)),
     }
 
 
 def page():
     """Return the text of README.md."""
-    return render("README.md.jinja", numbers())
+    found = numbers()
+    return render("README.md.jinja", found | {"claims": verdicts.table(found)})
 
 
 if __name__ == "__main__":
-    ablation.draw_if_whole()
     (RESULTS / "README.md").write_text(page())
     print(f"Wrote {RESULTS / 'README.md'}")

@@ -1,11 +1,24 @@
-"""What the paper probably ran: which mixture, and the scale of its rewards."""
+"""Write results/reconstruction.md from the runs in data/: python results/pages/reconstruction.py.
+
+What the paper probably ran: which mixture, which dropout, and the scale of its rewards.
+reconstruction.md.jinja has the text, this file every number in it.
+"""
 
 import numpy as np
 import pandas as pd
-from common import DATA, ENVIRONMENTS, FEW_SEEDS, FIXED_SEEDS, by_environment
-from harmful import MIXUP, PLAIN_MIXUP, WORSE
+from common import (
+    DATA,
+    ENVIRONMENTS,
+    FEW_SEEDS,
+    FIXED_SEEDS,
+    RESULTS,
+    by_environment,
+    read_returns,
+    render,
+)
+from harmful import MIXUP, PLAIN_MIXUP, WORSE, worse_noises
 
-from analysis.paper import PAPER_SEEDS
+from analysis.paper import PAPER_SEEDS, read_paper
 from analysis.statistics import contrast, improvement_percent
 
 
@@ -66,3 +79,26 @@ def reward_scale():
     """The standard deviation by which PPO would divide its reward on Pusher (reward_scale.py)."""
     table = pd.read_csv(DATA / "reward_scale/reward_scale.csv").fillna({"noise": ""})
     return table.set_index(["noise", "begins_anew_when"])["std"].to_dict()
+
+
+def numbers():
+    """Compute all that the page says."""
+    paper = read_paper(RESULTS / "paper")
+    ppo = read_returns(DATA / "runs").query("algorithm == 'PPO'")
+    return {
+        "plain_mixup": PLAIN_MIXUP,
+        "mixup": worse_noises(ppo, paper)[MIXUP],
+        "mixture": mixture(paper),
+        "mixtures": mixtures(ppo, paper),
+        "scale": reward_scale(),
+    }
+
+
+def page():
+    """Return the text of reconstruction.md."""
+    return render("reconstruction.md.jinja", numbers())
+
+
+if __name__ == "__main__":
+    (RESULTS / "reconstruction.md").write_text(page())
+    print(f"Wrote {RESULTS / 'reconstruction.md'}")

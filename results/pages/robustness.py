@@ -189,7 +189,9 @@ def own_noise_table(own):
 def kept(found, counts):
     """Compare the shares of their own clean return that policies keep under noise, in percent.
 
-    The conditions that count and the averages are those of the score.
+    The conditions that count and the averages are those of the score: `share` is a mean of the
+    policies' ratios. `of_means` is the ratio of the policies' mean returns, which a policy with a
+    small clean return does not dominate; it is averaged over environments.
     """
     policy = ["noise", "environment", "seed"]
     clean = found[found["test_noise"] == ""].set_index(policy)["mean"].rename("clean")
@@ -204,11 +206,15 @@ def kept(found, counts):
         shares = tested[mask].groupby(policy)["share"].mean()
         x, y = (shares[name].unstack("environment") for name in (noise, ""))
         n = x.shape[1]
+        means = tested[mask].groupby(["noise", "environment"])[["mean", "clean"]].mean()
+        of_means = 100 * (means["mean"] / means["clean"]).groupby("noise").mean()
         samples = [table[name].to_numpy() for table in (x, y) for name in table]
         difference, _, low, high = contrast(samples, [1 / n] * n + [-1 / n] * n)
         result[SHORT[noise]] = {
             "share": x.mean().mean(),
             "baseline_share": y.mean().mean(),
+            "of_means": of_means[noise],
+            "baseline_of_means": of_means[""],
             "difference": difference,
             "low": low,
             "high": high,
@@ -230,6 +236,8 @@ def shares_table(unseen, seen):
                     "without noise": f"{row['baseline_share']:.0f} %",
                     "difference [95 %]": "{difference:+.0f} [{low:.0f}, {high:.0f}]".format(**row),
                     "p (exact)": f"{row['p']:.1g}",
+                    "ratio of means": f"{row['of_means']:.0f} %",
+                    "ratio of means, without noise": f"{row['baseline_of_means']:.0f} %",
                 }
             )
     return markdown(rows)

@@ -2,7 +2,9 @@
 
 import json
 
+import ablation
 import common
+import data_readme
 import future_work
 import harmful
 import helpful
@@ -25,10 +27,19 @@ RESULTS, DATA = common.RESULTS, common.DATA
 
 
 @pytest.mark.slow
-def test_the_page_is_what_its_command_writes():
-    assert (RESULTS / "README.md").read_text() == readme.page()
-    assert (RESULTS / "future_work.md").read_text() == future_work.page()
-    assert (RESULTS / "robustness.md").read_text() == robustness.page()
+@pytest.mark.parametrize(
+    ("script", "path"),
+    [
+        (readme, "README.md"),
+        (ablation, "ablation.md"),
+        (data_readme, "data/README.md"),
+        (future_work, "future_work.md"),
+        (reconstruction, "reconstruction.md"),
+        (robustness, "robustness.md"),
+    ],
+)
+def test_a_page_is_what_its_command_writes(script, path):
+    assert (RESULTS / path).read_text() == script.page()
 
 
 def test_an_interaction_that_would_be_seen_is_about_as_large_as_the_noises_gain():
@@ -65,6 +76,12 @@ def test_the_robustness_on_the_page_is_that_of_the_episodes():
         returns = tested.groupby("environment")["episodic_return"].mean()
         return (100 * (returns - clean) / clean.abs()).mean()
 
+    def ratio_of_means(policies, noises):
+        tested = policies[policies["noise"].str.split("(").str[0].isin(noises)]
+        own = policies[policies["noise"] == ""].groupby("environment")["episodic_return"].mean()
+        means = tested.groupby("environment")["episodic_return"].mean()
+        return 100 * (means / own).mean()
+
     def kept(policies, noises):
         tested = policies[policies["noise"].str.split("(").str[0].isin(noises)]
         policy = ["environment", "seed"]
@@ -88,6 +105,8 @@ def test_the_robustness_on_the_page_is_that_of_the_episodes():
         difference = score(noisy, noises) - score(baseline, noises)
         assert found[name]["difference"] == pytest.approx(difference)
         assert shares[name]["share"] == pytest.approx(kept(noisy, noises))
+        assert shares[name]["of_means"] == pytest.approx(ratio_of_means(noisy, noises))
+        assert shares[name]["baseline_of_means"] == pytest.approx(ratio_of_means(baseline, noises))
         assert shares[name]["baseline_share"] == pytest.approx(kept(baseline, noises))
 
 
@@ -323,7 +342,7 @@ def test_what_the_papers_tables_say_by_hand():
     assert found["std_then"] == pytest.approx((found["fifth"] + 100) / -np.sqrt(5))
     assert found["std_then"] == pytest.approx(found["std"], rel=0.01)
     kinds = paper_tables.kinds(paper)
-    assert "| PPO | 0" in kinds["table"]
+    assert kinds["counts"]["PPO"] == {"observation": 0, "reward": 4, "dynamics": 1}
     assert kinds["fisher"] == pytest.approx({"observation": 2 / 252, "reward": 12 / 252})
     worse = paper_tables.worse_everywhere(paper)
     assert worse["of"]["RandomNormalNoisyObservation(1.0)"] == 3 + 5 + 6

@@ -1,0 +1,231 @@
+"""The table of claims in results/README.md: the verdicts, and the rules that make them.
+
+A verdict is about our runs. It is made from their numbers, never written by hand.
+"""
+
+from common import markdown
+from harmful import MIXUP, NORMAL
+from helpful import ENDING, ENDING_ANYWHERE
+
+CONFIRMED, CONTRADICTED = "confirmed", "contradicted"
+UNDECIDED, NOT_TESTED = "undecided", "not tested"
+LEVEL = 0.05
+PERCENT = ("percent", "low_percent", "high_percent")  # an estimate and its interval
+
+
+def of_effect(effect, p, claimed=1):
+    """Judge one effect: p is corrected where several were tested; claimed is its sign, 1 or -1."""
+    if p > LEVEL:
+        return UNDECIDED
+    return CONFIRMED if effect * claimed > 0 else CONTRADICTED
+
+
+def of_all(verdicts):
+    """Judge the claim that something holds in every case, from the verdicts on the cases."""
+    if CONTRADICTED in verdicts:
+        return CONTRADICTED
+    return CONFIRMED if set(verdicts) == {CONFIRMED} else UNDECIDED
+
+
+def of_some(verdicts):
+    """Judge the claim that something holds in some cases, from the verdicts on the cases.
+
+    Tests never show that it holds in none, so such a claim is not contradicted.
+    """
+    return CONFIRMED if CONFIRMED in verdicts else UNDECIDED
+
+
+def beyond_luck(p):
+    """Say how many of these P(luck) are at most 5 %."""
+    count = sum(value <= LEVEL for value in p)
+    return f"{count if count else 'none'} of {len(p)}"
+
+
+def gains(numbers):
+    """Judge PPO's best noise in each environment: {environment: verdict}.
+
+    By Holm's p over seeds 1 to 10; on Pusher, which had the smallest p, by the fresh seeds.
+    """
+    five, pusher = numbers["five"], numbers["pusher"]
+    found = {name: of_effect(five["percent"][name], p) for name, p in five["holm"].items()}
+    found["Pusher"] = of_effect(pusher["percent"]["fresh"], pusher["p"]["fresh"])
+    return found
+
+
+def losses(found):
+    """Judge the loss in each environment of a noise of harmful.worse_noises."""
+    return {name: of_effect(found["change"][name], p, -1) for name, p in found["alone"].items()}
+
+
+def td3_losses(found):
+    """Judge the loss of TD3 at each of two rates, with Bonferroni's correction."""
+    return [of_effect(found[rate]["percent"], 2 * found[rate]["p"], -1) for rate in found["rates"]]
+
+
+def interval(value, low, high, form="+.0f"):
+    """Write an estimate with its interval, in percent."""
+    return f"{value:{form}} % [{low:{form.strip('+')}}, {high:{form.strip('+')}}]"
+
+
+def claims(numbers):
+    """Return the rows of the table: (claim, section, the paper's evidence, ours, verdict)."""
+    five, pusher, step = numbers["five"], numbers["pusher"], numbers["pusher"]["step"]
+    by, luck = numbers["consistent"]["by"], numbers["luck"]
+    normal, mixup = numbers["worse_noises"][NORMAL], numbers["worse_noises"][MIXUP]
+    td3, sac, spread = numbers["td3"], numbers["sac"], numbers["spread"]
+    worse_at = numbers["worse"]["of"]
+    fisher, counts = numbers["kinds"]["fisher"]["observation"], numbers["kinds"]["counts"]
+    judged, rows = gains(numbers), []
+
+    def add(claim, section, paper, ours, verdict):
+        address = section if section.endswith(".md") else f"#{section}"
+        rows.append((claim, address, paper, ours, verdict))
+
+    ours = interval(*(pusher[key]["fresh"] for key in PERCENT))
+    add(
+        f"`{ENDING}` helps PPO on Pusher",
+        "pusher-early-termination-at-step-50",
+        f"{five['paper_percent']['Pusher']:+.0f} %",
+        f"{ours}, n = {pusher['n']['fresh']:.0f}, fresh seeds",
+        judged["Pusher"],
+    )
+    for name in (name for name in five["percent"] if name != "Pusher"):
+        ours = interval(five["percent"][name], five["low"][name], five["high"][name])
+        add(
+            f"Its best noise helps PPO on {name}",
+            "ppo-with-the-papers-best-noises",
+            f"{five['paper_percent'][name]:+.0f} %",
+            f"{ours}, n = {five['n'][name]}",
+            judged[name],
+        )
+    others = luck["improvement"][5:]
+    add(
+        "The best noise of SAC and TD3 helps in each environment",
+        "luck-the-best-of-90",
+        f"{others.min():+.0f} to {others.max():+.0f} %; {beyond_luck(luck['p'][5:])} beyond luck",
+        "\u2013",
+        NOT_TESTED,
+    )
+    for noise, found in ((NORMAL, normal), (MIXUP, mixup)):
+        ours = interval(found["average"], *found["interval"])
+        add(
+            f"`{noise}` harms PPO",
+            "noises-that-harm-ppo",
+            f"{found['paper']:+.0f} % on average",
+            f"{ours} on average, n = {found['n']}",
+            of_effect(found["average"], found["p"], -1),
+        )
+    worse = [sum(v == CONFIRMED for v in losses(found).values()) for found in (normal, mixup)]
+    low, high = normal["alone_interval"]["Pusher"]
+    add(
+        "They harm it in every environment",
+        "noises-that-harm-ppo",
+        "5 of 5",
+        f"{min(worse)} of 5; Pusher {interval(normal['change']['Pusher'], low, high)}, "
+        f"n = {normal['n']}",
+        of_all([*losses(normal).values(), *losses(mixup).values()]),
+    )
+    ours = " and ".join(interval(*(td3[rate][key] for key in PERCENT)) for rate in td3["rates"])
+    add(
+        f"`{NORMAL}` harms TD3 at the lowest and highest rate",
+        "a-noise-that-harms-td3",
+        "worse everywhere at 6 of 6 rates",
+        f"HalfCheetah: {ours}, n = {td3['1.00']['n']}",
+        of_all(td3_losses(td3)),
+    )
+    for name in ("observation noise", "action noise"):
+        row = numbers["unseen"][name]
+        points = "{difference:+.0f} points [{difference_low:.0f}, {difference_high:.0f}], n = {n}"
+        add(
+            f"{name.capitalize()} in training raises returns under other noise",
+            "robustness.md",
+            "conjecture",
+            points.format(**row),
+            of_effect(row["difference"], row["p_holm"]),
+        )
+    consistent = ", ".join(f"{name} {by[name]['consistent']}" for name in by)
+    add(
+        "Some noises are consistent",
+        "consistent-noises",
+        f"{consistent} of 90; by luck {by['SAC']['consistent_by_luck']:.0f} each",
+        "\u2013",
+        NOT_TESTED,
+    )
+    change = spread["change"]
+    add(
+        "Some noises reduce the variance",
+        "step-variance-and-speed",
+        f"smaller with {numbers['paper_spread']['lower']} of 15 best noises",
+        f"PPO: {min(change.values()):+.0f} to {max(change.values()):+.0f} %, n = 10",
+        of_some([of_effect(change[name], p, -1) for name, p in spread["holm"].items()]),
+    )
+    reward = five["reward"]
+    add(
+        "PPO gains from reward noise, TD3 from observation noise",
+        "luck-the-best-of-90",
+        f"{counts['PPO']['reward']} and {counts['TD3']['observation']} of 5 best noises "
+        f"(afterwards: p = {fisher:.2g})",
+        f"PPO: {reward['won']:.0f} of {reward['pairs']} pairs won, n = 10",
+        of_effect(reward["won"] / reward["pairs"] - 0.5, reward["p"]),
+    )
+    ours = " and ".join(
+        interval(sac["percent"][rate], sac["low"][rate], sac["high"][rate])
+        for rate in sac["percent"]
+    )
+    add(
+        f"`{numbers['scaled_reward']}` helps all algorithms",
+        "sacs-early-performance",
+        f"consistent in each; by luck in {numbers['scaled']['this']:.0f} %",
+        f"SAC: {ours}, n = 5",
+        of_all([of_effect(sac["percent"][rate], min(1, 2 * p)) for rate, p in sac["p"].items()]),
+    )
+    ours = interval(*(step[key] for key in PERCENT))
+    add(
+        "The step of early termination matters",
+        "step-variance-and-speed",
+        f"(1, 100) worse everywhere at {worse_at[ENDING_ANYWHERE]} of 18 rates, "
+        f"(50) at {worse_at[ENDING]}",
+        f"PPO on Pusher: {ours}, n = {step['n']}",
+        of_some([of_effect(abs(step["percent"]), step["p"])]),
+    )
+    headline, ablation = numbers["headline"], numbers["ablation"]
+    add(
+        "Noise halves the steps to the baseline's return",
+        "step-variance-and-speed",
+        f"SAC on HalfCheetah: by {numbers['paper_speed']['reached']} million",
+        f"p = {headline['p_steps']:.2g}, n = {headline['n']}" if headline else "\u2013",
+        headline["verdict"] if headline else NOT_TESTED,
+    )
+    p = ablation["p"]
+    ours = f"p = {' and '.join(f'{value:.2g}' for value in p.values())}, " if p else ""
+    add(
+        "PPO is sensitive to the scale of the noise",
+        "ablation.md",
+        "a figure without numbers",
+        f"{ours}{ablation['whole_seeds']} of {ablation['planned_seeds']} seeds" if p else "\u2013",
+        ablation["verdict"],
+    )
+    best = numbers["rates"]["best"]
+    add(
+        "p = 1 is seldom the best rate",
+        "rates-and-scaled-rewards",
+        f"{best['count']} of {best['of']}; by chance {best['expected']:.1f}",
+        "\u2013",
+        NOT_TESTED,
+    )
+    return rows
+
+
+def table(numbers):
+    """Write the table of claims."""
+    return markdown(
+        [
+            {
+                "claim": f"[{claim}]({section})",
+                "the paper's evidence": paper,
+                "ours [95 %]": ours,
+                "verdict": f"**{verdict}**",
+            }
+            for claim, section, paper, ours, verdict in claims(numbers)
+        ]
+    )
