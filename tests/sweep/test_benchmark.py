@@ -183,6 +183,7 @@ StateSaveLocation={folder}/state
 SlurmdSpoolDir={folder}/spool
 SlurmctldPidFile={folder}/slurmctld.pid
 SlurmdPidFile={folder}/slurmd.pid
+SlurmdPidFile={folder}/slurmd.pid
 """
     )
     (folder / "state").mkdir()
