@@ -137,7 +137,7 @@ def ablation_figure(study, summary, wrapper, noises):
     add_legend()
     caption = f"{study.name}, {wrapper}: final test return by parameters and noise rate. "
     caption += "Bars: mean over n seeds, whiskers \u00b1 one standard deviation; dotted: no noise."
-    return f"ablation_{slug(study.name)}_{wrapper}", fig, caption
+    return f"parameters_{slug(study.name)}_{wrapper}", fig, caption
 
 
 def bars(ax, place, rows, width, **look):

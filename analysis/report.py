@@ -19,7 +19,7 @@ SECTIONS = {
     "luck": "Luck",
     "statistics": "Statistics",
     "early_performance": "Learning curves",
-    "ablation": "Parameters",
+    "parameters": "Parameters",
     "interactions": "Two noises together",
     "robustness": "Robustness",
     "summary": "All results",

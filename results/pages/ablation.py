@@ -1,7 +1,7 @@
 """How sensitive PPO is to the scale of the noise: the runs in data/ablation/, and their figure.
 
 `./benchmark.sh ablation` trains them: two noises, five values of beta each, five environments. The
-paper calls PPO sensitive and shows bars without numbers. claims.py has the verdict on its page. The
+paper calls PPO sensitive and shows bars without numbers. results/README.md has the verdict. The
 rule was fixed before any run: for each noise, is the return the same at all values of beta?
 """
 

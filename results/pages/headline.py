@@ -1,7 +1,7 @@
 """The paper's headline: SAC on HalfCheetah reaches the baseline's final return in half the steps.
 
 With RandomUniformScaleReward(0.5, 1.5) at p = 0.01, the paper's figure and its table of early
-performance. Our runs are in data/long/; claims.py shows what is here.
+performance. Our runs are in data/long/; readme.py shows what is here.
 """
 
 import numpy as np

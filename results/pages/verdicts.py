@@ -127,10 +127,10 @@ def claims(numbers):
     )
     ours = " and ".join(interval(*(td3[rate][key] for key in PERCENT)) for rate in td3["rates"])
     add(
-        f"`{NORMAL}` harms TD3 at the lowest and highest rate",
+        f"`{NORMAL}` harms TD3 at the extreme rates",
         "a-noise-that-harms-td3",
-        "worse everywhere at 6 of 6 rates",
-        f"HalfCheetah: {ours}, n = {td3['1.00']['n']}",
+        "6 of 6 rates",
+        f"HalfCheetah, not side by side: {ours}, n = {td3['1.00']['n']}",
         of_all(td3_losses(td3)),
     )
     for name in ("observation noise", "action noise"):

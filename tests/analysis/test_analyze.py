@@ -930,7 +930,7 @@ def test_ablation_bars_stand_side_by_side(tmp_path):
     drawn = {
         n: f for n, f, _ in analysis.figures.figures(studies, analysis.tables.make_tables(studies))
     }
-    figure = drawn["ablation_SAC_RandomUniformScaleReward"]
+    figure = drawn["parameters_SAC_RandomUniformScaleReward"]
     (ax,) = figure.axes
     heights = [bar.get_height() for bar in ax.patches]
     np.testing.assert_equal(heights, [15, 30, NAN, 45, 60])
