@@ -21,6 +21,8 @@ from analysis.configurations import BASELINE, Configuration
 from analysis.formatting import P_VALUE, SHARE, WHOLE, Table
 from analysis.runs import KEYS, STUDY, study_name
 from analysis.statistics import (
+    DETECTABLE,
+    LEVEL,
     contrast,
     holm,
     improvement_percent,
@@ -28,7 +30,7 @@ from analysis.statistics import (
     mean_std,
     probability_of_improvement,
 )
-from analysis.verdicts import DETECTABLE, LEVEL, counted, p_value
+from analysis.verdicts import counted, p_value
 
 FILES = ("robustness.csv", "robustness.csv.gz")
 HEADER = ["noise", "noise_rate", "episode", "episodic_return", "episodic_length"]

@@ -10,14 +10,15 @@ from analysis.statistics import (
     MIN_SEEDS,
     bootstrap_iqm,
     contrast,
+    detectable_percent,
     improvement_percent,
     leave_one_seed_out,
     mann_whitney,
     mean_std,
     probability_of_improvement,
+    seeds_for,
     steps_to_reach,
 )
-from analysis.verdicts import power
 
 
 def row_keys(study, environment, config):
@@ -151,7 +152,8 @@ def against_baseline(x, y):
         "smallest_p": smallest_p,
     }
     if x.shape[1] == 1:
-        row["detectable_percent"], row["seeds_needed"] = power(x[:, 0], y[:, 0], improvement)
+        row["detectable_percent"] = detectable_percent(x[:, 0], y[:, 0])
+        row["seeds_needed"] = seeds_for(x[:, 0], y[:, 0], improvement)
     return row
 
 

@@ -6,20 +6,15 @@ method over all configurations of one algorithm in one environment, is at most 0
 uncorrected p is, it is "perhaps" so.
 """
 
-from functools import cache
-from math import ceil, inf, nan, pi, sqrt
+from math import nan
 
 import numpy as np
 import pandas as pd
-from scipy import stats
 
 from analysis.configurations import BASELINE
 from analysis.runs import STUDY, rows_of, study_name
-from analysis.statistics import improvement_percent, mann_whitney_null, mean_std
+from analysis.statistics import LEVEL, improvement_percent
 
-LEVEL, POWER = 0.05, 0.8
-# A test at this level finds an effect of so many standard errors with this power.
-DETECTABLE = stats.norm.ppf(1 - LEVEL / 2) + stats.norm.ppf(POWER)
 UNCLEAR = "no clear difference"
 VERDICTS = ["better", "worse", "perhaps better", "perhaps worse", UNCLEAR]  # in this order
 MAX_SEEDS = 1000  # a difference that would take more seeds is said to take more than these
@@ -33,72 +28,6 @@ def verdict(row):
         return UNCLEAR
     direction = "better" if row["probability_of_improvement"] > 0.5 else "worse"
     return direction if round(row["p_adjusted"], 12) <= LEVEL else f"perhaps {direction}"
-
-
-# -------------------------------------------------------------------------------------------- power
-
-
-def normal_shift(n, m, level=LEVEL):
-    """Return the shift that n against m seeds find with 80 % power, for many seeds.
-
-    In standard deviations, for normal returns. Noether (1987),
-    https://doi.org/10.1080/01621459.1987.10478478.
-    """
-    errors = stats.norm.ppf(1 - level / 2) + stats.norm.ppf(POWER)
-    return errors * sqrt((1 / n + 1 / m) * pi / 3)
-
-
-@cache
-def detectable_shift(n, m, level=LEVEL):
-    """Return the shift that n against m seeds find with 80 % power, or NaN if there is none.
-
-    In standard deviations, for normal returns and the exact two-sided Mann-Whitney test at this
-    level. For few seeds it is simulated: when x is shifted by s, it wins the pairs with y - x < s.
-    """
-    tail = 2 * np.cumsum(mann_whitney_null(n, m))
-    losses = np.flatnonzero(tail <= level + 1e-12)  # so many lost pairs are still significant
-    if len(losses) == 0:
-        return nan
-    if n * m > 900:
-        return normal_shift(n, m, level)
-    rng = np.random.default_rng(0)
-    last_needed = n * m - losses[-1] - 1  # the largest gap that must be closed
-    largest = []
-    # 400,000 draws for few seeds, down to 40,000: an error of about 0.1 to 0.4 %
-    for _ in range(min(100, max(10, 5000 // (n * m)))):
-        x, y = rng.normal(size=(4000, n, 1)), rng.normal(size=(4000, 1, m))
-        gaps = (y - x).reshape(4000, n * m)
-        largest.append(np.partition(gaps, last_needed, axis=1)[:, last_needed])
-    return float(np.quantile(np.concatenate(largest), POWER))
-
-
-@cache
-def seeds_needed(shift):
-    """Return how many seeds each side needs to find a shift (in sd) with 80 % power; maybe inf."""
-    if shift == 0:
-        return inf
-    n = max(4, ceil((normal_shift(1, 1) / shift) ** 2))
-    while n < 30 and not detectable_shift(n, n) <= shift:
-        n += 1
-    return n
-
-
-def power(x, y, observed_percent):
-    """Return what these returns could have shown, and what the observed improvement would take.
-
-    x (n) and y (m) are final returns with and without noise -> the improvement in percent that is
-    found with 80 % power, and the seeds that `observed_percent` needs. Both take the returns
-    for normal with the pooled standard deviation of x and y; NaN where that does not exist.
-    """
-    (_, x_std, n), (y_mean, y_std, m) = mean_std(x), mean_std(y)
-    if n < 2 or m < 2 or y_mean == 0:
-        return nan, nan
-    pooled = sqrt(((n - 1) * x_std**2 + (m - 1) * y_std**2) / (n + m - 2))
-    std_percent = 100 * pooled / abs(y_mean)
-    if std_percent == 0:
-        return nan, nan
-    shift = round(abs(observed_percent) / std_percent, 3)
-    return detectable_shift(n, m) * std_percent, seeds_needed(shift)
 
 
 # ---------------------------------------------------------------------------------------- sentences

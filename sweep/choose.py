@@ -14,8 +14,7 @@ from typing import NamedTuple
 
 from analysis.errors import fail
 from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED, read_run
-from analysis.statistics import holm
-from analysis.verdicts import detectable_shift
+from analysis.statistics import detectable_shift, holm
 from sweep import halving
 from sweep.grid import NOISES, RATES, PlannedRun, cell, cells, make_run, result
 

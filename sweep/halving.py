@@ -20,8 +20,13 @@ from typing import NamedTuple
 import numpy as np
 
 from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED
-from analysis.statistics import bootstrap_iqm, mann_whitney, probability_of_improvement
-from analysis.verdicts import UNCLEAR, disagrees, interval, p_value, percent, power
+from analysis.statistics import (
+    bootstrap_iqm,
+    detectable_percent,
+    mann_whitney,
+    probability_of_improvement,
+)
+from analysis.verdicts import UNCLEAR, disagrees, interval, p_value, percent
 
 LEVEL = 0.05  # of a verdict, two-sided, over all verdicts of one command
 BASELINE = ("", "0.0")
@@ -141,7 +146,7 @@ def compare(winner, seeds, returns):
     improvement, low, high = bootstrap_iqm(noisy, baseline)
     probability, _, _ = probability_of_improvement(noisy, baseline)
     p, _ = mann_whitney(noisy, baseline)
-    detectable, _ = power(noisy, baseline, improvement)
+    detectable = detectable_percent(noisy, baseline)
     return Comparison(winner, len(seeds), improvement, low, high, probability, p, detectable)
 
 

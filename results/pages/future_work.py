@@ -13,8 +13,7 @@ from common import DATA, RESULTS, compare_rows, markdown, read_returns, render
 from helpful import ENDING
 
 from analysis.runs import FIRST_CONFIRMATION_SEED
-from analysis.statistics import contrast, holm
-from analysis.verdicts import DETECTABLE, power
+from analysis.statistics import DETECTABLE, contrast, detectable_percent, holm
 from sweep import halving
 
 SMALL = "RandomNormalNoisyObservation(0.001)"
@@ -45,7 +44,7 @@ def comparisons(cases):
     for name, (x, y) in cases.items():
         row, numbers = compare_rows(name, x, y)
         p[name] = numbers["p"]
-        finds, _ = power(x, y, 0)
+        finds = detectable_percent(x, y)
         rows.append({**row, "80 % power at": f"{finds:.0f} %"})
     corrected = holm(list(p.values()))
     table = pd.DataFrame(rows).rename(columns={"p": "p (exact)"})
@@ -125,7 +124,7 @@ def falling(runs):
         "falling, always 1": (falls, always),
         "falling, no noise": (falls, nothing),
     }
-    finds, _ = power(falls, always, 0)
+    finds = detectable_percent(falls, always)
     return comparisons(pairs) | {
         "finds": finds,
         "all": against_all(falls, runs, ALWAYS),

@@ -11,8 +11,7 @@ from common import (
     spell_average,
 )
 
-from analysis.statistics import contrast, improvement_percent, mann_whitney
-from analysis.verdicts import power as finds
+from analysis.statistics import contrast, detectable_percent, improvement_percent, mann_whitney
 
 MIXUP = "RandomMixupObservation(0.0, recursive=True)"
 PLAIN_MIXUP = "RandomMixupObservation(0.0)"
@@ -50,7 +49,7 @@ def worse_noises(runs, paper):
         }
         found[noise]["lowest"] = list(change.index[noisy.max() < without.min()])
         found[noise]["alone"] = {e: mann_whitney(noisy[[e]], without[[e]])[0] for e in environments}
-        found[noise]["finds"] = {e: finds(noisy[e], without[e], 0)[0] for e in environments}
+        found[noise]["finds"] = {e: detectable_percent(noisy[e], without[e]) for e in environments}
         row = {"noise": f"`{noise}`"} | {name: "\u2013" for name in ENVIRONMENTS}
         row |= {name: f"{value:+.0f} %" for name, value in change.items()}
         row["average"] = f"{change.mean():+.0f} ± {change.std(ddof=1):.0f} %"

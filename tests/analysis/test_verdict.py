@@ -8,6 +8,7 @@ from scipy import stats
 import analysis.formatting
 import analysis.rows
 import analysis.runs
+import analysis.statistics
 import analysis.tables
 import analysis.verdicts
 import analyze
@@ -94,11 +95,11 @@ def test_three_seeds_cannot_show_anything():
 def test_no_clear_difference_says_what_the_seeds_could_have_shown():
     table, said = judge(TEN, {"0.10": TEN + 1.5})
     spread = 100 * TEN.std(ddof=1) / TEN.mean()  # the same on both sides
-    shift = analysis.verdicts.detectable_shift(10, 10)
+    shift = analysis.statistics.detectable_shift(10, 10)
     row = table.iloc[0]
     assert row["detectable_percent"] == pytest.approx(shift * spread)
     observed = 100 * 1.5 / TEN.mean() / spread  # in standard deviations
-    assert row["seeds_needed"] == analysis.verdicts.seeds_needed(round(observed, 3)) > 30
+    assert row["seeds_needed"] == analysis.statistics.seeds_needed(round(observed, 3)) > 30
     [text] = said["sentence"]
     assert f"; 10 seeds could have shown {shift * spread:.1f} % (80 % power), and 1.4 %" in text
     assert f" would take about {row['seeds_needed']:.0f} seeds each." in text
@@ -109,20 +110,20 @@ def test_no_clear_difference_says_what_the_seeds_could_have_shown():
 @pytest.mark.parametrize(("n", "m"), [(4, 4), (5, 5), (10, 5), (10, 10), (40, 40)])
 def test_the_detectable_shift_is_found_in_80_percent_of_the_cases(n, m):
     rng = np.random.default_rng(3)
-    x = rng.normal(analysis.verdicts.detectable_shift(n, m), 1, (1500, n))
+    x = rng.normal(analysis.statistics.detectable_shift(n, m), 1, (1500, n))
     y = rng.normal(0, 1, (1500, m))
     p = stats.mannwhitneyu(x, y, axis=1, method="exact").pvalue
     assert (p <= 0.05).mean() == pytest.approx(0.8, abs=0.035)
 
 
 def test_seeds_needed_is_the_first_number_that_finds_the_shift():
-    assert np.isnan(analysis.verdicts.detectable_shift(3, 3))
+    assert np.isnan(analysis.statistics.detectable_shift(3, 3))
     for shift in (3.0, 2.0, 1.2):
-        n = analysis.verdicts.seeds_needed(shift)
-        assert analysis.verdicts.detectable_shift(n, n) <= shift
-        assert n == 4 or not analysis.verdicts.detectable_shift(n - 1, n - 1) <= shift
+        n = analysis.statistics.seeds_needed(shift)
+        assert analysis.statistics.detectable_shift(n, n) <= shift
+        assert n == 4 or not analysis.statistics.detectable_shift(n - 1, n - 1) <= shift
     # Noether: (1.96 + 0.8416)^2 * 2 * pi / 3 / 0.3^2 = 182.6
-    assert analysis.verdicts.seeds_needed(0.3) == 183
+    assert analysis.statistics.seeds_needed(0.3) == 183
 
 
 def test_the_power_is_said_to_be_before_the_correction():

@@ -21,7 +21,7 @@ from scipy import stats
 
 from analysis.paper import read_paper, with_luck
 from analysis.runs import read_runs
-from analysis.verdicts import detectable_shift
+from analysis.statistics import detectable_shift
 
 RESULTS, DATA = common.RESULTS, common.DATA
 
