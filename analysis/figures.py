@@ -9,15 +9,24 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from analysis.configurations import BASELINE, rate_order
-from analysis.formatting import MERGED, slug
+from analysis.effects import (
+    COLORS,
+    DIVERGING,
+    UNCLEAR,
+    WIDTH,
+    broken,
+    effects_caption,
+    effects_figure,
+    ink_on,
+)
+from analysis.formatting import slug
 from analysis.runs import STUDY, rows_of, study_name
 
 STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
 STYLE["svg.hashsalt"] = "noisy"  # equal figures are equal files
 matplotlib.rcParams.update(STYLE)
-WIDTH, HEIGHT = 10, 5.5  # inches of every figure; one with many rows is higher
+HEIGHT = 5.5  # inches of every figure; one with many rows is higher
 viridis = matplotlib.colormaps["viridis"]  # ordered by lightness, so it reads in grey
-TOP = 10  # configurations in the interval plot
 
 
 def figures(studies, tables):
@@ -28,10 +37,13 @@ def figures(studies, tables):
         summary = tables[f"summary_{study.algorithm}"].frame
         summary = summary[rows_of(summary, study.key)]
         if tested["improvement_iqm_percent"].notna().any():
-            yield interval_figure(study, tested)
+            name = f"effects_{slug(study.name)}"
+            yield name, effects_figure(tested), effects_caption(study, tested)
+        best = tables["best"].frame
+        best = best[rows_of(best, study.key)]
         noises = sorted({config.noise for config in study.returns if not config.is_baseline})
-        if tested["improvement_iqm_percent"].notna().any() and len(noises) > 1:
-            yield heatmap_figure(study, summary)
+        if len(best) and len(study.returns) > 2:
+            yield best_curves_figure(study, best, tested)
         for noise in noises or [""]:
             yield curves_figure(study, noise)
         single = [config for config in study.returns if len(config.noises) == 1]
@@ -77,6 +89,52 @@ def panels(environments, labels):
     return fig, axes, add_legend
 
 
+def best_curves_figure(study, best, statistics):
+    """Draw no noise against the best noise of each environment: means and standard deviations."""
+    labels = ["no noise", "best noise tried there, in the colour of its verdict"]
+    environments = list(best["environment"])
+    fig, axes, _ = panels(environments, labels)
+    # Three lines of title above each panel
+    fig.subplots_adjust(top=1 - 0.6 / fig.get_figheight(), hspace=0.75)
+    unit, word = time_unit(study)
+    configs = {(config.noise, config.noise_rate): config for config in study.returns}
+    verdicts = statistics[statistics["scope"] == "environment"]
+    verdicts = verdicts.set_index(["environment", "noise", "noise_rate"])["verdict"]
+    for ax, row in zip(axes, best.itertuples(), strict=True):
+        e = study.environments.index(row.environment)
+        verdict = verdicts.get((row.environment, row.noise, row.noise_rate), "")
+        pair = {"black": BASELINE, COLORS.get(verdict, UNCLEAR): configs[row.noise, row.noise_rate]}
+        for color, config in pair.items():
+            mean, std = mean_and_std(study.returns[config][:, :, e])
+            ax.plot(study.steps / unit, mean, color=color, linewidth=1.6)
+            low, high = mean - std, mean + std
+            ax.fill_between(study.steps / unit, low, high, color=color, alpha=0.12, linewidth=0)
+        noise = row.noise if len(row.noise) < 50 else f"{row.noise[:47]}..."
+        lines = f"{noise}, {row.noise_rate}\n{verdict} (n = {span({row.n, row.n_baseline})})"
+        ax.set_title(f"{row.environment}\n{lines}", fontsize=7.5)
+        ax.set_xlabel(f"training steps ({word})")
+    handles = [axes[0].lines[0], Rectangle((0, 0), 1, 1, color=UNCLEAR)]
+    for handle, label in zip(handles, labels, strict=True):
+        handle.set_label(label)
+    fig.legend(handles, labels, loc="lower center", ncols=2, frameon=False)
+    caption = f"{study.name}: test return without noise and with the best noise of each "
+    caption += "environment, mean over n seeds, shaded \u00b1 one standard deviation. "
+    caption += "The best of many looks better than it is."
+    return f"best_curves_{slug(study.name)}", fig, caption
+
+
+def time_unit(study):
+    """Return the unit of the axis of training steps, and its name."""
+    return (1e6, "millions") if study.steps[-1] >= 1e6 else (1e3, "thousands")
+
+
+def mean_and_std(curves):
+    """Return mean and sample standard deviation (steps,) of the runs there are (steps x seeds)."""
+    curves = curves[:, np.isfinite(curves[-1])]
+    mean = curves.mean(axis=1) if curves.size else np.full(len(curves), np.nan)
+    return mean, curves.std(axis=1, ddof=1) if curves.shape[1] > 1 else 0
+
+
 def curves_figure(study, noise):
     """Draw learning curves: mean over seeds, one line per noise rate, shaded standard deviation.
 
@@ -91,13 +149,10 @@ def curves_figure(study, noise):
         name = "no noise" if config.is_baseline else f"rate {config.noise_rate}"
         labels.append(f"{name} (n = {span(n[n > 0])})")  # in the panels that have the line
     fig, axes, add_legend = panels([study.environments[e] for e in tried], labels)
-    unit, word = (1e6, "millions") if study.steps[-1] >= 1e6 else (1e3, "thousands")
+    unit, word = time_unit(study)
     x, every = study.steps / unit, max(1, len(study.steps) // 8)
     for (e, ax), (i, config) in product(zip(tried, axes, strict=True), enumerate(configs)):
-        curves = study.returns[config][:, :, e]
-        curves = curves[:, np.isfinite(curves[-1])]
-        mean = curves.mean(axis=1) if curves.size else np.full(len(x), np.nan)
-        std = curves.std(axis=1, ddof=1) if curves.shape[1] > 1 else 0
+        mean, std = mean_and_std(study.returns[config][:, :, e])
         color, line, marker = line_style(i, len(configs))
         width = 1.8 if config == BASELINE else 1.1
         marks = {"marker": marker, "markevery": (min(i, every - 1), every), "markersize": 4.5}
@@ -163,13 +218,13 @@ def heatmap(grid, framed=None, below=0.9):
     bottom = height - 0.5 - high
     fig = Figure(figsize=(WIDTH, height))
     ax = fig.add_axes([left / WIDTH, bottom / height, wide / WIDTH, high / height])
-    image = ax.imshow(grid, cmap="cividis", vmin=-limit, vmax=limit, aspect="auto")
+    image = ax.imshow(grid, cmap=DIVERGING, vmin=-limit, vmax=limit, aspect="auto")
     for (i, j), value in np.ndenumerate(grid.to_numpy()):
         if np.isfinite(value):
-            ink = "black" if value > 0 else "white"
+            ink = ink_on(value, limit)
             ax.text(j, i, f"{round(value):+d}", ha="center", va="center", color=ink, fontsize=8)
         if framed is not None and framed.iat[i, j]:
-            box = Rectangle((j - 0.46, i - 0.46), 0.92, 0.92, fill=False, edgecolor="red", lw=1.5)
+            box = Rectangle((j - 0.46, i - 0.46), 0.92, 0.92, fill=False, edgecolor="black", lw=1.5)
             ax.add_patch(box)
     ax.set_xticks(range(len(columns)), columns)
     ax.set_yticks(range(len(rows)), rows)
@@ -177,62 +232,6 @@ def heatmap(grid, framed=None, below=0.9):
     clipped = np.nanmax(np.abs(grid.to_numpy())) > limit
     fig.colorbar(image, cax=bar, extend="both" if clipped else "neither", label="percent")
     return fig, ax, limit
-
-
-def broken(label):
-    """Put each noise or rate of a combination on a line of its own."""
-    return str(label).replace(" + ", " +\n")
-
-
-def heatmap_figure(study, summary):
-    """Draw the mean improvement over environments, noise x rate, with the numbers in the cells."""
-    rows = summary[summary["improvement_percent"].notna()]
-    grid = rows.pivot_table(index="noise", columns="noise_rate", values="improvement_percent")
-    fig, ax, limit = heatmap(grid[sorted(grid.columns, key=rate_order)])
-    ax.set_xlabel("noise rate")
-    ax.set_title(f"{study.name} (seeds: {span(rows['n'])})")
-    caption = f"{study.name}: improvement of the final mean return over the baseline, mean "
-    caption += f"over environments ({span(rows.groupby(['noise', 'noise_rate']).size())} in a "
-    caption += f"cell); the colours end at \u00b1 {limit} %."
-    return f"heatmap_{slug(study.name)}", fig, caption
-
-
-def interval_figure(study, statistics):
-    """Draw the configurations with the highest IQM of the improvement, with their intervals.
-
-    Those of several environments together, or, where there are none, those of each.
-    """
-    all_rows = statistics[statistics["scope"] == "all"]
-    together = len(all_rows) > 0
-    rows = all_rows if together else statistics
-    rows = rows[rows["environments"] == rows["environments"].max()]  # the same ones for all
-    of, rows = len(rows), rows.sort_values("improvement_iqm_percent", kind="stable").tail(TOP)
-    labels = [f"{r.noise}, rate {r.noise_rate} (n = {r.n})" for r in rows.itertuples()]
-    if not together:
-        pairs = zip(rows["environment"], labels, strict=True)
-        labels = [f"{environment}, {label}" for environment, label in pairs]
-    fig = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
-    left, right = axes = fig.subplots(1, 2, sharey=True, width_ratios=[3, 2])
-    place = np.arange(len(rows))
-    titles = ("improvement (IQM) %", "P(improvement)")
-    for ax, title, neutral in zip(axes, titles, (0, 0.5), strict=True):
-        middle, low, high = rows[list(MERGED[title])].astype(float).to_numpy().T
-        ax.hlines(place, low, high, color="0.6", linewidth=5)
-        ax.plot(middle, place, "|", color="black", markersize=11, markeredgewidth=2)
-        ax.axvline(neutral, color="black", linewidth=0.8, linestyle="--")
-        margin = 0.6 + max(0, 4 - len(rows)) / 2  # a few rows stay close together
-        ax.set_ylim(-margin, len(rows) - 1 + margin)
-    left.set_yticks(place, [broken(label) for label in labels])
-    left.set_xlabel("improvement over the baseline, IQM (%)")
-    right.set_xlabel("probability of improvement")
-    right.set_xlim(-0.02, 1.02)
-    where = f"{rows['environments'].iloc[0]:.0f} environments" if together else "each alone"
-    caption = f"{study.name}, {where}: improvement with 95 % intervals (none for n < 3); "
-    caption += "dashed: no improvement."
-    if len(rows) < of:
-        caption += f" The {len(rows)} best of {of} are chosen on the seeds that are shown, so "
-        caption += "they look better than they are."
-    return f"intervals_{slug(study.name)}", fig, caption
 
 
 def robustness_figures(table):

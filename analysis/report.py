@@ -1,4 +1,7 @@
-"""report.html: one self-contained page with all verdicts, tables and figures."""
+"""report.html: a page with all verdicts, tables and figures.
+
+Figures that the page shows folded are files beside it; all else is in the page.
+"""
 
 import base64
 import re
@@ -8,8 +11,8 @@ import jinja2
 from markupsafe import Markup, escape
 
 from analysis.formatting import shown
-from analysis.runs import STUDY
-from analysis.verdicts import tally
+from analysis.runs import STUDY, rows_of, study_name
+from analysis.verdicts import LEVEL, VERDICTS, counted, tally
 
 SECTIONS = {
     "choice": "Choice of a noise",
@@ -25,7 +28,8 @@ SECTIONS = {
     "summary": "All results",
     "missing": "Runs left out",
 }
-FIGURES_OF = {"intervals": "best", "heatmap": "consistent", "curves": "early_performance"}
+FIGURES_OF = {"best": "early_performance", "curves": "early_performance"}
+SENTENCES = 10  # of clear verdicts, before the others are folded
 
 
 def breakable(text):
@@ -37,11 +41,34 @@ def breakable(text):
     return Markup(re.sub("(?<=[a-z0-9])(?=[A-Z(])", "<wbr>", str(escape(text))))
 
 
+def headlines(verdicts, best):
+    """Return for each study its name, its comparisons in words, its counts of verdicts, its luck.
+
+    Counted are the verdicts of single environments.
+    """
+    lines = []
+    alone = verdicts[verdicts["scope"] == "environment"]
+    for key, rows in alone.groupby(STUDY, sort=False):
+        number = f"{counted(len(rows), 'comparison')} in "
+        number += counted(rows["environment"].nunique(), "environment")
+        counts = [(word, (rows["verdict"] == word).sum()) for word in VERDICTS]
+        p_luck = best[rows_of(best, key)]["p_luck"].dropna()
+        luck = ""
+        if len(p_luck) and (p_luck > LEVEL).all():
+            luck = (
+                "The best noise of each environment looks no better than luck alone would make it."
+            )
+        shown = [(word, n) for word, n in counts if n or word in VERDICTS[:2]]
+        lines.append({"name": study_name(*key), "number": number, "counts": shown, "luck": luck})
+    return lines
+
+
 def write_report(out, verdicts, tables, drawn, overview, problems, notes):
-    """Write report.html: one self-contained page with all verdicts, tables and figures."""
+    """Write report.html: the effects and the verdicts first, then everything else."""
     sections = {key: {"id": key, "title": title} for key, title in SECTIONS.items()}
+    effects = []
     for section in sections.values():
-        section |= {"tables": [], "figures": []}
+        section |= {"tables": [], "figures": [], "folded": []}
     for table in tables.values():
         text = shown(table)
         entry = {
@@ -53,20 +80,31 @@ def write_report(out, verdicts, tables, drawn, overview, problems, notes):
         sections[table.section]["tables"].append(entry)
     for name, caption in drawn:
         kind = name.split("_")[0]
+        section = sections.get(FIGURES_OF.get(kind, kind))
+        entry = {"src": f"{name}.svg", "caption": caption}
+        if kind == "curves" and len(drawn) > 1:
+            section["folded"].append(entry)
+            continue
         svg = base64.b64encode((out / f"{name}.svg").read_bytes()).decode()
-        entry = {"svg": svg, "caption": caption}
-        sections[FIGURES_OF.get(kind, kind)]["figures"].append(entry)
+        entry["src"] = f"data:image/svg+xml;base64,{svg}"
+        (effects if section is None else section["figures"]).append(entry)
     here = jinja2.FileSystemLoader(Path(__file__).parent)
     pages = jinja2.Environment(loader=here, autoescape=True, trim_blocks=True)
-    full = [s for s in sections.values() if s["tables"] or s["figures"]]
+    full = [s for s in sections.values() if s["tables"] or s["figures"] or s["folded"]]
     pages.filters["breakable"] = breakable
     page = pages.get_template("report.html.jinja")
-    groups = verdicts.groupby([*STUDY, "scope", "environment"], sort=False)
-    verdicts = []
-    for _, group in groups:
-        lines = group[["verdict", "sentence"]].to_dict("records")
-        verdicts.append({"lines": lines, "tally": tally(group["verdict"])})
+    clear = verdicts[verdicts["verdict"].isin(VERDICTS[:2])].sort_values("verdict", kind="stable")
+    first = clear[:SENTENCES]
+    rest = verdicts.drop(first.index)
     html = page.render(
-        verdicts=verdicts, sections=full, overview=overview, problems=problems, notes=notes
+        effects=effects,
+        headlines=headlines(verdicts, tables["best"].frame),
+        first=first.to_dict("records"),
+        rest=rest.to_dict("records"),
+        rest_tally=tally(rest["verdict"]),
+        sections=full,
+        overview=overview,
+        problems=problems,
+        notes=notes,
     )
     (out / "report.html").write_text(html)

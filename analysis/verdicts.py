@@ -155,7 +155,7 @@ def tally(verdicts):
     """Count verdicts in words: "3 comparisons: 1 perhaps better, 2 no clear difference"."""
     counts = verdicts.value_counts()
     parts = [f"{counts[name]} {name}" for name in VERDICTS if name in counts]
-    return f"{len(verdicts)} comparisons: {', '.join(parts)}"
+    return f"{counted(len(verdicts), 'comparison')}: {', '.join(parts)}"
 
 
 def sentences(studies, statistics):
