@@ -15,6 +15,7 @@ from analysis.effects import (
     UNCLEAR,
     WIDTH,
     broken,
+    cut_at,
     effects_caption,
     effects_figure,
     ink_on,
@@ -207,7 +208,7 @@ def heatmap(grid, framed=None, below=0.9):
     The colours fit the data and end at \u00b1 `limit` %, which is at most 100. `framed` marks
     cells (as `grid`, of bool); `below` is the space in inches for the names of the columns.
     """
-    limit = int(np.clip(np.ceil(np.nanmax(np.abs(grid.to_numpy()))), 1, 100))
+    limit = cut_at(grid.to_numpy())
     rows, columns = ([broken(name) for name in names] for names in (grid.index, grid.columns))
     lines = max(name.count("\n") for name in rows) + 1
     longest = max(len(line) for name in rows for line in name.split("\n"))

@@ -72,10 +72,10 @@ def follow(args, algorithm, env_id):
             runs[noise, rate, seed] = run
             if result(run)[0]:
                 finished[noise, rate, seed] = read_return(run, seed)
-        check_frequencies(runs[key] for key in [*returns, *finished])
         if not finished:
             break
         returns |= finished
+    check_frequencies(runs[key] for key in returns)
     left = halving.number_of_runs(len(noises), budget, args.confirm) - len(returns)
     speeds = IN_HUMANOID if "Humanoid" in env_id else STEPS_PER_SECOND
     seconds = START_UP + args.total_timesteps / speeds[algorithm]
