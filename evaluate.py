@@ -38,7 +38,13 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from analysis.errors import fail
-from analysis.runs import differing_settings, is_run, read_config, study_name
+from analysis.runs import (
+    ROBUSTNESS_COLUMNS,
+    differing_settings,
+    is_run,
+    read_config,
+    study_name,
+)
 from noisy_wrappers import (
     NotFiniteError,
     canonical_env_id,
@@ -47,7 +53,6 @@ from noisy_wrappers import (
     noise_slug,
 )
 
-HEADER = ["noise", "noise_rate", "episode", "episodic_return", "episodic_length"]
 DISPLAY = "import glfw; assert glfw.init() and glfw.get_primary_monitor()"
 
 
@@ -269,7 +274,7 @@ def write_stored(run, stored):
     try:
         with open(temporary, "w") as file:
             writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(HEADER)
+            writer.writerow(ROBUSTNESS_COLUMNS)
             for key, results in stored.items():
                 writer.writerows([*key, i, *result] for i, result in enumerate(results))
             file.flush()

@@ -19,7 +19,7 @@ import pandas as pd
 
 from analysis.configurations import BASELINE, Configuration
 from analysis.formatting import P_VALUE, SHARE, WHOLE, Table
-from analysis.runs import KEYS, STUDY, study_name
+from analysis.runs import KEYS, ROBUSTNESS_COLUMNS, STUDY, study_name
 from analysis.statistics import (
     DETECTABLE,
     LEVEL,
@@ -33,7 +33,6 @@ from analysis.statistics import (
 from analysis.verdicts import counted, p_value
 
 FILES = ("robustness.csv", "robustness.csv.gz")
-HEADER = ["noise", "noise_rate", "episode", "episodic_return", "episodic_length"]
 CONDITION = ["test_noise", "test_rate"]
 CLEAN = BASELINE  # a condition of a test is a Configuration, too
 RUN_COLUMNS = [*KEYS, "configuration", "seed", *CONDITION, "condition", "mean", "cvar"]
@@ -98,7 +97,7 @@ def read_episodes(path):
     """Read one file: a dict of Configuration -> returns of its episodes. Raises ValueError."""
     text = {"noise": str, "noise_rate": str}
     table = pd.read_csv(path, dtype=text, keep_default_na=False)
-    if list(table.columns) != HEADER:
+    if list(table.columns) != ROBUSTNESS_COLUMNS:
         raise ValueError("unexpected header")
     returns = pd.to_numeric(table["episodic_return"])
     if not np.isfinite(returns).all() or not len(returns):

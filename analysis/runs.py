@@ -26,6 +26,7 @@ RUN_COLUMNS = ["run", "status", "reason", *KEYS, "configuration", "seed", "episo
 RUN_COLUMNS += ["arguments", "versions", "steps", "returns"]
 CHOICE_COLUMNS = ["algorithm", "environment", "phase", "round", "noise", "noise_rate"]
 CHOICE_COLUMNS += ["seeds", "score", "survives"]
+ROBUSTNESS_COLUMNS = ["noise", "noise_rate", "episode", "episodic_return", "episodic_length"]
 FIRST_CONFIRMATION_SEED = 1001  # of `./benchmark.sh choose`: lower seeds are those of its search
 
 

@@ -251,12 +251,20 @@ def contrast(cells, weights):
     if sizes.min() < MIN_SEEDS:
         return estimate, np.nan, np.nan, np.nan
     variances = np.array([np.var(cell, ddof=1) for cell in cells])
-    parts = np.square(weights) * variances / sizes
-    error = np.sqrt(parts.sum())
-    if error == 0:
+    if not variances.any():
         return estimate, 0.0, estimate, estimate
-    half = error * stats.t.ppf(0.975, parts.sum() ** 2 / np.sum(parts**2 / (sizes - 1)))
+    error, half = satterthwaite(np.square(weights) * variances / sizes, sizes)
     return estimate, error, estimate - half, estimate + half
+
+
+def satterthwaite(variances, sizes):
+    """Return the standard error of a sum of independent means, and half of its 95 % interval.
+
+    variances (k, ...): of the k means; sizes (k, ...): how many values each is the mean of.
+    """
+    total = np.sum(variances, axis=0)
+    freedom = total**2 / np.sum(np.square(variances) / (sizes - 1), axis=0)
+    return np.sqrt(total), np.sqrt(total) * stats.t.ppf(0.975, freedom)
 
 
 def holm(p):

@@ -32,6 +32,7 @@ class Choice(NamedTuple):
     env_id: str
     schedule: list[tuple[int, int]]  # of its search
     confirm: int  # fresh seeds of the confirmation
+    cells: dict[tuple[str, str], tuple]  # (noise, rate) as text: (noises, rates), in order
     state: halving.State
     runs: dict[tuple[str, str, int], PlannedRun]  # those that have been due so far
     returns: dict[tuple[str, str, int], float]  # of those that are finished
@@ -62,13 +63,13 @@ def follow(args, algorithm, env_id):
         fail(f"--budget {budget} is too large: the best noises would run with {last_seed} seeds")
     if not args.noises:
         check_others(args, algorithm, env_id)
-    cell_of = {halving.BASELINE: ([], [])} | noises
+    all_cells = {halving.BASELINE: ([], [])} | noises
     runs, returns = {}, {}
     while True:
         state = halving.advance(list(noises), budget, args.confirm, returns)
         finished = {}
         for noise, rate, seed in state.due:
-            run = make_run(args, algorithm, env_id, *cell_of[noise, rate], seed)
+            run = make_run(args, algorithm, env_id, *all_cells[noise, rate], seed)
             runs[noise, rate, seed] = run
             if result(run)[0]:
                 finished[noise, rate, seed] = read_return(run, seed)
@@ -81,9 +82,18 @@ def follow(args, algorithm, env_id):
     seconds = START_UP + args.total_timesteps / speeds[algorithm]
     if returns:
         seconds = fmean(wall_time(runs[key]) for key in returns)
-    core_hours = left * seconds / 3600
-    name = f"{algorithm.upper()} on {env_id}"
-    return Choice(name, algorithm, env_id, schedule, args.confirm, state, runs, returns, core_hours)
+    return Choice(
+        name=f"{algorithm.upper()} on {env_id}",
+        algorithm=algorithm,
+        env_id=env_id,
+        schedule=schedule,
+        confirm=args.confirm,
+        cells=all_cells,
+        state=state,
+        runs=runs,
+        returns=returns,
+        core_hours=left * seconds / 3600,
+    )
 
 
 def check_others(args, algorithm, env_id):
@@ -280,8 +290,8 @@ def obstacle(choice):
     """Say that a choice cannot go on, and what to do."""
     text = f"{describe(choice)}. These did not finish; the same command starts them again."
     for noise, rate, _ in choice.state.due:
-        pairs = zip(noise.split(" + "), rate.split(" + "), strict=True)
-        excluded = "+".join(f"{noise}@{rate}" for noise, rate in pairs)
+        pairs = zip(*choice.cells[noise, rate], strict=True)
+        excluded = "+".join(f"{one}@{own}" for one, own in pairs)
         advice = f'\n  If it fails every time, leave it out: --exclude "{excluded}"'
         if noise and advice not in text:
             text += advice

@@ -25,8 +25,23 @@ def imported(path):
                 found |= {f"{node.module}.{name}": [] for name in names}
             else:
                 found.setdefault(node.module, []).extend(names)
-    ours = {name: names for name, names in found.items() if name.partition(".")[0] in ORDER}
-    return ours
+    return {name: names for name, names in found.items() if name.partition(".")[0] in ORDER}
+
+
+def private_attributes(path):
+    """The private names that a file takes from the project's modules, as in `runs._read`."""
+    tree, modules = ast.parse(path.read_text()), set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            modules |= {alias.asname or alias.name for alias in node.names if alias.name in ORDER}
+        elif isinstance(node, ast.ImportFrom) and node.module in PACKAGES:
+            modules |= {alias.asname or alias.name for alias in node.names}
+    taken = [node for node in ast.walk(tree) if isinstance(node, ast.Attribute)]
+    return [
+        ast.unparse(node)
+        for node in taken
+        if ast.unparse(node.value) in modules and node.attr.startswith("_")
+    ]
 
 
 def module(path):
@@ -68,3 +83,4 @@ def test_imports_run_one_way_and_take_no_private_name(path):
         assert ORDER.index(name.partition(".")[0]) <= place, f"{path.name} imports {name}"
         private = [part for part in (*name.split("."), *names) if part.startswith("_")]
         assert not private, f"{path.name} takes {private} of {name}"
+    assert not private_attributes(path)

@@ -17,7 +17,12 @@ FIXED_SEEDS = range(1, 11)
 ENVIRONMENTS = ["HalfCheetah", "Hopper", "Humanoid", "Pusher", "Walker2d"]  # without version
 sys.path.insert(0, str(RESULTS.parent))
 from analysis.runs import KEYS, read_runs  # noqa: E402
-from analysis.statistics import holm, improvement_percent, mann_whitney  # noqa: E402
+from analysis.statistics import (  # noqa: E402
+    holm,
+    improvement_percent,
+    mann_whitney,
+    satterthwaite,
+)
 
 
 def plain(table):
@@ -58,9 +63,8 @@ def standard_error(*samples):
 
 def welch_interval(x, y):
     """Return the 95 % interval of the difference of the samples' means, row by row."""
-    parts = np.array([z["std"] ** 2 / z["n"] for z in (x, y)])
-    df = parts.sum(axis=0) ** 2 / (parts**2 / [z["n"] - 1 for z in (x, y)]).sum(axis=0)
-    half = stats.t.ppf(0.975, df) * standard_error(x, y)
+    sizes = np.array([x["n"], y["n"]])
+    _, half = satterthwaite([z["std"] ** 2 / z["n"] for z in (x, y)], sizes)
     difference = x["mean"] - y["mean"]
     return difference - half, difference + half
 
