@@ -639,7 +639,6 @@ class Run:
         if self.bar.disable and time.time() - self.printed > 10:
             eta = tqdm.format_interval((total - step) / sps)
             # sweep/__main__.py reads this line
-            # python -m sweep reads this line
             say(f"step={step}/{total} sps={sps:.0f} {self.last_test}eta={eta}")
             self.printed = time.time()
 
