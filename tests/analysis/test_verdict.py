@@ -116,6 +116,12 @@ def test_the_detectable_shift_is_found_in_80_percent_of_the_cases(n, m):
     assert (p <= 0.05).mean() == pytest.approx(0.8, abs=0.035)
 
 
+@pytest.mark.parametrize("n", [4, 5, 10, 30])
+def test_the_shifts_that_are_listed_are_those_of_the_simulation(n):
+    simulated = analysis.statistics.simulated_shift(n, n, 0.05)
+    assert analysis.statistics.detectable_shift(n, n) == pytest.approx(simulated, rel=0.005)
+
+
 def test_seeds_needed_is_the_first_number_that_finds_the_shift():
     assert np.isnan(analysis.statistics.detectable_shift(3, 3))
     for shift in (3.0, 2.0, 1.2):
