@@ -30,6 +30,7 @@ results: $(BIN)/.run
 	cp results/report/*.csv results/tables
 	cp results/report/curves_PPO_RandomEarlyTermination_50.svg results/figures
 	$(BIN)/python results/pages/readme.py
+	$(BIN)/python results/pages/further_tables.py
 	$(BIN)/python results/pages/baselines.py
 	$(BIN)/python results/pages/ablation.py
 	$(BIN)/python results/pages/reconstruction.py

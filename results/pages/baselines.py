@@ -22,6 +22,7 @@ from common import (
     render,
     sample,
     spell,
+    variance_share,
     welch,
     welch_interval,
 )
@@ -78,7 +79,7 @@ CLEANRL_TD3 = {
 # The one that stands beside ours: the newest of each
 CLEANRL = {"PPO": {"v4": CLEANRL_PPO["v4, newer"]}, "SAC": CLEANRL_SAC, "TD3": CLEANRL_TD3}
 CLEANRL_SEEDS = 3
-FULL_LENGTH = 1_000_000
+FULL_LENGTH, SHORT_LENGTH = 1_000_000, 200_000
 COLORS = {"PPO": "C0", "SAC": "C1", "TD3": "C2"}
 VALUES = ["mean", "std", "n"]
 
@@ -234,12 +235,6 @@ def corrected(numbers):
     return dict(zip(ENVIRONMENTS, holm(p), strict=True))
 
 
-def variance_share(runs):
-    """Return the percent of the variance between seeds that the test's few episodes make."""
-    by_environment = runs.groupby("environment")
-    return 100 * by_environment["error"].mean() / by_environment["test"].var(ddof=1)
-
-
 # ------------------------------------------------------------------------- how the paper tested PPO
 
 
@@ -312,7 +307,7 @@ def numbers():
     paper, runs = read_paper(RESULTS / "paper"), read_baselines()
     ppo = runs.query("algorithm == 'PPO' and version == 'v5'")
     share = variance_share(ppo)
-    full, short = table(runs, paper, FULL_LENGTH), table(runs, paper, 200_000)
+    full, short = table(runs, paper, FULL_LENGTH), table(runs, paper, SHORT_LENGTH)
     tests = read_tests(DATA / "paper_tests")
     return {
         "full": full,

@@ -50,6 +50,12 @@ def test_error(run):
     return returns.var(ddof=1) / len(returns)
 
 
+def variance_share(runs):
+    """Return the percent of the variance between seeds that the test's few episodes make."""
+    environments = runs.groupby("environment")
+    return 100 * environments["error"].mean() / environments["test"].var(ddof=1)
+
+
 def sample(runs, column):
     """Describe the runs of each environment: mean, sample standard deviation and number."""
     groups = runs.groupby("environment")[column]

@@ -116,14 +116,21 @@ def five_noises(base, noisy, paper_base, paper_noisy, percent, statistics):
         "low": (100 * low / y["mean"].abs()).to_dict(),
         "high": (100 * high / y["mean"].abs()).to_dict(),
         "n": x["n"].to_dict(),
-        "noise": noise["noise"].to_dict(),
+        "gains": pd.DataFrame(
+            {
+                "noise": noise["noise"],
+                "noise_rate": noise["noise_rate"],
+                "paper_gain": paper_gain,
+                "gain": gain,
+                "gain_low": low,
+                "gain_high": high,
+            }
+        ),
         "power_at_5": dict(zip(names, found, strict=True)),
         "paper_percent": percent.to_dict(),
         "p": tested["p"].to_dict(),
         "holm": dict(zip(names, corrected, strict=True)),
         "reward": {
-            "n": len(rewarding),
-            "higher": (gain[rewarding] > 0).sum(),
             "won": sum(
                 wins(with_reward_noise[e].to_numpy(), without[e].to_numpy()) for e in rewarding
             ),
@@ -146,10 +153,19 @@ def spread(base, noisy, paper_base, paper_noisy):
     ]
     return {
         "change": (100 * (x["std"] / y["std"] - 1)).to_dict(),
-        "paper_change": (100 * (paper_noisy["std"] / paper_base["std"] - 1)).to_dict(),
         "p": dict(zip(x.index, p, strict=True)),
         "holm": dict(zip(x.index, holm(np.array(p)), strict=True)),
         "power": power_of_levene(0.5, 10),
+        "table": pd.DataFrame(
+            {
+                "std_without": y["std"],
+                "std_with": x["std"],
+                "paper_std_without": paper_base["std"],
+                "paper_std_with": paper_noisy["std"],
+                "brown_forsythe_p": p,
+                "brown_forsythe_p_holm": holm(np.array(p)),
+            }
+        ),
     }
 
 

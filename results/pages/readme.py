@@ -7,7 +7,7 @@ numbers, and verdicts.py makes the verdicts from them.
 import ablation
 import headline
 import verdicts
-from common import DATA, RESULTS, plain, read_returns, render
+from common import DATA, RESULTS, plain, read_returns, render, variance_share
 from harmful import MIXUP, NORMAL, PLAIN_MIXUP, td3, worse_noises
 from helpful import (
     five_noises,
@@ -89,6 +89,7 @@ def numbers():
         ),
         "spread": spread(base, noisy, paper_base, paper_noisy),
         "speed": speed(five_summary),
+        "test_share": {"without": variance_share(base), "with": variance_share(noisy)},
         "pusher": pusher(ppo) | {"step": other_step(read_returns(DATA / "choice"), ppo)},
         "half_cheetah": half_cheetah(ppo, best["improvement_percent"]["HalfCheetah"]),
         "worse_noises": worse_noises(ppo, paper),

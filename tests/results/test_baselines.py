@@ -89,7 +89,7 @@ def test_the_share_of_the_test_in_the_variance(tmp_path):
     (tmp_path / "eval.csv").write_text("\n".join(lines) + "\n")
     assert common.test_error(tmp_path) == pytest.approx(1 / 3)
     runs = pd.DataFrame({"environment": ["a", "a"], "test": [2.0, 4.0], "error": [1 / 3, 1 / 3]})
-    assert baselines.variance_share(runs)["a"] == pytest.approx(100 / 3 / 2)
+    assert common.variance_share(runs)["a"] == pytest.approx(100 / 3 / 2)
 
 
 # ------------------------------------------------------------------------- how the paper tested PPO

@@ -5,6 +5,7 @@ import json
 import ablation
 import common
 import data_readme
+import further_tables
 import future_work
 import harmful
 import helpful
@@ -40,6 +41,41 @@ RESULTS, DATA = common.RESULTS, common.DATA
 )
 def test_a_page_is_what_its_command_writes(script, path):
     assert (RESULTS / path).read_text() == script.page()
+
+
+@pytest.mark.slow
+def test_further_tables_are_what_their_command_writes():
+    for name, table in further_tables.tables().items():
+        written = table.to_csv(index=False, float_format=further_tables.DIGITS)
+        assert (RESULTS / f"tables/{name}.csv").read_text() == written, name
+
+
+def test_further_tables_by_hand():
+    """Some cells from the runs and the paper's tables themselves."""
+    tables = {
+        name: pd.read_csv(RESULTS / f"tables/{name}.csv", index_col=0)
+        for name in ("ppo_best_noises", "paper_steps_to_baseline", "baselines")
+    }
+    ppo = tables["ppo_best_noises"].loc["Pusher"]
+    returns = [
+        [
+            json.loads(path.read_text())["final_return_mean"]
+            for seed in range(1, 11)
+            for path in DATA.glob(f"runs/Pusher-v5__ppo_*__{noise}__{seed}/result.json")
+        ]
+        for noise in ("baseline", "*EarlyTermination_50_p1.0")
+    ]
+    assert [len(column) for column in returns] == [10, 10]
+    without, noisy = np.array(returns)
+    assert ppo["gain"] == pytest.approx(noisy.mean() - without.mean(), rel=1e-5)
+    assert ppo["paper_gain"] == pytest.approx(57.6 - 45.9)
+    spreads = without.std(ddof=1), noisy.std(ddof=1)
+    assert (ppo["std_without"], ppo["std_with"]) == pytest.approx(spreads, rel=1e-5)
+    assert (ppo["steps_without"], ppo["steps_with"]) == (900_000, 150_000)
+    steps = tables["paper_steps_to_baseline"].loc["Walker2d-v2"]
+    assert steps["p_0.00"] == 0.8 and np.isnan(steps["p_0.01"]) and steps["p_0.05"] == 0.6
+    p = stats.ttest_ind_from_stats(without.mean(), spreads[0], 10, -57.6, 14.1, 10, False).pvalue
+    assert tables["baselines"].loc["PPO on Pusher-v5", "paper_p"] == pytest.approx(p, rel=1e-2)
 
 
 def test_an_interaction_that_would_be_seen_is_about_as_large_as_the_noises_gain():
@@ -344,6 +380,13 @@ def test_what_the_papers_tables_say_by_hand():
     kinds = paper_tables.kinds(paper)
     assert kinds["counts"]["PPO"] == {"observation": 0, "reward": 4, "dynamics": 1}
     assert kinds["fisher"] == pytest.approx({"observation": 2 / 252, "reward": 12 / 252})
+    chance = paper_tables.kinds_by_chance(paper).set_index(["algorithm", "kind"])["p_at_least"]
+    assert chance["PPO", "reward"] == pytest.approx(5 * (1 / 3) ** 4 * (2 / 3) + (1 / 3) ** 5)
+    assert chance["TD3", "observation"] == pytest.approx((8 / 15) ** 5)
+    spread = paper_tables.spread_tests(paper).set_index(["algorithm", "environment"])
+    f = spread.loc[("SAC", "Humanoid-v2")]
+    assert f["f_p"] == pytest.approx(2 * stats.f.cdf((129 / 1913.1) ** 2, 4, 4))
+    assert f["f_p_holm"] == pytest.approx(15 * f["f_p"])
     worse = paper_tables.worse_everywhere(paper)
     assert worse["of"]["RandomNormalNoisyObservation(1.0)"] == 3 + 5 + 6
     assert (worse["at_every_rate"], worse["next"]) == (1, 5)
