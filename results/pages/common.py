@@ -114,6 +114,14 @@ def cells(form, *columns):
     return ["\u2013" if pd.isna(row[0]) else form.format(*row) for row in rows]
 
 
+def spelled(rows, columns):
+    """Write columns of a frame: {title: (format, names of columns...)} -> {title: texts}."""
+    return {
+        title: cells(form, *(rows[name] for name in names))
+        for title, (form, *names) in columns.items()
+    }
+
+
 def spell(x):
     """Write a sample as mean ± standard deviation, with a decimal for returns of two digits."""
     digits = np.where(x["mean"].abs() >= 100, 0, 1)

@@ -1,4 +1,4 @@
-"""Write results/future_work.md from the runs beside it: python results/future_work.py.
+"""Write results/future_work.md from the runs in data/: python results/pages/future_work.py.
 
 The three wishes at the end of the paper, tried with PPO on Pusher-v5: a noise that is chosen
 (choice/), a rate that changes during training and two noises at once (schedules/, beside the runs
@@ -9,7 +9,7 @@ number in it.
 import json
 
 import pandas as pd
-from common import DATA, RESULTS, compare_rows, markdown, read_returns, render
+from common import DATA, RESULTS, compare_rows, markdown, read_returns, render, uncorrected
 from helpful import ENDING
 
 from analysis.runs import FIRST_CONFIRMATION_SEED
@@ -31,31 +31,29 @@ def core_hours(*patterns):
     return {"runs": len(results), "hours": seconds / 3600}
 
 
-def final_returns(runs, config, seeds):
-    """Return the test returns (n,) of a (noise, noise_rate), each of whose seeds must be there."""
+def all_returns(runs, config):
+    """Return the test returns of a (noise, noise_rate), indexed by seed."""
     noise, noise_rate = config
     found = runs[(runs["noise"] == noise) & (runs["noise_rate"] == noise_rate)]
-    return found.set_index("seed")["test"].loc[list(seeds)].to_numpy()
+    return found.set_index("seed")["test"]
+
+
+def final_returns(runs, config, seeds):
+    """Return the test returns (n,) of a (noise, noise_rate), each of whose seeds must be there."""
+    return all_returns(runs, config).loc[list(seeds)].to_numpy()
 
 
 def comparisons(cases):
     """Compare pairs of samples, {name: (x, y)}; p is corrected with Holm's method for all pairs."""
-    rows, p = [], {}
+    rows, p = [], []
     for name, (x, y) in cases.items():
         row, numbers = compare_rows(name, x, y)
-        p[name] = numbers["p"]
-        finds = detectable_percent(x, y)
-        rows.append({**row, "80 % power at": f"{finds:.0f} %"})
-    corrected = holm(list(p.values()))
+        p.append(numbers["p"])
+        rows.append({**row, "80 % power at": f"{detectable_percent(x, y):.0f} %"})
+    corrected = holm(p)
     table = pd.DataFrame(rows).rename(columns={"p": "p (exact)"})
     table["Holm"] = [f"{value:.2g}" for value in corrected]
     return {"table": markdown(table), "holm": list(corrected)}
-
-
-def all_returns(runs, config):
-    """Return the test returns (n,) of a (noise, noise_rate), of all seeds."""
-    noise, noise_rate = config
-    return runs[(runs["noise"] == noise) & (runs["noise_rate"] == noise_rate)]["test"].to_numpy()
 
 
 def against_all(x, runs, config):
@@ -104,7 +102,7 @@ def choice():
         "grid": 10 * (noises + 1),
         "winner": winner.noise,
         "verdict": verdict,
-        "table": markdown({"p (exact)" if name == "p" else name: [row[name]] for name in row}),
+        "table": uncorrected([row]),
         "p": comparison.p,
         "finds": comparison.detectable,
         "search": core_hours("choice/*__?", "choice/*__??"),
@@ -120,13 +118,9 @@ def falling(runs):
     falls, always, nothing = (
         final_returns(runs, config, FALLING_SEEDS) for config in (FALLING, ALWAYS, NOTHING)
     )
-    pairs = {
-        "falling, always 1": (falls, always),
-        "falling, no noise": (falls, nothing),
-    }
-    finds = detectable_percent(falls, always)
+    pairs = {"falling, always 1": (falls, always), "falling, no noise": (falls, nothing)}
     return comparisons(pairs) | {
-        "finds": finds,
+        "finds": detectable_percent(falls, always),
         "all": against_all(falls, runs, ALWAYS),
         "cost": core_hours("schedules/*1.0to0.0__*"),
     }

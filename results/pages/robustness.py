@@ -21,6 +21,7 @@ from common import (
     plain,
     read_returns,
     render,
+    spelled,
 )
 from helpful import FAR_ABOVE
 
@@ -58,57 +59,37 @@ def scores(found, counts):
     return table
 
 
-def answers(table):
+SCORE = {
+    "score": ("{:.0f}", "score"),
+    "without noise": ("{:.0f}", "baseline_score"),
+    "difference [95 %]": (
+        "{:+.0f} [{:.0f}, {:.0f}]",
+        "difference",
+        "difference_low",
+        "difference_high",
+    ),
+    "p (exact)": ("{:.2g}", "p"),
+}
+PRIMARY = SCORE | {"Holm": ("{:.2g}", "p_holm"), "80 % power at": ("{:.0f}", "detectable")}
+HARDER = {
+    "worst condition": ("{:.0f}", "worst_score"),
+    "worst condition, without noise": ("{:.0f}", "baseline_worst_score"),
+    "worst tenth": ("{:.0f}", "cvar_score"),
+    "worst tenth, without noise": ("{:.0f}", "baseline_cvar_score"),
+}
+
+
+def together(table, columns):
     """Spell the rows of all environments together, which are the tests fixed beforehand."""
     rows = table[table["scope"] == "all"]
-    return markdown(
-        {
-            "trained with": [SHORT[noise] for noise in rows["noise"]],
-            **score_columns(rows),
-            "p (exact)": [f"{p:.2g}" for p in rows["p"]],
-            "Holm": [f"{p:.2g}" for p in rows["p_holm"]],
-            "80 % power at": [f"{value:.0f}" for value in rows["detectable"]],
-        }
-    )
+    return markdown({"trained with": rows["noise"].map(SHORT), **spelled(rows, columns)})
 
 
 def by_environment(table):
     """Spell the rows of one environment each, which are secondary and uncorrected."""
     rows = plain(table[table["scope"] != "all"])
-    return markdown(
-        {
-            "trained with": [SHORT[noise] for noise in rows["noise"]],
-            "": rows["environment"],
-            **score_columns(rows),
-            "p (exact)": [f"{p:.2g}" for p in rows["p"]],
-        }
-    )
-
-
-def score_columns(rows):
-    """Spell scores beside those of the policies that were trained without noise."""
-    differences = zip(
-        rows["difference"], rows["difference_low"], rows["difference_high"], strict=True
-    )
-    return {
-        "score": [f"{value:.0f}" for value in rows["score"]],
-        "without noise": [f"{value:.0f}" for value in rows["baseline_score"]],
-        "difference [95 %]": [f"{d:+.0f} [{low:.0f}, {high:.0f}]" for d, low, high in differences],
-    }
-
-
-def harder(table):
-    """Spell the worst condition and the worst episodes, over all environments together."""
-    rows = table[table["scope"] == "all"]
-    return markdown(
-        {
-            "trained with": [SHORT[noise] for noise in rows["noise"]],
-            "worst condition": [f"{value:.0f}" for value in rows["worst_score"]],
-            "worst condition, without noise": [f"{v:.0f}" for v in rows["baseline_worst_score"]],
-            "worst tenth": [f"{value:.0f}" for value in rows["cvar_score"]],
-            "worst tenth, without noise": [f"{v:.0f}" for v in rows["baseline_cvar_score"]],
-        }
-    )
+    names = {"trained with": rows["noise"].map(SHORT), "": rows["environment"]}
+    return markdown(names | spelled(rows, SCORE))
 
 
 def clean_returns(runs):
@@ -223,24 +204,22 @@ def kept(found, counts):
     return result
 
 
+SHARES = {
+    "share": ("{:.0f} %", "share"),
+    "without noise": ("{:.0f} %", "baseline_share"),
+    "difference [95 %]": ("{:+.0f} [{:.0f}, {:.0f}]", "difference", "low", "high"),
+    "p (exact)": ("{:.1g}", "p"),
+    "ratio of means": ("{:.0f} %", "of_means"),
+    "ratio of means, without noise": ("{:.0f} %", "baseline_of_means"),
+}
+
+
 def shares_table(unseen, seen):
     """Spell the shares of kept(), under noise that was not in training and under its own."""
-    rows = []
-    for title, found in (("noise of another kind", unseen), ("the same noise", seen)):
-        for noise, row in found.items():
-            rows.append(
-                {
-                    "trained with": noise,
-                    "tested with": title,
-                    "share": f"{row['share']:.0f} %",
-                    "without noise": f"{row['baseline_share']:.0f} %",
-                    "difference [95 %]": "{difference:+.0f} [{low:.0f}, {high:.0f}]".format(**row),
-                    "p (exact)": f"{row['p']:.1g}",
-                    "ratio of means": f"{row['of_means']:.0f} %",
-                    "ratio of means, without noise": f"{row['baseline_of_means']:.0f} %",
-                }
-            )
-    return markdown(rows)
+    rows = pd.DataFrame([*unseen.values(), *seen.values()])
+    titles = len(unseen) * ["noise of another kind"] + len(seen) * ["the same noise"]
+    names = {"trained with": [*unseen, *seen], "tested with": titles}
+    return markdown(names | spelled(rows, SHARES))
 
 
 def by_noise(table):
@@ -272,13 +251,13 @@ def numbers():
         "runs": len(results),
         "minutes": np.median([result["wall_time_seconds"] for result in results]) / 60,
         "unseen": {
-            "table": answers(unseen),
+            "table": together(unseen, PRIMARY),
             "environments": by_environment(unseen),
-            "harder": harder(unseen),
+            "harder": together(unseen, HARDER),
             **by_noise(unseen),
         },
         "seen": {
-            "table": answers(seen),
+            "table": together(seen, PRIMARY),
             "environments": by_environment(seen),
             "rates": own_noise_table(own),
             **by_noise(seen),
