@@ -155,7 +155,8 @@ def spread(base, noisy, paper_base, paper_noisy):
         "change": (100 * (x["std"] / y["std"] - 1)).to_dict(),
         "p": dict(zip(x.index, p, strict=True)),
         "holm": dict(zip(x.index, holm(np.array(p)), strict=True)),
-        "power": power_of_levene(0.5, 10),
+        "n": len(FIXED_SEEDS),
+        "power": power_of_levene(0.5, len(FIXED_SEEDS)),
         "table": pd.DataFrame(
             {
                 "std_without": y["std"],

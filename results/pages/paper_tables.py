@@ -32,6 +32,7 @@ def luck_of_the_best(paper):
             }
         ),
         "p": best["p_luck"],
+        "algorithm": best["algorithm"],
         "beyond": (best["p_luck"] <= 0.05).sum(),
         "rows": len(best),
         "improvement": best["improvement_percent"],
@@ -85,6 +86,7 @@ def rates(paper):
         found[name] = {
             "count": count,
             "of": len(rows),
+            "most_frequent": rows.mode().tolist(),
             "expected": len(rows) / len(RATES),
             "p": stats.binomtest(count, len(rows), 1 / len(RATES)).pvalue,
         }
@@ -161,6 +163,7 @@ def worse_everywhere(paper):
     table = paper["consistently_worse"]
     counts = table.groupby(["noise", "algorithm"]).size().sort_values(ascending=False)
     return {
+        "rates": counts.to_dict(),
         "at_every_rate": (counts == len(RATES)).sum(),
         "next": counts[counts < len(RATES)].max(),
         "of": counts.groupby("noise").sum().to_dict(),

@@ -6,6 +6,9 @@ A verdict is about our runs. It is made from their numbers, never written by han
 from common import markdown
 from harmful import MIXUP, NORMAL
 from helpful import ENDING, ENDING_ANYWHERE
+from paper_tables import RATES
+
+from analysis.paper import PAPER_CONFIGURATIONS, PAPER_SEEDS
 
 CONFIRMED, CONTRADICTED = "confirmed", "contradicted"
 UNDECIDED, NOT_TESTED = "undecided", "not tested"
@@ -21,7 +24,10 @@ def of_effect(effect, p, claimed=1):
 
 
 def of_all(verdicts):
-    """Judge the claim that something holds in every case, from the verdicts on the cases."""
+    """Judge the claim that something holds in every case, from the verdicts on the cases.
+
+    A case that is not tested can neither confirm nor contradict it.
+    """
     if CONTRADICTED in verdicts:
         return CONTRADICTED
     return CONFIRMED if set(verdicts) == {CONFIRMED} else UNDECIDED
@@ -62,6 +68,11 @@ def td3_losses(found):
     return [of_effect(found[rate]["percent"], 2 * found[rate]["p"], -1) for rate in found["rates"]]
 
 
+def sac_gains(found):
+    """Judge the gain of SAC at each of two rates, with Bonferroni's correction."""
+    return [of_effect(found["percent"][rate], 2 * p) for rate, p in found["p"].items()]
+
+
 def interval(value, low, high, form="+.0f"):
     """Write an estimate with its interval, in percent."""
     return f"{value:{form}} % [{low:{form.strip('+')}}, {high:{form.strip('+')}}]"
@@ -98,11 +109,12 @@ def claims(numbers):
             f"{ours}, n = {five['n'][name]}",
             judged[name],
         )
-    others = luck["improvement"][5:]
+    of_others = luck["algorithm"] != "PPO"
+    others, beyond = luck["improvement"][of_others], beyond_luck(luck["p"][of_others])
     add(
         "The best noise of SAC and TD3 helps in each environment",
         "luck-the-best-of-90",
-        f"{others.min():+.0f} to {others.max():+.0f} %; {beyond_luck(luck['p'][5:])} beyond luck",
+        f"{others.min():+.0f} to {others.max():+.0f} %; {beyond} beyond luck",
         "\u2013",
         NOT_TESTED,
     )
@@ -117,20 +129,20 @@ def claims(numbers):
         )
     worse = [sum(v == CONFIRMED for v in losses(found).values()) for found in (normal, mixup)]
     low, high = normal["alone_interval"]["Pusher"]
+    on_pusher = interval(normal["change"]["Pusher"], low, high)
     add(
         "They harm it in every environment",
         "noises-that-harm-ppo",
-        "5 of 5",
-        f"{min(worse)} of 5; Pusher {interval(normal['change']['Pusher'], low, high)}, "
-        f"n = {normal['n']}",
+        f"{len(normal['change'])} of {len(normal['change'])}",
+        f"{min(worse)} of {len(normal['change'])}; Pusher {on_pusher}, n = {normal['n']}",
         of_all([*losses(normal).values(), *losses(mixup).values()]),
     )
     ours = " and ".join(interval(*(td3[rate][key] for key in PERCENT)) for rate in td3["rates"])
     add(
-        f"`{NORMAL}` harms TD3 at the extreme rates",
+        f"`{NORMAL}` harms TD3 on HalfCheetah at the extreme rates",
         "a-noise-that-harms-td3",
-        "6 of 6 rates",
-        f"HalfCheetah, not side by side: {ours}, n = {td3['1.00']['n']}",
+        f"{numbers['worse']['rates'][NORMAL, 'TD3']} of {len(RATES)} rates",
+        f"not side by side: {ours}, n = {td3['1.00']['n']}",
         of_all(td3_losses(td3)),
     )
     for name in ("observation noise", "action noise"):
@@ -144,10 +156,11 @@ def claims(numbers):
             of_effect(row["difference"], row["p_holm"]),
         )
     consistent = ", ".join(f"{name} {by[name]['consistent']}" for name in by)
+    by_luck = by["SAC"]["consistent_by_luck"]  # the same for all three, as a test holds
     add(
         "Some noises are consistent",
         "consistent-noises",
-        f"{consistent} of 90; by luck {by['SAC']['consistent_by_luck']:.0f} each",
+        f"{consistent} of {PAPER_CONFIGURATIONS}; by luck {by_luck:.0f} each",
         "\u2013",
         NOT_TESTED,
     )
@@ -155,18 +168,18 @@ def claims(numbers):
     add(
         "Some noises reduce the variance",
         "step-variance-and-speed",
-        f"smaller with {numbers['paper_spread']['lower']} of 15 best noises",
-        f"PPO: {min(change.values()):+.0f} to {max(change.values()):+.0f} %, n = 10",
+        "smaller with {lower} of {rows} best noises".format(**numbers["paper_spread"]),
+        f"PPO: {min(change.values()):+.0f} to {max(change.values()):+.0f} %, n = {spread['n']}",
         of_some([of_effect(change[name], p, -1) for name, p in spread["holm"].items()]),
     )
     reward = five["reward"]
     add(
         "PPO gains from reward noise, TD3 from observation noise",
         "luck-the-best-of-90",
-        f"{counts['PPO']['reward']} and {counts['TD3']['observation']} of 5 best noises "
+        f"{counts['PPO']['reward']} and {counts['TD3']['observation']} of 5 best "
         f"(afterwards: p = {fisher:.2g})",
-        f"PPO: {reward['won']:.0f} of {reward['pairs']} pairs won, n = 10",
-        of_effect(reward["won"] / reward["pairs"] - 0.5, reward["p"]),
+        f"PPO only: {reward['won']:.0f} of {reward['pairs']} pairs won, n = {spread['n']}",
+        of_all([of_effect(reward["won"] / reward["pairs"] - 0.5, reward["p"]), NOT_TESTED]),
     )
     ours = " and ".join(
         interval(sac["percent"][rate], sac["low"][rate], sac["high"][rate])
@@ -176,14 +189,15 @@ def claims(numbers):
         f"`{numbers['scaled_reward']}` helps all algorithms",
         "sacs-early-performance",
         f"consistent in each; by luck in {numbers['scaled']['this']:.0f} %",
-        f"SAC: {ours}, n = 5",
-        of_all([of_effect(sac["percent"][rate], min(1, 2 * p)) for rate, p in sac["p"].items()]),
+        f"SAC only: {ours}, n = {min(sac['n'].values()):.0f}",
+        of_all([*sac_gains(sac), NOT_TESTED]),
     )
     ours = interval(*(step[key] for key in PERCENT))
     add(
         "The step of early termination matters",
         "step-variance-and-speed",
-        f"(1, 100) worse everywhere at {worse_at[ENDING_ANYWHERE]} of 18 rates, "
+        f"(1, 100) worse everywhere at {worse_at[ENDING_ANYWHERE]} of "
+        f"{len(RATES) * len(PAPER_SEEDS)} rates, "
         f"(50) at {worse_at[ENDING]}",
         f"PPO on Pusher: {ours}, n = {step['n']}",
         of_some([of_effect(abs(step["percent"]), step["p"])]),

@@ -1,5 +1,6 @@
 """The numbers in "What we found" of the project's README are those that results/ computes."""
 
+import baselines
 import harmful
 import pytest
 import readme
@@ -60,3 +61,20 @@ def test_robustness(numbers, section):
     limits = (acting[key] for key in ("difference", "difference_low", "difference_high"))
     assert "nothing was shown ({:+.0f} [{:.0f}, {:.0f}])".format(*limits) in section
     assert seeing["p_holm"] <= 0.05 < acting["p_holm"]
+
+
+def test_baselines(section):
+    """ "Clear" is the paper's tests with Holm's correction, and CleanRL's without."""
+    found = baselines.numbers()
+    assert "no clear difference but for PPO on Hopper and Walker2d, which returns more" in section
+    assert [name for name in found["holm"] if found["holm"][name] <= 0.05] == ["Hopper", "Walker2d"]
+    differences = found["full"]["numbers"] | found["short"]["numbers"]
+    clear = [
+        (name, who)
+        for name, others in differences.items()
+        for who, other in others.items()
+        if other["p"] <= 0.05
+    ]
+    of_ppo = ("PPO on Hopper-v5", "PPO on Walker2d-v4", "PPO on Walker2d-v5")
+    assert clear == [(name, "paper") for name in of_ppo]
+    assert all(differences[name]["paper"]["se"] > 0 for name in of_ppo)
