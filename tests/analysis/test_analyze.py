@@ -13,9 +13,11 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import nullcontext
 from html import escape, unescape
 from pathlib import Path
 from types import SimpleNamespace
+from unittest import mock
 
 import numpy as np
 import pandas as pd
@@ -110,10 +112,15 @@ def small_sweep(root, order=1, **kwargs):
         write_run(root, curve, env=env, seed=seed + 1, folder=folder, **config, **kwargs)
 
 
-def run(tmp_path, runs="runs", out="results", compare=None):
-    """Run analyze.py's main function and read its csv tables."""
-    args = analyze.Args(runs_dir=tmp_path / runs, out=tmp_path / out, compare=compare)
-    analyze.main(args)
+def main(args, drawn=False):
+    """Run analyze.py's main function, without figures: drawing takes longer than all the rest."""
+    with nullcontext() if drawn else mock.patch.object(analyze, "figures", return_value=[]):
+        analyze.main(args)
+
+
+def run(tmp_path, runs="runs", out="results", compare=None, drawn=False):
+    """Analyse and read the csv tables."""
+    main(analyze.Args(runs_dir=tmp_path / runs, out=tmp_path / out, compare=compare), drawn)
     empty = dict.fromkeys(("settings", "phase", "environment", "noise"), "")
     text = dict.fromkeys((*empty, "noise_rate", "test_rate"), str)
     files = sorted((tmp_path / out).glob("*.csv"))
@@ -132,14 +139,14 @@ def row(table, **where):
 def sweep(tmp_path_factory):
     path = tmp_path_factory.mktemp("sweep")
     small_sweep(path / "runs")
-    return SimpleNamespace(path=path, tables=run(path))
+    return SimpleNamespace(path=path, tables=run(path, drawn=True))
 
 
 @pytest.fixture(scope="module")
 def committed(tmp_path_factory):
     """What analyze.py writes for the runs of the repository."""
     out = tmp_path_factory.mktemp("committed")
-    analyze.main(analyze.Args(RESULTS / "data/runs", out, RESULTS / "paper"))
+    main(analyze.Args(RESULTS / "data/runs", out, RESULTS / "paper"))
     return out
 
 
@@ -538,7 +545,7 @@ def read(sweep, name):
 
 def test_shuffling_the_run_folders_changes_nothing(sweep, tmp_path):
     small_sweep(tmp_path / "runs", order=-1)
-    run(tmp_path)
+    run(tmp_path, drawn=True)
     for path in sorted((sweep.path / "results").glob("*")):
         assert path.read_bytes() == (tmp_path / "results" / path.name).read_bytes(), path.name
 
@@ -774,7 +781,7 @@ def test_what_an_earlier_analysis_left_is_said(tmp_path, capsys):
     run(tmp_path)
     assert "earlier analysis" not in capsys.readouterr().out
     (tmp_path / "results/summary_TD3.csv").touch()
-    analyze.main(analyze.Args(runs_dir=tmp_path / "runs", out=tmp_path / "results"))
+    main(analyze.Args(runs_dir=tmp_path / "runs", out=tmp_path / "results"))
     assert "earlier analysis, not renewed: summary_TD3.csv\n" in capsys.readouterr().out
 
 
@@ -905,7 +912,7 @@ def test_odd_sweeps_are_analysed_too(tmp_path):
     write_run(tmp_path / "runs", [0.0], folder="a")
     write_run(tmp_path / "runs", [1.0], folder="b", noise=SCALE, rate=0.1)
     write_run(tmp_path / "runs", [1.0], folder="c", noise=SCALE, rate=0.1, **settings)
-    tables = run(tmp_path)
+    tables = run(tmp_path, drawn=True)
     assert tables["summary_SAC"]["improvement_percent"].isna().all()
     assert len(list((tmp_path / "results").glob("curves_*.svg"))) == 2
 
@@ -1117,14 +1124,14 @@ def test_a_folder_that_cannot_be_written_is_an_error(tmp_path, capsys):
 
 def test_results_go_beside_the_runs_unless_another_analysis_lies_there(tmp_path, capsys):
     write_run(tmp_path / "runs", [1])
-    analyze.main(analyze.Args(runs_dir=tmp_path / "runs"))
+    main(analyze.Args(runs_dir=tmp_path / "runs"))
     assert (tmp_path / "runs/results/report.html").exists()
-    analyze.main(analyze.Args(runs_dir=tmp_path / "runs"))  # its own results are renewed
+    main(analyze.Args(runs_dir=tmp_path / "runs"))  # its own results are renewed
 
     (tmp_path / "runs/results/runs").mkdir()
     before = sorted((tmp_path / "runs/results").iterdir())
     with pytest.raises(SystemExit) as error:
-        analyze.main(analyze.Args(runs_dir=tmp_path / "runs"))
+        main(analyze.Args(runs_dir=tmp_path / "runs"))
     assert error.value.code == 2 and sorted((tmp_path / "runs/results").iterdir()) == before
     assert "--out" in capsys.readouterr().err
 
@@ -1136,16 +1143,16 @@ def test_results_that_git_tracks_are_not_overwritten_unasked(tmp_path, capsys):
     for command in (["init", "-q"], ["add", "results"]):
         subprocess.run(["git", "-C", tmp_path, *command], check=True)
     with pytest.raises(SystemExit) as error:
-        analyze.main(analyze.Args(runs_dir=tmp_path))
+        main(analyze.Args(runs_dir=tmp_path))
     assert error.value.code == 2 and (tmp_path / "results/best.csv").read_text() == "kept"
     assert "tracked by git" in capsys.readouterr().err
-    analyze.main(analyze.Args(runs_dir=tmp_path, out=tmp_path / "results"))  # asked for
+    main(analyze.Args(runs_dir=tmp_path, out=tmp_path / "results"))  # asked for
 
 
 def test_runs_one_folder_deeper_are_pointed_to(tmp_path, capsys):
     write_run(tmp_path / "runs/demo", [1])
     with pytest.raises(SystemExit):
-        analyze.main(analyze.Args(runs_dir=tmp_path / "runs"))
+        main(analyze.Args(runs_dir=tmp_path / "runs"))
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and str(tmp_path / "runs/demo") in error
     assert not (tmp_path / "runs/results").exists()
@@ -1170,7 +1177,7 @@ def test_what_is_printed_fits_the_terminal(width, tmp_path, capsys, monkeypatch)
     write_run(tmp_path, [1.0, 5.0], noise=long, rate=1.0, seed=4, finished=False)
     monkeypatch.setattr(analyze, "terminal_width", lambda: width)
     monkeypatch.chdir(tmp_path)
-    analyze.main(analyze.Args(runs_dir=Path(".")))
+    main(analyze.Args(runs_dir=Path(".")))
     lines = capsys.readouterr().out.splitlines()
     assert width - 20 < max(map(len, lines)) <= width
     [head] = [line for line in lines if line.startswith("algorithm  ")]
@@ -1189,16 +1196,10 @@ def test_a_file_gets_whole_lines(tmp_path):
     assert len(first) > 120 and first.endswith(".")
 
 
-def test_help_shows_the_commands():
-    command = [sys.executable, analyze.__file__, "--help"]
-    text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    assert "python analyze.py --runs-dir runs/demo --out somewhere" in text
-
-
 def test_one_seed_is_no_plural(tmp_path, capsys):
     write_run(tmp_path, [1.0, 2.0])
     write_run(tmp_path, [1.0, 2.0], noise=SCALE, rate=0.5)
-    analyze.main(analyze.Args(runs_dir=tmp_path))
+    main(analyze.Args(runs_dir=tmp_path))
     printed = capsys.readouterr().out
     assert "SAC, Hopper-v5: with 1 seed no difference can be significant" in printed
     for text in (printed, (tmp_path / "results" / "report.html").read_text()):
@@ -1212,13 +1213,13 @@ def test_a_run_without_a_name_of_its_kind_is_corrupt(name, tmp_path, capsys):
     config = json.loads(path.read_text())
     (config if name in config else config["args"])[name] = None
     path.write_text(json.dumps(config))
-    analyze.main(analyze.Args(runs_dir=tmp_path))
+    main(analyze.Args(runs_dir=tmp_path))
     assert f"config.json: {name} is None" in capsys.readouterr().out
 
 
 def test_one_baseline_run_is_enough_for_a_report(tmp_path, capsys):
     write_run(tmp_path / "runs", [1.0, 2.0])
-    tables = run(tmp_path)
+    tables = run(tmp_path, drawn=True)
     assert tables["best"].empty and row(tables["summary_SAC"], n=1)["mean"] == 2
     assert (tmp_path / "results/curves_SAC_no_noise.svg").exists()
     assert "Finished runs: 1." in capsys.readouterr().out
@@ -1254,9 +1255,10 @@ def test_committed_runs_had_the_noise_that_their_names_say():
 
 
 @pytest.mark.slow
-def test_help_names_every_option():
+def test_help_shows_a_command_and_every_option():
     command = [sys.executable, analyze.__file__, "--help"]
     text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert "python analyze.py --runs-dir runs/demo --out somewhere" in text
     assert all(option in text for option in ("--runs-dir", "--out", "--compare"))
 
 

@@ -166,6 +166,7 @@ def test_useless_noise_in_a_paper_is_beyond_luck_in_five_percent_of_studies(n, m
     assert 0.03 <= (np.array(p) <= 0.05).mean() <= 0.08
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [5, 10])
 def test_the_captions_say_how_often_p_luck_is_wrong_and_how_often_it_finds_an_effect(
     n, monkeypatch
