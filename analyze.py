@@ -1,4 +1,4 @@
-"""From a folder of runs to the paper's tables and figures, with statistics fit for few seeds.
+"""Make the paper's tables and figures from a folder of runs, with statistics fit for few seeds.
 
     python analyze.py
     python analyze.py --runs-dir runs/demo --out somewhere --compare results/paper

@@ -10,59 +10,57 @@ Usage: ./benchmark.sh PRESET [grid options] [executor options] [-- script option
        ./benchmark.sh status [PRESET] [grid options]
 
 Presets
-  choose     finds out whether a noise helps, and which: for each algorithm and environment that you
-             name, runs the noises with more and more seeds, drops the worse half again and again,
-             compares the winner with no noise on fresh seeds, and says what came out; the runs
-             go into runs/choose
+  choose     finds a noise that helps: for each algorithm and environment, tries the noises, gives
+             the better half of them more seeds in each round, compares the winner with no noise on
+             fresh seeds, and prints a verdict; the runs are stored in runs/choose
   demo       PPO on InvertedPendulum-v5, without and with one noise, 5 seeds, 50,000 steps, into
              runs/demo
   baseline   no noise: 3 algorithms, 5 environments, the paper's seeds
   best       the paper's best noise for each algorithm and environment
   paper      15 noises at 6 rates, 9,100 runs
   ablation   PPO with noise of several strengths (the paper's appendix)
-  custom     whatever the grid options say
+  custom     what the grid options name, nothing else
 Every preset includes the baselines.
 
 Grid options replace a preset's values
   --algos sac td3 ppo
   --envs Hopper-v5 my_envs:MyEnv-v0
-             an environment of your own: my_envs.py lies in the folder that you call this from
+             your own environment, from my_envs.py in the current folder
   --seeds 1-5 7
   --noises "RandomNormalNoisyReward(1.0)" "RandomEarlyTermination(50)+RandomMixupObservation(0.5)"
              noises joined by + act together
   --noise-rates 0.05 1.0 1.0:0.0
              each noise is run at each rate; 1.0:0.0 falls linearly during training
   --noises "RandomNormalNoisyReward(1.0)@0.1+RandomEarlyTermination(50)@0.2"
-             rates of its own, for each noise; --noise-rates does not apply to these
-  --combine  custom: adds every pair of the noises, both in one environment
+             a rate for each noise; --noise-rates does not apply here
+  --combine  with custom: also run every pair of the noises together
   --total-timesteps 1e6
   --runs-dir runs
-             where the run folders go (choose: runs/choose, demo: runs/demo); counts from the folder
-             that you call this from
+             folder of the runs, relative to the current folder (choose: runs/choose, demo:
+             runs/demo)
 
 Options of choose
-  --noises paper           all of the paper's 15 noises at 6 rates: 318 runs. By default 8 noises at
-                           rates 0.05 and 1.0 are tried, in 96 runs: mild ones of every kind, and
-                           those that did best in the paper and in our runs (docs/sweeps.md lists
-                           them). Both confirm a true gain of 1.5 standard deviations in 9 of 10 cases
+  --noises paper           the paper's 15 noises at 6 rates: 318 runs. The default is 8 noises at
+                           rates 0.05 and 1.0, in 96 runs (docs/sweeps.md lists them). Both confirm
+                           a true gain of 1.5 standard deviations in 9 of 10 cases
   --exclude "NOISE@RATE"   noises to leave out, for example because they always fail
-  --budget N               runs that the search may take, about (default: 3 for each noise)
+  --budget N               about how many runs the search may take (default: 3 for each noise)
   --confirm N              fresh seeds for the final comparison (default: 25)
 
 Executor options
-  --dry-run             print the commands of the runs that are to do, start nothing
+  --dry-run             print the commands of the remaining runs and start nothing
   --executor local      (default) runs side by side on this machine
   --executor parallel   GNU parallel, on this machine or over ssh
   --executor slurm      job arrays; submits and returns
   --jobs N              runs at a time: on each machine (default: the number of its cores), or of
                         each job array (default: as many as the cluster has room for)
   --sshlogin LIST       machines in GNU parallel's notation: "hostA,hostB", "4/user@host", ":"
-  --remote-dir DIR      where the project lies on machines that do not share this folder: run
-                        folders are then sent and fetched with rsync
+  --remote-dir DIR      the project's folder on machines that do not share this one: run folders
+                        are then copied with rsync
   --slurm-args "..."    options for sbatch, e.g. "--partition=cpu --time=24:00:00"
   --wait                slurm: wait for the jobs and report (choose always waits)
 
-Options of the training scripts, such as --eval-episodes 20, stand at the end, after "--".
+Put options of the training scripts, such as --eval-episodes 20, at the end, after "--".
 
 Examples
   ./benchmark.sh choose --algos ppo --envs Pusher-v5 --noise-rates 1.0
@@ -74,10 +72,10 @@ Examples
   ./benchmark.sh status --runs-dir runs/short
   ./benchmark.sh paper --dry-run | grep sac_ | head -n 1 | sh
 
-The same command again starts what is not done and resumes what was interrupted. Ctrl-C stops
-every run with a checkpoint. `status` without a preset tells of the runs that RUNS_DIR holds. Logs
-are in RUNS_DIR/logs. The interpreter is $PYTHON, else .venv/bin/python, else python. Exit status:
-0 every run is done, 1 some are not, 2 bad arguments, 130 stopped by Ctrl-C. See docs/sweeps.md.
+Run the same command again to resume: finished runs are skipped. Ctrl-C saves a checkpoint of every
+run and exits. `status` without a preset lists all runs in RUNS_DIR. Logs are in RUNS_DIR/logs. The
+interpreter is $PYTHON, else .venv/bin/python, else python. Exit status: 0 all runs are done, 1 some
+are not, 2 bad arguments, 130 stopped by Ctrl-C. See docs/sweeps.md.
 END
 }
 
@@ -131,7 +129,7 @@ export PYTHON
 lacking=$("$PYTHON" -c "import sys, importlib.util as u
 print(*[name for name in sys.argv[1:] if not u.find_spec(name)], sep=', ')" \
   gymnasium mujoco torch tyro tensorboard 2>/dev/null) ||
-  fail "'$PYTHON' is no Python 3: set PYTHON, or install requirements.txt into .venv"
+  fail "'$PYTHON' is not a Python 3: set PYTHON, or install requirements.txt into .venv"
 [ -z "$lacking" ] ||
   fail "'$PYTHON' lacks $lacking: set PYTHON, or install requirements.txt into .venv"
 
@@ -164,7 +162,7 @@ fi
 export PARALLEL_SSH=${PARALLEL_SSH:-ssh -o BatchMode=yes}
 parallel_options=(--will-cite --workdir "${remote_dir:-$PWD}")
 [ -z "$sshlogin" ] || parallel_options+=(--sshlogin "$sshlogin")
-command -v flock >/dev/null || fail "this needs flock (Debian: apt-get install util-linux)"
+command -v flock >/dev/null || fail "benchmark.sh needs flock (Debian: apt-get install util-linux)"
 if [ "$count" -eq 0 ]; then
   show report
   exit
@@ -185,7 +183,7 @@ stopped=0 group='' ids=()
 stop() { # EXIT_STATUS
   if [ "$stopped" -eq 0 ]; then
     stopped=$1
-    echo "stopping: every run writes a checkpoint first" >&2 || true
+    echo "stopping: every run saves a checkpoint first" >&2 || true
     [ -z "$group${ids[*]}" ] || "stop_$executor" &
   elif [ "$executor" = slurm ]; then
     stop_slurm || true
@@ -235,7 +233,7 @@ while [ "$count" -gt 0 ]; do
   run_todo
   if [ "$stopped" -ne 0 ]; then
     show stopped
-    echo "stopped; the same command goes on from here"
+    echo "stopped; run the same command again to resume"
     exit "$stopped"
   fi
   if [ "${grid[0]}" = choose ]; then list_todo; else break; fi

@@ -1,14 +1,14 @@
 """Test trained policies again: clean and under noise, in a window, or as a video.
 
-    python evaluate.py runs/Hopper-v5__* --noise "RandomNormalNoisyAction(0.2)" --noise-rate 0.5 1
-    python evaluate.py runs/Hopper-v5__sac_continuous_noisy__baseline__1 --render
+    python evaluate.py runs/*Hopper-v5* --noise "RandomNormalNoisyAction(0.2)" --noise-rate 0.5 1
+    python evaluate.py runs/baseline_s1__Hopper-v5__sac_continuous_noisy --render
     python evaluate.py runs --video videos
 
 Every policy plays without noise and under every noise at every rate. Episode i begins with
 reset(seed = --seed + i), which also seeds the noise: all policies and conditions share their
-initial states. Returns are the environment's own, before noise on the reward. robustness.csv in
-the run's folder keeps them, and what it has is not played again. It has no column for the seed:
-with another --seed than the default, everything is played and nothing is stored.
+initial states. Returns are the environment's own, before noise on the reward. They are stored in
+robustness.csv in the run's folder, and what is stored there is not played again. That file has no
+column for the seed: with any --seed but the default, everything is played and nothing is stored.
 """
 
 import csv
@@ -65,13 +65,13 @@ class Args:
     noise: tuple[str, ...] = ()
     """noises to test under; "A(..)+B(..)" combines two"""
     noise_rate: tuple[float | str, ...] = ()
-    """probabilities p; every noise is tested at every one"""
+    """noise rates; every noise is tested at every rate"""
     episodes: int = 100
     """test episodes per policy and condition"""
     seed: int = 2_000_000
-    """seed of the first episode; with another one everything is played and nothing is stored"""
+    """seed of the first episode; with any other, everything is played and nothing is stored"""
     jobs: int = 1
-    """processes side by side"""
+    """number of parallel processes"""
     render: bool = False
     """show one episode of each condition in a window and store nothing"""
     video: Path | None = None
@@ -97,7 +97,7 @@ def reason(error):
 def find_runs(paths):
     """Return the runs that the paths name, each once; a folder stands for its finished runs."""
     if not paths:
-        fail("name the runs to test, for example: python evaluate.py runs/Hopper-v5__*")
+        fail("name the runs to test, for example: python evaluate.py runs/*Hopper-v5*")
     folders = []
     for path in paths:
         children = sorted(filter(is_run, path.iterdir())) if path.is_dir() else []
@@ -119,7 +119,7 @@ def find_runs(paths):
 def read_finished(folder):
     """Read what a finished run's config.json says."""
     if not (folder / "result.json").exists():
-        fail(f"{folder} is not finished: the command that started it goes on with it")
+        fail(f"{folder} is not finished: run the command that started it again")
     try:
         config = read_config(folder)
         return FinishedRun(folder, *(config[name] for name in FinishedRun._fields[1:]))
@@ -164,7 +164,7 @@ def load(run, render_mode=None):
     try:
         return env, script.load_policy(run.folder, env)
     except Exception as error:  # a damaged file may raise anything
-        fail(f"{run.folder / 'policy.pt'} is no policy for {run.environment}: {reason(error)}")
+        fail(f"{run.folder / 'policy.pt'} is not a policy for {run.environment}: {reason(error)}")
 
 
 def check_environment(run, conditions):

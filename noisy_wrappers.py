@@ -7,18 +7,19 @@ episode) is perturbed, otherwise the data of the environment pass through untouc
 combine by nesting, or with :func:`make_noisy`.
 
 A rate that changes during training is written "start:end": ``"1.0:0.0"`` goes linearly from 1 to 0.
-:func:`set_progress` says how much of the training is done; the next ``reset()`` sets the rate.
+Call :func:`set_progress` to say how much of the training is done; the next ``reset()`` sets the
+rate.
 
 On a perturbed step ``info["noise"]`` is the tuple of the names of the wrappers that acted,
 innermost first; on other steps the key is absent.
 
 Randomness. A wrapper owns two generators, made at ``reset(seed=seed)`` by
 ``np.random.SeedSequence([seed, zlib.crc32(class_name.encode()), position]).spawn(2)``, in which
-``position`` is the number of noise wrappers inside this one. The first, the gate, gives one
-uniform per opportunity whatever the rate, so under one seed a higher rate perturbs the same steps
-and more; the second gives the noise. ``reset()`` goes on with both streams; a wrapper never seeded
-draws its seed from the operating system. The environment's own generator is never touched, so
-initial states are the same with and without noise.
+``position`` is the number of noise wrappers inside this one. The first, the gate, draws one uniform
+number per opportunity, whatever the rate, so under one seed a higher rate perturbs the same steps
+and more; the second draws the noise. ``reset()`` without a seed continues both streams; a wrapper
+that was never seeded takes its seed from the operating system. The environment's own generator is
+never touched, so initial states are the same with and without noise.
 """
 
 import ast
@@ -216,7 +217,7 @@ class ObservationNoise(NoiseWrapper):
     kind = "observation"
 
     def __init__(self, env: Env, noise_rate: float | str, **parameters: Any):
-        """Raise ValueError unless observations are a Box of numbers that are no categories."""
+        """Raise ValueError unless observations are a Box of numbers, none of them categories."""
         super().__init__(env, noise_rate, **parameters)
         space = env.observation_space
         flattened = [
@@ -226,9 +227,9 @@ class ObservationNoise(NoiseWrapper):
         ]
         if any(_has_categories(part) for part in [space, *flattened]):
             raise ValueError(
-                f"{type(self).__name__} cannot perturb categories, and this environment observes "
-                "some (a Discrete or MultiDiscrete space): take reward noise, action noise or "
-                "early termination"
+                f"{type(self).__name__} cannot perturb categories, which this environment's "
+                "observations contain (a Discrete or MultiDiscrete space): use reward noise, "
+                "action noise or early termination"
             )
         if not isinstance(space, gym.spaces.Box) or space.dtype.kind not in "fiu":
             raise ValueError(
@@ -374,7 +375,7 @@ class RandomMixupObservation(ObservationNoise):
     and is no opportunity. No noise is drawn besides the gate's.
 
     noisyenv 0.1.1 remembers what it returned, as ``recursive=True`` does, so with p = 1 and
-    factor = 0 the agent sees one observation for ever; and it blends the first observation of an
+    factor = 0 the agent sees one observation forever; and it blends the first observation of an
     episode with the last one of the episode before.
 
     >>> env = RandomMixupObservation(gym.make("CartPole-v1"), 1.0, 0.0)
@@ -686,20 +687,20 @@ class RecordEpisodeStatistics(gym.wrappers.RecordEpisodeStatistics[Any, Any]):
 
 
 class NotFiniteError(FloatingPointError):
-    """A number that training cannot go on with: NaN, infinite, or no number at all."""
+    """A value that training cannot continue with: NaN, infinite, or not a number at all."""
 
 
 class SpaceError(ValueError):
-    """Observations or actions that are no vectors of numbers."""
+    """Observations or actions that are not vectors of numbers."""
 
 
 class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Stops at NaN and infinity, makes rewards floats and observations arrays of their own.
 
-    A learner that is given NaN is lost from there on, and says so much later or never; so it raises
-    NotFiniteError, which says whether the action was NaN already, as after a divergence. The
-    reward may be an array of one number, but no text. An observation is copied: an environment may
-    write the next one into the same array.
+    A learner that receives NaN does not recover, and may never show it. So this raises
+    NotFiniteError, which says whether the action was already NaN, as after a divergence. The
+    reward may be an array of one number but not a string. Observations are copied, because an
+    environment may write the next one into the same array.
 
     >>> env = FiniteNumbers(gym.make("Pendulum-v1", disable_env_checker=True))
     >>> _ = env.reset(seed=0)
@@ -782,7 +783,7 @@ def signatures() -> list[str]:
 def parse_noise(text: str) -> Noise:
     """Read the paper's notation, e.g. "RandomUniformScaleReward(0.5, 1.5)".
 
-    Literals only, nothing is evaluated. The wrapper's constructor checks the arguments.
+    Only literals are allowed; nothing is evaluated. The wrapper's constructor checks the arguments.
 
     >>> str(parse_noise("RandomUniformScaleReward(.50, high=1.5)"))
     'RandomUniformScaleReward(0.5, 1.5)'
@@ -886,7 +887,7 @@ def canonical_noises(
     (['RandomNormalNoisyReward(1.0)'], ['1.0:0.0'])
 
     Raises:
-        ValueError: a bad noise, a bad rate, or numbers of rates and noises that differ.
+        ValueError: a bad noise or rate, or neither one rate nor one for each noise.
     """
     pairs = _pair(noises, rates)
     return [str(noise) for noise, _ in pairs], [rate for _, rate in pairs]
@@ -914,7 +915,7 @@ def make_noisy(
         ValueError: as :func:`canonical_noises`, a space that a noise cannot work on, or an
             environment that records its episodes already; if it shows this only when an episode
             ends, by an "episode" in its info, the error comes then.
-        TypeError: what is no single environment, such as a vector environment.
+        TypeError: not a single environment (a vector environment, for example).
     """
     if not isinstance(env, gym.Env):
         raise TypeError(f"make_noisy takes a single gymnasium.Env, not a {type(env).__name__}")
@@ -938,9 +939,9 @@ def make_noisy(
 def make_flat(env: Env) -> Env:
     """Prepare an environment for networks, whose inputs and outputs are vectors.
 
-    Observations that are no vector (dictionaries, tuples, arrays, categories) are flattened to one
-    by ``gymnasium.wrappers.FlattenObservation``; :class:`FiniteNumbers` makes rewards floats and
-    stops at NaN and infinity. Noise belongs around the result: ``make_noisy(make_flat(env), ...)``.
+    Non-vector observations (dictionaries, tuples, arrays, categories) are flattened by
+    ``gymnasium.wrappers.FlattenObservation``; :class:`FiniteNumbers` makes rewards floats and stops
+    at NaN and infinity. Apply noise to the result: ``make_noisy(make_flat(env), ...)``.
 
     >>> make_flat(gym.make("Pendulum-v1").unwrapped)
     <FiniteNumbers<PendulumEnv<Pendulum-v1>>>
@@ -949,7 +950,7 @@ def make_flat(env: Env) -> Env:
     noisy_wrappers.SpaceError: needs Box actions of floats in one dimension; CartPole-v1 has ...
 
     Raises:
-        SpaceError: actions that are no vector of floats, or observations that cannot become one.
+        SpaceError: actions are not a vector of floats, or observations cannot become a vector.
     """
     name = env.spec.id if env.spec else str(env)
     space = env.observation_space
@@ -969,9 +970,9 @@ def make_flat(env: Env) -> Env:
 
 
 def set_progress(env: Any, fraction: float) -> None:
-    """Say what fraction of training is done, for rates that change; call it before a ``reset()``.
+    """Set the fraction of training done, for rates that change; call it before each ``reset()``.
 
-    The rates follow when the next episode begins and never within one; constant rates stay. ``env``
+    Rates change when the next episode begins, never within one; constant rates stay. ``env``
     is an environment, a vector environment of Gymnasium, or a VecEnv of Stable-Baselines3, whose
     environments may run in processes of their own. Without noise nothing happens.
 
@@ -985,7 +986,7 @@ def set_progress(env: Any, fraction: float) -> None:
 
     Raises:
         ValueError: a fraction that is not in [0, 1].
-        TypeError: what is no environment.
+        TypeError: not an environment.
     """
     progress = _number("fraction", fraction, low=0, high=1)
     if isinstance(env, gym.Env):
@@ -1002,7 +1003,7 @@ def noise_wrappers(env: Env) -> dict[str, NoiseWrapper]:
     The second of a class is "ClassName_2", and so on.
 
     Raises:
-        TypeError: what is no single environment.
+        TypeError: not a single environment.
     """
     if not isinstance(env, gym.Env):
         raise TypeError(f"noise_wrappers takes a gymnasium.Env, not a {type(env).__name__}")
@@ -1028,7 +1029,7 @@ def noise_statistics(env: Any) -> dict[str, float]:
 
     Raises:
         ValueError: a vector of environments whose noises differ.
-        TypeError: what is no environment.
+        TypeError: not an environment.
     """
     if isinstance(env, gym.Env):
         outermost = next(_noise_layers(env), None)
@@ -1038,7 +1039,7 @@ def noise_statistics(env: Any) -> dict[str, float]:
         return {}
     each = _call_each(env, "noise_statistics") if all(noisy) else []
     if len({tuple(statistics) for statistics in each}) != 1:
-        raise ValueError("these environments have different noises, so there are no means to give")
+        raise ValueError("these environments have different noises, so there are no means")
     return {name: float(np.mean([one[name] for one in each])) for name in each[0]}
 
 
@@ -1058,9 +1059,9 @@ class EnvState:
 
     That is the random generators of the environment and of its action space, the random streams and
     the counters of its noise wrappers, and the returns that RecordEpisodeStatistics remembers.
-    ``generators`` are further ones to keep beside them. How far training is, :func:`set_progress`
-    has to say again. An environment of one's own that carries more than its generator
-    ``np_random`` does not go on exactly.
+    Further ``generators`` are kept with them. After loading, call :func:`set_progress` again. An
+    environment that carries more than its generator ``np_random`` from one episode to the next does
+    not resume exactly.
 
     >>> env = make_noisy(gym.make("Pendulum-v1"), ["RandomNormalNoisyObservation(1)"], [0.5])
     >>> _ = env.reset(seed=1)
@@ -1072,7 +1073,7 @@ class EnvState:
     """
 
     def __init__(self, env: Env, *generators: np.random.Generator):
-        """Look at an environment that has been reset with a seed."""
+        """Take an environment that has been reset with a seed."""
         self.env = env
         self.generators = generators
 
@@ -1191,7 +1192,7 @@ def run_folder(
     rates: Sequence[float | str],
     seed: int,
 ) -> Path:
-    """Return a run's folder: :func:`run_name` in runs_dir, or the one that version 0.1 has made."""
+    """Return a run's folder: :func:`run_name` in runs_dir, or the folder that version 0.1 made."""
     pairs = _pair(noises, rates)
     slug = "+".join(f"{_words(noise)}_p{_rate_word(rate)}" for noise, rate in pairs) or "baseline"
     old_name = f"{_safe(env_id)}__{_safe(exp_name)}__{slug}__{seed}"
@@ -1239,7 +1240,7 @@ def _import_module(module: str, env_id: str) -> None:
     top = module.partition(".")[0]
     try:
         if not all(map(str.isidentifier, module.split("."))):
-            raise ValueError(f"there is no environment {env_id!r}: {module!r} is no module's name")
+            raise ValueError(f"there is no environment {env_id!r}: {module!r} is not a module name")
         loaded, found = sys.modules.get(top), importlib.machinery.PathFinder.find_spec(top)
         if loaded and found and found.origin != getattr(loaded, "__file__", found.origin):
             raise ValueError(

@@ -52,19 +52,19 @@ class Args:
     env_id: str = "HalfCheetah-v5"  # Gymnasium environment: Name-v0, or module:Name-v0
     seed: int = 1  # seed of everything that is random
     total_timesteps: int = 1_000_000  # environment steps, rounded down to whole rollouts
-    max_episode_steps: int | None = None  # time limit of episodes, in place of the environment's
+    max_episode_steps: int | None = None  # time limit of an episode; None: the environment's own
     exp_name: str = Path(__file__).stem  # name of the experiment, part of the run folder's name
     runs_dir: str = "runs"  # folder in which the run's own folder is made
     overwrite: bool = False  # delete the files in the run's folder and start again
     checkpoint_frequency: int = 50_000  # environment steps between two checkpoints
-    noise: tuple[str, ...] = ()  # noises of the training environment; without any: the baseline
-    noise_rate: tuple[float | str, ...] = ()  # probability of each noise, or start:end of it
-    eval_frequency: int | None = None  # steps between tests; None: at most 50,000; 0: at the end
+    noise: tuple[str, ...] = ()  # noises of the training environment; the baseline has none
+    noise_rate: tuple[float | str, ...] = ()  # probability of each noise; 1.0:0.0 falls linearly
+    eval_frequency: int | None = None  # steps between tests; None: up to 50,000; 0: only at the end
     eval_episodes: int = 10  # episodes in each test
 
     cuda: bool = False  # train on a GPU (not tested on one yet); these networks are small
-    torch_threads: int = 1  # CPU threads; several runs side by side gain more than threads do
-    compile: bool = True  # compile the updates, which takes a C++ compiler
+    torch_threads: int = 1  # CPU threads; runs in parallel gain more than extra threads
+    compile: bool = True  # compile the updates; needs a C++ compiler
     # precision of float32 products, raised to highest where another would cost accuracy
     matmul_precision: Literal["highest", "high", "medium"] = "highest"
 
@@ -80,9 +80,9 @@ class Args:
     clip_vloss: bool = True  # clip the value loss, too
     ent_coef: float = 0.0  # coefficient of the entropy
     vf_coef: float = 0.5  # coefficient of the value loss
-    max_grad_norm: float = 0.5  # largest norm of the gradient
-    target_kl: float | None = None  # end a rollout's epochs at this KL divergence
-    # bootstrap the value where a time limit ends an episode; CleanRL treats that as a terminal
+    max_grad_norm: float = 0.5  # gradients are clipped to this norm
+    target_kl: float | None = None  # stop the epochs of a rollout above this KL divergence
+    # bootstrap the value where a time limit ends an episode; CleanRL treats it as terminal
     bootstrap_truncated: bool = False
 
 
@@ -615,7 +615,7 @@ class Run:
             raise ValueError("it is damaged")
         checkpoint = torch.load(self.checkpoint, weights_only=True)
         if checkpoint["format"] != 4:
-            raise ValueError("another version of this script wrote it, which can finish the run")
+            raise ValueError("another version wrote it: finish the run with that version")
         if checkpoint["run"] != self.folder.name:
             raise ValueError(f"it belongs to {checkpoint['run']}")
         for part, state in zip(self.state, checkpoint["state"], strict=True):
@@ -652,7 +652,7 @@ class Run:
         for group, values in groups.items():
             tags |= {f"{group}/{name}": float(value) for name, value in values.items()}
         if not all(map(math.isfinite, tags.values())):
-            reason = f"step {step}: training diverged, not all is finite: {tags}"
+            reason = f"step {step}: training diverged, some values are not finite: {tags}"
             raise noisy.NotFiniteError(reason)
         with self._writing("events.*"):
             for tag, value in tags.items():

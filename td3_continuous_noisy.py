@@ -52,28 +52,28 @@ class Args:
     env_id: str = "HalfCheetah-v5"  # Gymnasium environment: Name-v0, or module:Name-v0
     seed: int = 1  # seed of everything that is random
     total_timesteps: int = 1_000_000  # environment steps to train for
-    max_episode_steps: int | None = None  # time limit of episodes, in place of the environment's
+    max_episode_steps: int | None = None  # time limit of an episode; None: the environment's own
     exp_name: str = Path(__file__).stem  # name of the experiment, part of the run folder's name
     runs_dir: str = "runs"  # folder in which the run's own folder is made
     overwrite: bool = False  # delete the files in the run's folder and start again
     checkpoint_frequency: int = 50_000  # environment steps between two checkpoints
-    noise: tuple[str, ...] = ()  # noises of the training environment; without any: the baseline
-    noise_rate: tuple[float | str, ...] = ()  # probability of each noise, or start:end of it
-    eval_frequency: int | None = None  # steps between tests; None: at most 10,000; 0: at the end
+    noise: tuple[str, ...] = ()  # noises of the training environment; the baseline has none
+    noise_rate: tuple[float | str, ...] = ()  # probability of each noise; 1.0:0.0 falls linearly
+    eval_frequency: int | None = None  # steps between tests; None: up to 10,000; 0: only at the end
     eval_episodes: int = 10  # episodes in each test
 
     cuda: bool = False  # train on a GPU (not tested on one yet); these networks are small
-    torch_threads: int = 1  # CPU threads; several runs side by side gain more than threads do
-    compile: bool = True  # compile the updates, which takes a C++ compiler
+    torch_threads: int = 1  # CPU threads; runs in parallel gain more than extra threads
+    compile: bool = True  # compile the updates; needs a C++ compiler
     # precision of float32 products, raised to highest where another would cost accuracy; with bf16
     # the updates are computed in bfloat16, even if this costs accuracy
     matmul_precision: Literal["highest", "high", "medium", "bf16"] = "medium"
 
     buffer_size: int = 1_000_000  # transitions in the replay buffer
     gamma: float = 0.99  # discount factor
-    tau: float = 0.005  # step of the target networks towards the networks
+    tau: float = 0.005  # target smoothing coefficient
     batch_size: int = 256  # transitions in a minibatch
-    learning_starts: int = 25_000  # environment steps with random actions, before learning starts
+    learning_starts: int = 25_000  # environment steps with random actions before learning starts
     learning_rate: float = 3e-4  # learning rate of the policy and of the Q-functions
     policy_frequency: int = 2  # environment steps between two updates of the policy and the targets
     # noise of 1.0 below is half the range of the actions
@@ -260,7 +260,7 @@ def train(args, stop=lambda: False):
     """Train one agent; return False if stop(), asked whenever an episode ends, ended it early."""
     args, env, test_env = make_envs(args)
     if not np.isfinite([env.action_space.low, env.action_space.high]).all():
-        fail(f"TD3 needs bounded actions; some of {args.env_id} have no bounds")
+        fail(f"TD3 needs bounded actions; some actions of {args.env_id} are unbounded")
     torch.set_num_threads(args.torch_threads)
     device = torch.device("cuda" if args.cuda else "cpu")
     run = Run(args, "TD3", use_matmul_precision(args.matmul_precision, device), env)
@@ -590,7 +590,7 @@ class Run:
             raise ValueError("it is damaged")
         checkpoint = torch.load(self.checkpoint, weights_only=True)
         if checkpoint["format"] != 4:
-            raise ValueError("another version of this script wrote it, which can finish the run")
+            raise ValueError("another version wrote it: finish the run with that version")
         if checkpoint["run"] != self.folder.name:
             raise ValueError(f"it belongs to {checkpoint['run']}")
         for part, state in zip(self.state, checkpoint["state"], strict=True):
@@ -627,7 +627,7 @@ class Run:
         for group, values in groups.items():
             tags |= {f"{group}/{name}": float(value) for name, value in values.items()}
         if not all(map(math.isfinite, tags.values())):
-            reason = f"step {step}: training diverged, not all is finite: {tags}"
+            reason = f"step {step}: training diverged, some values are not finite: {tags}"
             raise noisy.NotFiniteError(reason)
         with self._writing("events.*"):
             for tag, value in tags.items():

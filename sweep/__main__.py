@@ -231,6 +231,9 @@ def main(view, caller, argv):
 
 
 if __name__ == "__main__":
+    if sys.argv[1:] in ([], ["-h"], ["--help"]):
+        print(__doc__)
+        sys.exit()
     try:
         sys.exit(main(sys.argv[1], sys.argv[2], sys.argv[3:]))
     except KeyboardInterrupt:

@@ -109,7 +109,7 @@ def check_others(args, algorithm, env_id):
         if result(make_run(args, algorithm, env_id, *found, seed=1))[0]:
             fail(
                 f"{args.runs_dir} holds a choice among other noises, one of them "
-                f"{halving.spelled(as_text(found))}: go on with it (--noises paper tries all 90), "
+                f"{halving.spelled(as_text(found))}: continue it (--noises paper tries all 90), "
                 "or choose another --runs-dir"
             )
 
@@ -287,8 +287,8 @@ def verdicts(found, judgements):
 
 
 def obstacle(choice):
-    """Say that a choice cannot go on, and what to do."""
-    text = f"{describe(choice)}. These did not finish; the same command starts them again."
+    """Say that a choice cannot continue, and what to do."""
+    text = f"{describe(choice)}. These did not finish; run the same command again to retry them."
     for noise, rate, _ in choice.state.due:
         pairs = zip(*choice.cells[noise, rate], strict=True)
         excluded = "+".join(f"{one}@{own}" for one, own in pairs)

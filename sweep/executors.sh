@@ -89,7 +89,7 @@ submit() { # the array's indices are line numbers, counted from the offset of it
   local size offset n id
   size=$(scontrol show config | awk '$1 == "MaxArraySize" {print $3}') || true
   [ "$stopped" -eq 0 ] || return 0
-  [ "${size:-0}" -gt 0 ] || fail "scontrol show config does not tell MaxArraySize"
+  [ "${size:-0}" -gt 0 ] || fail "scontrol show config does not show MaxArraySize"
   read -ra slurm_options <<<"$slurm_args"
   for ((offset = 0; offset < count && stopped == 0; offset += size)); do
     n=$((count - offset < size ? count - offset : size))

@@ -107,7 +107,7 @@ def rate(text):
     try:
         return float(text)
     except ValueError:
-        reason = f"{text!r} is no rate: give a number from 0 to 1, or two as in 1.0:0.0"
+        reason = f"{text!r} is not a rate: give a number from 0 to 1, or two as in 1.0:0.0"
         raise argparse.ArgumentTypeError(reason) from None
 
 
@@ -142,16 +142,16 @@ def check_arguments(args):
         fail(f"--envs: {error}")
     for name in ("--exclude", "--budget", "--confirm"):
         if name in args.given and args.preset != "choose":
-            fail(f"{name} belongs to choose")
+            fail(f"{name} is an option of choose")
     if args.combine and args.preset != "custom":
-        fail("--combine belongs to custom")
+        fail("--combine is an option of custom")
     if args.preset == "choose":
         if not {"--algos", "--envs"} <= args.given:
-            fail("choose needs --algos and --envs: the noise is chosen for each of them")
+            fail("choose needs --algos and --envs: it chooses a noise for each of them")
         if "--seeds" in args.given:
-            fail("choose takes the seeds that it needs: leave out --seeds; see --budget, --confirm")
+            fail("choose picks its own seeds: leave out --seeds; see --budget and --confirm")
     if {"-h", "--help"} & set(args.extra):
-        fail("--help after the -- would start nothing: ask the script itself")
+        fail("--help belongs before the --; for the options of a script, call it with --help")
     for word in args.extra:
         if not word.startswith("--"):
             continue

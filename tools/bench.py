@@ -8,17 +8,17 @@
 
 Every program is a process with one thread on one core (the last; `taskset` chooses another). It has
 its defaults, but neither tests its policy nor saves. Whenever it logs losses to TensorBoard (every
-100 steps; PPO: after every rollout) it reports the time and waits to be told to go on. So each
+100 steps; PPO: after every rollout) it reports the time and waits for its next turn. So each
 program starts once, reports three times to warm up, and then runs in blocks of --seconds, of which
 --pairs are measured. A speed is the median of its blocks.
 
-    core %       the share of the core that the process got; below 97 the machine was not quiet
+    core %       the share of the core that the process got; below 97 the machine was busy
     memory MB    the most that the process held; --stored 1000000 fills the replay buffer first
 
 With --clock cpu only time on the core counts, which depends less on other processes.
---against-... runs others alternately with ours, a block each. "ours / its" is the median of the
-ratios of neighbouring blocks, and "from", "to" the 95 % interval of this median (with fewer than
-six pairs: the smallest and the largest ratio). CleanRL's pinned Gymnasium has -v4 environments
+--against-... runs other programs and ours in turn, one block each. "ours / its" is the median of
+the ratios of neighbouring blocks; "from" and "to" are the 95 % interval of this median (with fewer
+than six pairs: the smallest and the largest ratio). CleanRL's pinned Gymnasium has -v4 environments
 (Humanoid-v4: 376 observations, -v5: 348). SBX gets the sizes of our networks, batches and updates;
 it logs nothing, and in PPO it normalizes neither observations nor rewards.
 --jobs N compares N runs side by side, on a core each, with one alone.
@@ -335,14 +335,14 @@ def parse(argv):
     add("--algos", nargs="+", choices=ALGOS, default=ALGOS)
     add("--envs", nargs="+", default=["HalfCheetah-v5", "Humanoid-v5"], metavar="ENV_ID")
     add("--pairs", type=int, default=20, help="blocks of each program (default: 20)")
-    add("--seconds", type=float, default=2.0, help="the least length of a block (default: 2)")
+    add("--seconds", type=float, default=2.0, help="shortest length of a block (default: 2)")
     add("--stored", type=int, default=1000, help="random steps before learning (default: 1000)")
     add("--clock", choices=("wall", "cpu"), default="wall")
     add("--against-cleanrl", type=Path, metavar="PATH", help="a checkout of CleanRL")
-    add("--cleanrl-python", type=interpreter, metavar="PYTHON", help="one with its requirements")
-    add("--against-sbx", type=interpreter, metavar="PYTHON", help="one with sbx-rl")
+    add("--cleanrl-python", type=interpreter, metavar="PYTHON", help="with CleanRL's requirements")
+    add("--against-sbx", type=interpreter, metavar="PYTHON", help="with sbx-rl")
     add("--against-checkout", type=Path, metavar="PATH", help="another version of this project")
-    add("--jobs", type=int, metavar="N", help="runs side by side")
+    add("--jobs", type=int, metavar="N", help="compare N runs side by side with one")
     add("--checkpoint", action="store_true", help="size and time of checkpoints")
     add("--json", type=Path, metavar="FILE", help="write all figures, block by block, to a file")
     end = argv.index("--") if "--" in argv else len(argv)

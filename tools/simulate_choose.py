@@ -7,6 +7,7 @@ true gain and all others do nothing. Gains are in standard deviations of the fin
 seeds. Returns are normal, or a fifth of the runs end far above the others.
 """
 
+import argparse
 import sys
 from math import ceil
 from pathlib import Path
@@ -94,6 +95,8 @@ def row(noises, rounds, sizes, confirm):
 
 def main():
     """Print the table."""
+    raw = argparse.RawDescriptionHelpFormatter
+    argparse.ArgumentParser(description=__doc__, formatter_class=raw).parse_args()
     print(
         "| noises | runs of a round | fresh seeds | runs in all | found, +1 sd | confirmed, +1 sd "
         "| +1.5 sd | +2 sd | two peaks, +1 sd | false claims |"

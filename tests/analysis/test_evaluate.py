@@ -532,8 +532,8 @@ def other_environment(run_dir, env_id="Reacher-v5"):
 
 BAD_RUNS = {
     "is not finished": lambda run_dir: (run_dir / "result.json").unlink(),
-    "is no policy for Reacher-v5": other_environment,
-    "is no policy for InvertedPendulum-v5": lambda run_dir: (run_dir / "policy.pt").write_bytes(
+    "is not a policy for Reacher-v5": other_environment,
+    "is not a policy for InvertedPendulum-v5": lambda run_dir: (run_dir / "policy.pt").write_bytes(
         b"x"
     ),
     "cannot read": lambda run_dir: (run_dir / "config.json").write_text("{"),

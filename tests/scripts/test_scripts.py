@@ -657,7 +657,7 @@ BAD = [  # arguments, what the message names, of which scripts
     ({"env_id": ""}, "there is no environment ''", SCRIPTS),
     ({"env_id": "Ant-v1"}, "Ant-v1", SCRIPTS),
     ({"env_id": "no_such_package.module:Env-v0"}, "no_such_package", SCRIPTS),
-    ({"env_id": ".toy_envs:Tiny-v0"}, "'.toy_envs' is no module's name", SCRIPTS),
+    ({"env_id": ".toy_envs:Tiny-v0"}, "'.toy_envs' is not a module name", SCRIPTS),
     ({"env_id": "Hopper-v2"}, "moved to the gymnasium-robotics project", SCRIPTS),
     ({"env_id": "Pusher-v4"}, "only supported on `mujoco<3`", SCRIPTS),
     ({"exp_name": ""}, "--exp-name must be a name, not ''", SCRIPTS),

@@ -675,7 +675,7 @@ def test_what_an_interpreter_lacks_is_named(tmp_path):
     python.chmod(0o755)
     for interpreter, message in {
         python: f"'{python}' lacks gymnasium, mujoco, torch, tensorboard: set PYTHON, or",
-        tmp_path / "nothing": f"'{tmp_path}/nothing' is no Python 3: set PYTHON, or",
+        tmp_path / "nothing": f"'{tmp_path}/nothing' is not a Python 3: set PYTHON, or",
     }.items():
         result = run(
             "demo", "--runs-dir", tmp_path / "runs", env=ENV | {"PYTHON": str(interpreter)}

@@ -126,7 +126,7 @@ def test_canonical_env_id():
         ("no_such_module:Env-v0", "No module named 'no_such_module'"),
         ("toy_envs:Nothing-v0", "Nothing"),
         ("toy_envs.nothing:Env-v0", "toy_envs.nothing"),
-        ("..toy_envs:Tiny-v0", "'..toy_envs' is no module's name"),
+        ("..toy_envs:Tiny-v0", "'..toy_envs' is not a module name"),
     ],
 )
 def test_unknown_environments(env_id, reason):
