@@ -22,28 +22,23 @@ from pathlib import Path
 
 import tyro
 
+from analysis.effects import ENDS
 from analysis.errors import fail
-from analysis.figures import figures, write_figure
+from analysis.figures import NARROW, figures, write_figure
 from analysis.formatting import text_table, wrapped, write_table
 from analysis.paper import read_paper
 from analysis.report import write_report
 from analysis.robustness import read_robustness, robustness_sentences, robustness_tables
-from analysis.runs import STUDY, left_out, make_studies, read_choice, read_runs
+from analysis.runs import left_out, make_studies, read_choice, read_runs
 from analysis.tables import family_notes, make_tables, table_of
-from analysis.verdicts import sentences, tally
+from analysis.verdicts import clear_first, headlines, sentences, tally
 
+SENTENCES = 10  # of clear verdicts, before a terminal points to the report
 # Columns that a terminal may have room for, the most important ones first
+BEST_IN_SHORT = ["algorithm, environment", "noise", "noise_rate", *ENDS, "p_adjusted", "n"]
+BEST_IN_SHORT += ["luck_95_percent", "p_luck_of_best", "baseline_mean", "baseline_std"]
+BEST_IN_SHORT += ["noisy_mean", "noisy_std"]
 MISSING_IN_SHORT = ["status", "reason", "seeds", "environment", "noise", "noise_rate", "run"]
-BEST_IN_SHORT = ["algorithm", "environment", "noise", "noise_rate", "improvement_percent"]
-BEST_IN_SHORT += [
-    "p_adjusted",
-    "p_luck",
-    "baseline_mean",
-    "baseline_std",
-    "noisy_mean",
-    "noisy_std",
-]
-BEST_IN_SHORT += ["n", "n_baseline"]
 
 
 @dataclass
@@ -85,21 +80,25 @@ def no_finished_run(runs_dir):
     fail(f"no finished run in {runs_dir}; there are some in {found}: name it with --runs-dir")
 
 
-def shortened(verdicts, lines=15):
-    """Yield the sentences of each algorithm and environment, or the first ones and a tally."""
-    groups = verdicts.groupby([*STUDY, "scope", "environment"], sort=False)
-    if len(groups) == 0:
+def verdicts_in_short(verdicts, tables):
+    """Yield the tally of each study, then the sentences of clear verdicts."""
+    lines = headlines(tables["statistics"].frame, tables["best"].frame)
+    if not lines:
         yield "There is no noise to compare with a baseline yet."
-    for _, group in groups:
-        first = max(1, lines // len(groups))
-        yield from group["sentence"][:first]
-        if len(group) > first:
-            yield f"({tally(group['verdict'])}; the report has them all)"
+    for line in lines:
+        counts = ", ".join(f"{count} {word}" for word, count in line["counts"])
+        yield f"{line['name']}: {line['tried']}: {counts}. {line['luck']}".strip()
+    first, rest = clear_first(verdicts, SENTENCES)
+    yield from first["sentence"]
+    if len(first) and len(rest):
+        yield f"The report also has {tally(rest['verdict'])}."
+    if "robustness_score" in tables:
+        yield from robustness_sentences(tables["robustness_score"].frame)
 
 
 def overview_of(runs, studies):
     """Say in words what was analysed."""
-    parts = [f"Finished runs: {(runs['status'] == 'finished').sum()}."]
+    parts = [f"Finished runs: {(runs['status'] == 'finished').sum():,}."]
     for study in studies:
         parts.append(
             f"{study.name}: {study.steps[-1]:,} steps, seeds: {len(study.seeds)}, "
@@ -117,7 +116,8 @@ def write_results(out, verdicts, tables, studies, overview, problems, notes):
     drawn = []
     for name, figure, caption in figures(studies, tables):
         write_figure(out, name, figure)
-        drawn.append((name, caption))
+        if not name.endswith(NARROW):
+            drawn.append((name, caption))
     write_report(out, verdicts, tables, drawn, overview, problems, notes)
 
 
@@ -126,38 +126,32 @@ def terminal_width():
     return shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
 
 
-def in_short(table, columns, rows=None):
-    """Return a table with some of its columns, and its first rows."""
-    return replace(table, frame=table.frame[columns][:rows], only_csv=())
+def print_left_out(missing, width):
+    """Print the first of the runs that were left out."""
+    print(text_table(replace(missing, frame=missing.frame[MISSING_IN_SHORT][:20]), width))
 
 
 def print_results(out, verdicts, tables, overview, problems, notes):
-    """Print the verdicts, the main table, and what to know about them."""
+    """Print the verdicts, what to know about them, and where the report is."""
     width = terminal_width()
 
     def say(text):
         print(wrapped(text, width))
 
-    for line in shortened(verdicts):
+    for line in verdicts_in_short(verdicts, tables):
         say(line)
-    if "robustness_score" in tables:
-        for line in robustness_sentences(tables["robustness_score"].frame):
-            say(line)
-    best = tables["best"]
     print()
+    if len(tables["best"].frame):
+        say("The best noise in each environment, which may still be worse than no noise:")
+        best = replace(tables["best"], view=tables["best"].view[BEST_IN_SHORT])
+        print(f"\n{text_table(best, width)}\n")
     say(overview)
-    print("\nBest noise tried (may be worse than none)\n")
-    print(text_table(in_short(best, BEST_IN_SHORT), width))
-    print(f"\nMore columns: {out / 'best.csv'}\n")
-    say(best.caption)
-    print()
-    for note in family_notes(tables["statistics"].frame) + notes:
+    for note in notes:
         say(f"note: {note}")
     if problems:
-        first = in_short(tables["missing"], MISSING_IN_SHORT, rows=20)
         print()
         say(f"WARNING: {problems}")
-        print(text_table(first, width))
+        print_left_out(tables["missing"], width)
         print(f"All of them: {out / 'missing.csv'}")
     print(f"\nOpen {out / 'report.html'}")
 
@@ -179,8 +173,7 @@ def main(args):
     studies, notes = make_studies(runs)
     if not studies:
         if len(missing):
-            short = in_short(table_of("missing", missing), MISSING_IN_SHORT)
-            print(text_table(short, terminal_width()))
+            print_left_out(table_of("missing", missing), terminal_width())
         no_finished_run(args.runs_dir)
     robustness, unreadable = read_robustness(args.runs_dir, runs)
     notes += unreadable
@@ -189,6 +182,7 @@ def main(args):
     if choice is not None:
         tables["choice"] = table_of("choice", choice)
     verdicts = sentences(studies, tables["statistics"].frame)
+    notes = family_notes(tables["statistics"].frame) + notes
     overview = overview_of(runs, studies)
     try:
         write_results(out, verdicts, tables, studies, overview, problems, notes)

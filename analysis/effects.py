@@ -5,10 +5,13 @@ import re
 import numpy as np
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from analysis.configurations import rate_order
+from analysis.verdicts import seeds_of
 
-WIDTH = 10  # inches of every figure
+WIDTH = 10  # inches of most figures
+NARROW_WIDTH = 4.2  # inches of those for a telephone
 # Colour-blind readers tell these apart (Okabe and Ito, 2008); report.html.jinja has them, too.
 BETTER, WORSE, UNCLEAR = "#0072B2", "#D55E00", "#8C8C8C"
 COLORS = {"better": BETTER, "worse": WORSE}  # of verdicts; all others are grey
@@ -33,76 +36,97 @@ def of_environments(statistics):
     return statistics[known & (statistics["scope"] == "environment")]
 
 
+ENDS = ["improvement_iqm_percent", "improvement_low", "improvement_high"]
+
+
 def cut_at(values):
     """Return where a scale of percentages ends: a whole number, at most 100."""
-    return int(np.clip(np.ceil(np.nanmax(np.abs(values))), 1, 100))
+    return int(np.clip(np.ceil(np.nanmax(np.abs(values.astype(float)))), 1, 100))
 
 
 def effects_caption(study, statistics):
-    """Say what effects_figure shows, and how many of its verdicts are clear."""
+    """Say what effects_figure shows."""
     rows = of_environments(statistics)
-    clear = " and ".join(f"{(rows['verdict'] == word).sum()} {word}" for word in COLORS)
-    start = f"{study.name}: improvement over no noise in percent (interquartile mean); "
-    start += f"{clear} of {len(rows)}."
-    if len(rows.drop_duplicates(["noise", "noise_rate"])) > FOREST_ROWS:
-        limit = cut_at(rows["improvement_iqm_percent"])
-        return f"{start} A dot marks a clear verdict; the colours end at \u00b1 {limit} %."
-    start += (
-        " Bars are 95 % intervals, filled marks clear verdicts; triangles lie beyond the scale."
-    )
-    return f"{start} Rows: noise and rate; at the side: n, with/without noise."
+    clear = rows["verdict"].isin(COLORS).any()
+    if len(configurations(rows)) > FOREST_ROWS:
+        text = f"{study.name}: improvement over no noise in percent (interquartile mean). "
+        text += "A dot marks a clear verdict. " if clear else "No verdict is clear. "
+        return f"{text}The colours end at \u00b1 {cut_at(rows[ENDS[0]])} %."
+    text = f"{study.name}: improvement over no noise (interquartile mean) with its 95 % interval, "
+    text += "by noise and rate. "
+    text += "Filled marks are clear verdicts" if clear else "No verdict is clear"
+    if rows[ENDS[0]].abs().max() > cut_at(rows[ENDS]):
+        text += "; triangles lie beyond the scale"
+    return f"{text}. n: seeds (with / without noise)."
 
 
-def effects_figure(statistics):
+def configurations(rows):
+    """Return the (noise, rate) of rows of statistics, in order."""
+    configs = dict.fromkeys(zip(rows["noise"], rows["noise_rate"], strict=True))
+    return sorted(configs, key=lambda config: (config[0], rate_order(config[1])))
+
+
+def effects_figure(statistics, narrow=False):
     """Draw the effect of every noise, a panel for each environment in which any was tried.
 
     statistics: the tested rows of one study. Up to FOREST_ROWS noises and rates are a forest plot;
-    more are heatmaps of noises by rates.
+    more are heatmaps of noises by rates. The panels stand side by side, or below each other if the
+    figure shall be narrow.
     """
     rows = of_environments(statistics)
-    configs = list(dict.fromkeys(zip(rows["noise"], rows["noise_rate"], strict=True)))
-    configs.sort(key=lambda config: (config[0], rate_order(config[1])))
+    configs = configurations(rows)
     environments = sorted(set(rows["environment"]))
     forest = len(configs) <= FOREST_ROWS
     lines = [f"{broken(noise)}, {broken(rate)}" for noise, rate in configs]
-    if len(environments) > 2:  # little room for names beside the panels
-        lines = [re.sub(r"(?<=\w)\((?=.{10})", "\n(", line) for line in lines]
     if not forest:
         lines = [broken(noise) for noise in dict.fromkeys(noise for noise, _ in configs)]
-    across = min(ACROSS, len(environments))
+    if narrow or (forest and len(environments) != 2):  # little room for names beside the panels
+        lines = [re.sub(r"(?<=\w)\((?=.{10})", "\n(", line) for line in lines]
+    across = 1 if narrow else min(ACROSS, len(environments))
     down = -(-len(environments) // across)
-    high = 0.22 * len("\n".join(lines).split("\n"))
-    fig = Figure(figsize=(WIDTH, 0.6 + down * (0.7 + high)), layout="constrained")
+    width = NARROW_WIDTH if narrow else (5.2, 8, WIDTH, 12, 12)[across - 1]
+    high = (0.18 if narrow else 0.22) * len("\n".join(lines).split("\n"))
+    fig = Figure(figsize=(width, 0.6 + down * (0.7 + high)), layout="constrained")
     axes = fig.subplots(down, across, sharex=True, sharey=True, squeeze=False).ravel()
     for ax in axes[len(environments) :]:
         ax.remove()
     axes = axes[: len(environments)]
-    panels = [rows[rows["environment"] == environment] for environment in environments]
+    limit = cut_at(rows[ENDS] if forest else rows[ENDS[0]])
     for ax, environment in zip(axes, environments, strict=True):
         ax.set_title(environment, fontsize=9)
-    if forest:
-        ends = rows[["improvement_iqm_percent", "improvement_low", "improvement_high"]]
-        ends = ends.astype(float)
-        limit = cut_at(ends)
-        low = max(-limit, min(0, ends.min(axis=None)))
-        high = min(limit, max(0, ends.max(axis=None)))
-        wide = (high - low) or 1  # n stands in the last third, at the side of the marks
-        axes[0].set_xlim(low - 0.08 * wide, high + (0.45 if across > 2 else 0.15) * wide)
-        for ax, panel in zip(axes, panels, strict=True):
+        ax.tick_params(axis="y", labelsize=6.5 if narrow else 9)
+        panel = rows[rows["environment"] == environment]
+        if forest:
             forest_panel(ax, panel, configs, limit)
-        axes[0].set_yticks(range(len(lines)), lines)
-        axes[0].set_ylim(len(lines) - 0.4, -0.6)  # the first noise on top
-        fig.supxlabel("improvement over no noise (%)", fontsize=9)
-    else:
-        limit = cut_at(rows["improvement_iqm_percent"])
-        for ax, panel in zip(axes, panels, strict=True):
+        else:
             image = heat_panel(ax, panel, configs, limit)
-        axes[0].set_yticks(range(len(lines)), lines)
+    axes[0].set_yticks(range(len(lines)), lines)
+    axes[0].set_ylim(len(lines) - 0.5, -0.5)  # the first noise on top
+    label = "improvement over no noise (%)"
+    if forest:
+        scale_forest(axes[0], rows, limit, (width - 2) / across)
+        fig.supxlabel(label, fontsize=9)
+    else:
         fig.supxlabel("noise rate", fontsize=9)
-        beyond = "both" if rows["improvement_iqm_percent"].abs().max() > limit else "neither"
-        label = "improvement over no noise (%)"
-        fig.colorbar(image, ax=list(axes), extend=beyond, label=label, fraction=0.02, pad=0.01)
+        beyond = "both" if rows[ENDS[0]].abs().max() > limit else "neither"
+        place = {"location": "bottom", "fraction": 0.05} if narrow else {"fraction": 0.02}
+        fig.colorbar(image, ax=list(axes), extend=beyond, label=label, pad=0.01, **place)
     return fig
+
+
+def scale_forest(ax, rows, limit, inches):
+    """Set the scale that all panels of a forest plot share, with room for n at its right.
+
+    inches: how wide a panel is, roughly.
+    """
+    ends = rows[ENDS].astype(float)
+    low = max(-limit, min(0, ends.min(axis=None)))
+    high = min(limit, max(0, ends.max(axis=None)))
+    wide = (high - low) or 1
+    margin = 0.5 / inches  # of the panel's width
+    ax.set_xlim(low - 0.06 * wide, high + wide * (0.06 + margin / (1 - margin)))
+    ticks = MaxNLocator(nbins=max(2, min(6, int(inches / 0.6)))).tick_values(low, high)
+    ax.set_xticks([tick for tick in ticks if low <= tick <= high])
 
 
 def forest_panel(ax, rows, configs, limit):
@@ -120,10 +144,10 @@ def forest_panel(ax, rows, configs, limit):
         face = color if clear else "white"
         x = np.clip(x, -limit, limit)
         ax.plot(x, y, mark, color=color, markerfacecolor=face, markersize=6, zorder=3)
-        n = f"{row.n:.0f}" if row.n == row.n_baseline else f"{row.n:.0f}/{row.n_baseline:.0f}"
         side = {"transform": ax.get_yaxis_transform(), "ha": "right", "va": "center"}
-        ax.text(1, y, n, color="0.35", fontsize=7, **side)
-    ax.xaxis.get_major_locator().set_params(nbins=4)
+        ax.text(1, y, seeds_of(row.n, row.n_baseline), color="0.35", fontsize=7, **side)
+    side = {"transform": ax.transAxes, "ha": "right", "va": "bottom"}
+    ax.text(1, 1, "n", color="0.35", fontsize=7, **side)
     ax.tick_params(axis="y", length=0)
 
 
@@ -140,7 +164,7 @@ def heat_panel(ax, rows, configs, limit):
         for (i, j), value in zip(places, grid[tuple(zip(*places, strict=True))], strict=True):
             text = f"{round(value):+d}" if abs(value) < 1000 else f"{value:+.0e}"
             ink = ink_on(value, limit)
-            ax.text(j, i, text, ha="center", va="center", color=ink, fontsize=5.5)
+            ax.text(j, i, text, ha="center", va="center", color=ink, fontsize=6)
     clear = [p for p, word in zip(places, rows["verdict"], strict=True) if word in COLORS]
     for i, j in clear:
         ax.plot(j + 0.35, i - 0.3, "o", color="black", markersize=2.5)

@@ -12,6 +12,7 @@ from analysis.configurations import BASELINE, rate_order
 from analysis.effects import (
     COLORS,
     DIVERGING,
+    NARROW_WIDTH,
     UNCLEAR,
     WIDTH,
     broken,
@@ -22,29 +23,39 @@ from analysis.effects import (
 )
 from analysis.formatting import slug
 from analysis.runs import STUDY, rows_of, study_name
+from analysis.verdicts import seeds_of
 
 STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
 STYLE["svg.hashsalt"] = "noisy"  # equal figures are equal files
 matplotlib.rcParams.update(STYLE)
 HEIGHT = 5.5  # inches of every figure; one with many rows is higher
+NARROW = "_narrow"  # ends the names of figures for narrow windows
 viridis = matplotlib.colormaps["viridis"]  # ordered by lightness, so it reads in grey
 
 
 def figures(studies, tables):
-    """Yield (name, figure, caption) for every figure, in the order of the report."""
+    """Yield (name, figure, caption) for every figure, in the order of the report.
+
+    The first figures are made twice where they have many panels, the second one for telephones.
+    """
     statistics = tables["statistics"].frame
     for study in studies:
         tested = statistics[rows_of(statistics, study.key) & statistics["p"].notna()]
         summary = tables[f"summary_{study.algorithm}"].frame
         summary = summary[rows_of(summary, study.key)]
         if tested["improvement_iqm_percent"].notna().any():
-            name = f"effects_{slug(study.name)}"
-            yield name, effects_figure(tested), effects_caption(study, tested)
+            name, caption = f"effects_{slug(study.name)}", effects_caption(study, tested)
+            yield name, effects_figure(tested), caption
+            if tested["environment"].nunique() > 1:
+                yield name + NARROW, effects_figure(tested, narrow=True), caption
         best = tables["best"].frame
         best = best[rows_of(best, study.key)]
         noises = sorted({config.noise for config in study.returns if not config.is_baseline})
         if len(best) and len(study.returns) > 2:
-            yield best_curves_figure(study, best, tested)
+            name, caption = f"best_curves_{slug(study.name)}", best_curves_caption(study)
+            yield name, best_curves_figure(study, best, tested), caption
+            if len(best) > 1:
+                yield name + NARROW, best_curves_figure(study, best, tested, narrow=True), caption
         for noise in noises or [""]:
             yield curves_figure(study, noise)
         single = [config for config in study.returns if len(config.noises) == 1]
@@ -62,17 +73,20 @@ def span(numbers):
     return f"{low}" if low == high else f"{low} to {high}"
 
 
-def panels(environments, labels):
-    """Make one panel per environment, three in a row, above a legend with as many labels."""
-    across = min(3, len(environments))
+def panels(environments, labels, width=WIDTH):
+    """Make one panel per environment, three in a row, above a legend with as many labels.
+
+    A figure of less than half the usual width has one panel in a row.
+    """
+    across = 1 if width < WIDTH / 2 else min(3, len(environments))
     down = -(-len(environments) // across)
-    columns = max(1, min(4, int(130 / max(map(len, labels)))))
+    columns = max(1, min(4, int(13 * width / max(map(len, labels)))))
     legend = 0.2 + 0.2 * -(-len(labels) // columns)
     height = max(HEIGHT, 2.4 * down + legend)
-    fig = Figure(figsize=(WIDTH, height))
+    fig = Figure(figsize=(width, height))
     # Placed by hand: matplotlib's automatic layouts take as long as the drawing itself.
     bottom, top = (legend + 0.45) / height, 1 - 0.3 / height
-    fig.subplots_adjust(0.9 / WIDTH, bottom, 1 - 0.3 / WIDTH, top, wspace=0.25, hspace=0.45)
+    fig.subplots_adjust(0.9 / width, bottom, 1 - 0.3 / width, top, wspace=0.25, hspace=0.45)
     axes = fig.subplots(down, across, squeeze=False).ravel()
     for ax in axes[len(environments) :]:
         ax.remove()
@@ -90,11 +104,20 @@ def panels(environments, labels):
     return fig, axes, add_legend
 
 
-def best_curves_figure(study, best, statistics):
+def best_curves_caption(study):
+    """Say what best_curves_figure shows."""
+    return (
+        f"{study.name}: test return without noise (black) and with the best noise of each "
+        "environment, mean over n seeds, shaded \u00b1 one standard deviation. "
+        "The best of many looks better than it is."
+    )
+
+
+def best_curves_figure(study, best, statistics, narrow=False):
     """Draw no noise against the best noise of each environment: means and standard deviations."""
-    labels = ["no noise", "best noise tried there, in the colour of its verdict"]
+    labels = ["no noise", "best noise, in the colour of its verdict"]
     environments = list(best["environment"])
-    fig, axes, _ = panels(environments, labels)
+    fig, axes, _ = panels(environments, labels, NARROW_WIDTH if narrow else WIDTH)
     # Three lines of title above each panel
     fig.subplots_adjust(top=1 - 0.6 / fig.get_figheight(), hspace=0.75)
     unit, word = time_unit(study)
@@ -111,17 +134,14 @@ def best_curves_figure(study, best, statistics):
             low, high = mean - std, mean + std
             ax.fill_between(study.steps / unit, low, high, color=color, alpha=0.12, linewidth=0)
         noise = row.noise if len(row.noise) < 50 else f"{row.noise[:47]}..."
-        lines = f"{noise}, {row.noise_rate}\n{verdict} (n = {span({row.n, row.n_baseline})})"
+        lines = f"{noise}, {row.noise_rate}\n{verdict} (n = {seeds_of(row.n, row.n_baseline)})"
         ax.set_title(f"{row.environment}\n{lines}", fontsize=7.5)
         ax.set_xlabel(f"training steps ({word})")
     handles = [axes[0].lines[0], Rectangle((0, 0), 1, 1, color=UNCLEAR)]
     for handle, label in zip(handles, labels, strict=True):
         handle.set_label(label)
-    fig.legend(handles, labels, loc="lower center", ncols=2, frameon=False)
-    caption = f"{study.name}: test return without noise and with the best noise of each "
-    caption += "environment, mean over n seeds, shaded \u00b1 one standard deviation. "
-    caption += "The best of many looks better than it is."
-    return f"best_curves_{slug(study.name)}", fig, caption
+    fig.legend(handles, labels, loc="lower center", ncols=1 if narrow else 2, frameon=False)
+    return fig
 
 
 def time_unit(study):
@@ -174,20 +194,21 @@ def ablation_figure(study, summary, wrapper, noises):
     labels = [f"no noise (n = {span(baseline['n'])})"]
     for noise, group in zip(noises, groups, strict=True):
         labels.append(f"{noise} (n = {span(group['n'])})")
-    fig, axes, add_legend = panels(study.environments, labels)
+    tried = set().union(*(group["environment"] for group in groups))
+    environments = [env for env in study.environments if env in tried]
+    fig, axes, add_legend = panels(environments, labels)
     width = 0.8 / len(noises)
-    for ax, env in zip(axes, study.environments, strict=True):
+    for ax, env in zip(axes, environments, strict=True):
         rows = baseline[baseline["environment"] == env].set_index("noise_rate")
         rows = rows.reindex([BASELINE.noise_rate])
-        bars(ax, [-1], rows, 0.6, color="white", hatch="", label=labels[0])
+        bars(ax, [-1], rows, 0.6, color="white", label=labels[0])
         ax.axhline(rows["mean"].iloc[0], color="black", linewidth=0.6, linestyle=":")
         ax.axhline(0, color="black", linewidth=0.6)
         for i, group in enumerate(groups):
             rows = group[group["environment"] == env].set_index("noise_rate").reindex(rates)
             place = np.arange(len(rates)) + width * (i - (len(noises) - 1) / 2)
-            grey = str(0.85 - 0.4 * i / (len(noises) - 1))
-            hatch = ["", "//", "..", "xx", ""][i % 5]
-            bars(ax, place, rows, width, color=grey, hatch=hatch, label=labels[i + 1])
+            color, _, _ = line_style(i + 1, len(labels))
+            bars(ax, place, rows, width, color=color, label=labels[i + 1])
         ax.set_xticks([-1, *range(len(rates))], ["none", *rates])
         ax.set_xlabel("noise rate")
     add_legend()
@@ -313,7 +334,12 @@ def line_style(i, number):
 
 
 def write_figure(out, name, fig):
-    """Write {name}.svg, and .pdf for LaTeX, without dates: equal figures are equal files."""
+    """Write {name}.svg, and .pdf for LaTeX, without dates: equal figures are equal files.
+
+    A narrow figure is for the report only, so it is no .pdf.
+    """
     fig.savefig(out / f"{name}.svg", metadata={"Date": None})
+    if name.endswith(NARROW):
+        return
     fig.set_layout_engine("none")  # the layout is done
     fig.savefig(out / f"{name}.pdf", metadata={"CreationDate": None})

@@ -19,11 +19,14 @@ class Table:
     """A table of results, as analyze.py prints and writes it."""
 
     name: str  # of its files
-    frame: pd.DataFrame
-    caption: str
+    frame: pd.DataFrame  # all columns, as in the csv
+    caption: str  # at most two lines
     section: str  # of the report: a key of report.SECTIONS
     formats: dict = field(default_factory=dict)  # column -> format of its numbers; others TENTH
+    how: str = ""  # how the numbers are computed
     only_csv: tuple = ()  # columns that would make the table wider than a page
+    view: pd.DataFrame | None = None  # what people read, if that is not the frame
+    rates_beside: bool = False  # a column for each noise rate, with mean, std and n in its cells
 
 
 def slug(text):
@@ -34,8 +37,8 @@ def slug(text):
 
 # Columns that are shown as one: "mean ± std", "estimate [low, high]" or "ours (the baseline's)".
 MERGED = {
-    "baseline": ("baseline_mean", "baseline_std"),
-    "noisy": ("noisy_mean", "noisy_std"),
+    "no noise": ("baseline_mean", "baseline_std"),
+    "with noise": ("noisy_mean", "noisy_std"),
     "mean": ("mean", "std"),
     "average improvement %": ("average_improvement_percent", "std_improvement_percent"),
     "IQM": ("iqm", "iqm_low", "iqm_high"),
@@ -44,6 +47,7 @@ MERGED = {
     "interaction %": ("interaction_percent", "percent_low", "percent_high"),
     "difference": ("difference", "difference_low", "difference_high"),
     "P(improvement)": ("probability_of_improvement", "probability_low", "probability_high"),
+    "luck 95 % (p)": ("luck_95_percent", "p_luck_of_best"),
 }
 for _name in ("score", "worst_score", "cvar_score"):
     MERGED[f"{_name} (baseline)"] = (_name, f"baseline_{_name}")
@@ -56,29 +60,37 @@ def spelled(name, value, form):
     if pd.isna(value):
         return "\u2013"
     if isinstance(value, str):
-        return value or ("baseline" if name == "noise" else "\u2013")
+        return value or ("no noise" if name == "noise" else "\u2013")
     return f"{value:{form}}"
 
 
-def merged(title, parts, table, text):
+def merged(name, parts, table, text):
     """Return one column of text for the columns `parts`; a value that does not exist is a dash."""
     columns = [text[name] for name in parts]
     if len(parts) == 3:
         interval = columns[0] + " [" + columns[1] + ", " + columns[2] + "]"
         result = interval.where(table[parts[1]].notna(), columns[0])
-    elif title.endswith("(baseline)"):
+    elif name.endswith(")"):
         result = columns[0] + " (" + columns[1] + ")"
     else:
         result = columns[0] + " \u00b1 " + columns[1]
     return result.where(table[parts[0]].notna(), "\u2013")
 
 
+def title(column):
+    """Spell the name of a column for people."""
+    for word, spelling in (("_", " "), ("percent", "%"), ("adjusted", "corrected")):
+        column = column.replace(word, spelling)
+    return column
+
+
 def shown(table):
-    """Return a frame as a person reads it: all text, related columns in one, rates side by side.
+    """Return a table as a person reads it: all text, related columns in one.
 
     Settings and phase are shown where a row has any; a row of all environments says so.
     """
-    frame = table.frame.reset_index(drop=True).drop(columns=list(table.only_csv))
+    frame = table.frame if table.view is None else table.view
+    frame = frame.reset_index(drop=True).drop(columns=list(table.only_csv))
     if "scope" in frame:
         frame["environment"] = frame["environment"].mask(frame.pop("scope") == "all", "all")
     for name in ("settings", "phase"):
@@ -92,16 +104,16 @@ def shown(table):
     if "n_baseline_most" in text:  # over several environments: "10 to 50"
         most = text.pop("n_baseline_most")
         text["n_baseline"] += (" to " + most).where(most != text["n_baseline"], "")
-    for title, parts in MERGED.items():
+    for name, parts in MERGED.items():
         if parts[-1] in text:
-            text[parts[0]] = merged(title, parts, frame, text)
-            text = text.drop(columns=list(parts[1:])).rename(columns={parts[0]: title})
-    if table.name == "early_performance" and len(text):
+            text[parts[0]] = merged(name, parts, frame, text)
+            text = text.drop(columns=list(parts[1:])).rename(columns={parts[0]: name})
+    if table.rates_beside and len(text):
         text["mean"] += " (" + text.pop("n") + ")"
         keys = [name for name in text if name not in ("noise_rate", "mean")]
         text = text.pivot(index=keys, columns="noise_rate", values="mean").fillna("\u2013")
         text = text[sorted(text.columns, key=rate_order)].reset_index()
-    return text.rename(columns=lambda column: column.replace("_", " ").replace("percent", "%"))
+    return text.rename(columns=title)
 
 
 def text_table(table, width=0):
@@ -120,7 +132,8 @@ def wrapped(text, width=0):
     """Break a paragraph into lines of this width (0: any) between words."""
     if not width:
         return text
-    return textwrap.fill(text, width, break_long_words=False, break_on_hyphens=False)
+    style = {"break_long_words": False, "break_on_hyphens": False, "subsequent_indent": "  "}
+    return textwrap.fill(text, width, **style)
 
 
 def write_table(out, table):
@@ -130,7 +143,8 @@ def write_table(out, table):
     )
     text = shown(table)
     markdown = tabulate(text.values, text.columns, tablefmt="pipe", disable_numparse=True)
-    (out / f"{table.name}.md").write_text(f"{table.caption}\n\n{markdown}\n")
+    how = f"\n{table.how}\n" if table.how else ""
+    (out / f"{table.name}.md").write_text(f"{table.caption}\n\n{markdown}\n{how}")
     latex = tabulate(text.values, text.columns, tablefmt="latex_longtable", disable_numparse=True)
     escaped = re.sub(r"([%&_#])", r"\\\1", table.caption)
     escaped = escaped.replace("|", r"\textbar{}").replace("\n", " ")

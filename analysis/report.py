@@ -10,18 +10,19 @@ from pathlib import Path
 import jinja2
 from markupsafe import Markup, escape
 
+from analysis.figures import NARROW
 from analysis.formatting import shown
-from analysis.runs import STUDY, rows_of, study_name
-from analysis.verdicts import LEVEL, VERDICTS, counted, tally
+from analysis.runs import AVERAGED
+from analysis.verdicts import clear_first, headlines, tally
 
 SECTIONS = {
     "choice": "Choice of a noise",
     "best": "Best noise tried (may be worse than none)",
+    "early_performance": "Learning curves",
     "consistent": "Consistent noise",
     "consistently_worse": "Consistently worse",
     "luck": "Luck",
     "statistics": "Statistics",
-    "early_performance": "Learning curves",
     "parameters": "Parameters",
     "interactions": "Two noises together",
     "robustness": "Robustness",
@@ -29,82 +30,76 @@ SECTIONS = {
     "missing": "Runs left out",
 }
 FIGURES_OF = {"best": "early_performance", "curves": "early_performance"}
+FOLDED = ("curves", "parameters")  # where there are several: one for each noise
 SENTENCES = 10  # of clear verdicts, before the others are folded
+ROWS = 15  # a longer table is folded
 
 
 def breakable(text):
     """Mark where a browser may break a cell: a noise between its words, but never a number."""
     if re.match("-?[0-9]", text):
-        text = text.replace(" \u00b1 ", "\u00a0\u00b1\u00a0").replace(", ", ",\u00a0")
-        parts = [Markup('<span class="number">{}</span>').format(part) for part in text.split(" ")]
-        return Markup(" ").join(parts)
+        return text.replace(" \u00b1 ", "\u00a0\u00b1\u00a0").replace(", ", ",\u00a0")
     return Markup(re.sub("(?<=[a-z0-9])(?=[A-Z(])", "<wbr>", str(escape(text))))
 
 
-def headlines(verdicts, best):
-    """Return for each study its name, its comparisons in words, its counts of verdicts, its luck.
+def source(path):
+    """Return a picture as a URL that contains it."""
+    return f"data:image/svg+xml;base64,{base64.b64encode(path.read_bytes()).decode()}"
 
-    Counted are the verdicts of single environments.
+
+def sections_of(out, tables, drawn):
+    """Arrange the tables and figures as the page shows them; a section without any is left out.
+
+    Return the figures of the effects, which are in no section, and a list of dicts.
     """
-    lines = []
-    alone = verdicts[verdicts["scope"] == "environment"]
-    for key, rows in alone.groupby(STUDY, sort=False):
-        number = f"{counted(len(rows), 'comparison')} in "
-        number += counted(rows["environment"].nunique(), "environment")
-        counts = [(word, (rows["verdict"] == word).sum()) for word in VERDICTS]
-        p_luck = best[rows_of(best, key)]["p_luck"].dropna()
-        luck = ""
-        if len(p_luck) and (p_luck > LEVEL).all():
-            luck = (
-                "The best noise of each environment looks no better than luck alone would make it."
-            )
-        shown = [(word, n) for word, n in counts if n or word in VERDICTS[:2]]
-        lines.append({"name": study_name(*key), "number": number, "counts": shown, "luck": luck})
-    return lines
+    sections = {
+        key: {"id": key, "title": title, "tables": [], "figures": [], "folded": []}
+        for key, title in SECTIONS.items()
+    }
+    effects = []
+    for table in tables.values():
+        if len(table.frame):
+            text = shown(table)
+            text = text.loc[:, (text != "\u2013").any()]  # a column of dashes says nothing
+            entry = {"name": table.name, "caption": table.caption, "how": table.how}
+            entry |= {"columns": text.columns, "rows": text.values.tolist()}
+            sections[table.section]["tables"].append(entry)
+    kinds = [name.split("_")[0] for name, _ in drawn]
+    for kind, (name, caption) in zip(kinds, drawn, strict=True):
+        section = sections.get(FIGURES_OF.get(kind, kind))
+        if kind in FOLDED and kinds.count(kind) > 1:
+            section["folded"].append({"src": f"{name}.svg", "caption": caption})
+            continue
+        entry = {"src": source(out / f"{name}.svg"), "caption": caption}
+        narrow = out / f"{name}{NARROW}.svg"
+        if narrow.exists():
+            entry["narrow"] = source(narrow)
+        (effects if section is None else section["figures"]).append(entry)
+    shown_ones = [s for s in sections.values() if s["tables"] or s["figures"] or s["folded"]]
+    return effects, shown_ones
 
 
 def write_report(out, verdicts, tables, drawn, overview, problems, notes):
     """Write report.html: the effects and the verdicts first, then everything else."""
-    sections = {key: {"id": key, "title": title} for key, title in SECTIONS.items()}
-    effects = []
-    for section in sections.values():
-        section |= {"tables": [], "figures": [], "folded": []}
-    for table in tables.values():
-        text = shown(table)
-        entry = {
-            "name": table.name,
-            "caption": table.caption,
-            "columns": text.columns,
-            "rows": text.values.tolist(),
-        }
-        sections[table.section]["tables"].append(entry)
-    for name, caption in drawn:
-        kind = name.split("_")[0]
-        section = sections.get(FIGURES_OF.get(kind, kind))
-        entry = {"src": f"{name}.svg", "caption": caption}
-        if kind == "curves" and len(drawn) > 1:
-            section["folded"].append(entry)
-            continue
-        svg = base64.b64encode((out / f"{name}.svg").read_bytes()).decode()
-        entry["src"] = f"data:image/svg+xml;base64,{svg}"
-        (effects if section is None else section["figures"]).append(entry)
-    here = jinja2.FileSystemLoader(Path(__file__).parent)
-    pages = jinja2.Environment(loader=here, autoescape=True, trim_blocks=True)
-    full = [s for s in sections.values() if s["tables"] or s["figures"] or s["folded"]]
+    pages = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True
+    )
     pages.filters["breakable"] = breakable
-    page = pages.get_template("report.html.jinja")
-    clear = verdicts[verdicts["verdict"].isin(VERDICTS[:2])].sort_values("verdict", kind="stable")
-    first = clear[:SENTENCES]
-    rest = verdicts.drop(first.index)
-    html = page.render(
+    effects, sections = sections_of(out, tables, drawn)
+    first, rest = clear_first(verdicts, SENTENCES)
+    averaged = [note for note in notes if AVERAGED in note]  # these change no verdict
+    html = pages.get_template("report.html.jinja").render(
         effects=effects,
-        headlines=headlines(verdicts, tables["best"].frame),
+        headlines=headlines(tables["statistics"].frame, tables["best"].frame),
         first=first.to_dict("records"),
         rest=rest.to_dict("records"),
         rest_tally=tally(rest["verdict"]),
-        sections=full,
+        together=(rest["scope"] == "all").any(),
+        sections=sections,
+        most_rows=ROWS,
         overview=overview,
         problems=problems,
-        notes=notes,
+        notes=[note for note in notes if note not in averaged],
+        averaged=averaged,
     )
     (out / "report.html").write_text(html)

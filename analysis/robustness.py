@@ -49,25 +49,31 @@ FORMATS |= dict.fromkeys(("p", "p_holm", "smallest_p"), P_VALUE) | {"win_rate": 
 
 CAPTIONS = {
     "robustness_score": """Primary figure of robustness: the score on noise that was not in
-training. Score: 100 (R - C) / |C|, averaged equally over the test conditions that are not clean and
-have no wrapper of the training (and neither reward noise nor early termination), where R is the
-mean return of a run under a condition and C the mean clean return of the policies trained without
-noise. Baseline score: the same of the policies trained without noise, under the same conditions.
-[ ]: 95 % interval (Welch, Satterthwaite). Win rate: how often a policy has a higher score than one
-trained without noise, averaged over environments. p: its exact two-sided test, in one environment
-Mann and Whitney's; it decides where the interval says otherwise. Holm: corrected for the training
-configurations of an algorithm; smallest p: what these numbers of seeds could reach at most;
-detectable: the difference that they find with 80 % power, for normal scores. Rows of one
-environment are secondary where there is one of all. Clean change: how much better or worse the
-policies are without any noise, so that a better policy is not taken for a more robust one. Worst:
-the lowest score under one condition. CVaR: the score of the worst tenth of the episodes of each
-seed.""",
-    "robustness": """Return under every test condition: mean \u00b1 sample standard deviation over n
-seeds, and change against the policies trained without noise under the same condition. Tested on:
-clean; the same noise as in training; the same wrapper with other parameters or another rate; new
-noise. CVaR: mean of the worst tenth of a seed's episodes, then over seeds.""",
+training, of policies trained with noise and without.""",
+    "robustness": """Return under every test condition: mean \u00b1 standard deviation over n seeds,
+and change against the policies trained without noise.""",
 }
-CAPTIONS = {name: " ".join(text.split()) for name, text in CAPTIONS.items()}
+HOW = {
+    "robustness_score": """Score: 100 (R - C) / |C|, averaged equally over the test conditions that
+are not clean and have no wrapper of the training (and neither reward noise nor early termination),
+where R is the mean return of a run under a condition and C the mean clean return of the policies
+trained without noise. Baseline score: the same of the policies trained without noise, under the
+same conditions. [ ]: 95 % interval (Welch, Satterthwaite). Win rate: how often a policy has a
+higher score than one trained without noise, averaged over environments. p: its exact two-sided
+test, in one environment Mann and Whitney's; it decides where the interval says otherwise. Holm:
+corrected for the training configurations of an algorithm; smallest p: what these numbers of seeds
+could reach at most; detectable: the difference that they find with 80 % power, for normal scores.
+Rows of one environment are secondary where there is one of all. Clean change: how much better or
+worse the policies are without any noise, so that a better policy is not taken for a more robust
+one. Worst: the lowest score under one condition. CVaR: the score of the worst tenth of the episodes
+of each seed.""",
+    "robustness": """Change: against the policies trained without noise under the same condition.
+Tested on: clean; the same noise as in training; the same wrapper with other parameters or another
+rate; new noise. CVaR: mean of the worst tenth of a seed's episodes, then over seeds.""",
+}
+CAPTIONS, HOW = (
+    {name: " ".join(text.split()) for name, text in texts.items()} for texts in (CAPTIONS, HOW)
+)
 
 
 def read_robustness(runs_dir, runs):
@@ -283,12 +289,14 @@ def robustness_tables(runs):
     scores = pd.DataFrame(score_rows(runs), columns=SCORE_COLUMNS)
     for _, family in scores[primary(scores)].groupby(STUDY):
         scores.loc[family.index, "p_holm"] = holm(family["p"].to_numpy(float))
-    caption = "\n".join([CAPTIONS["robustness_score"], *robustness_sentences(scores)])
-    tables = [
-        Table("robustness_score", scores, caption, "robustness", FORMATS, ("smallest_p",)),
-        Table("robustness", table, CAPTIONS["robustness"], "robustness", FORMATS),
-    ]
-    return {table.name: table for table in tables}
+    tables = {"robustness_score": scores, "robustness": table}
+    only_csv = {"robustness_score": ("smallest_p",)}
+    return {
+        name: Table(
+            name, frame, CAPTIONS[name], "robustness", FORMATS, HOW[name], only_csv.get(name, ())
+        )
+        for name, frame in tables.items()
+    }
 
 
 def robustness_sentences(scores):

@@ -348,6 +348,9 @@ def make_studies(runs):
     return studies, notes
 
 
+AVERAGED = "some rows average runs"  # of different versions: in the notes that say so
+
+
 def version_notes(name, versions):
     """Say in words where runs of one study differ in versions of code or libraries."""
     notes = []
@@ -358,5 +361,5 @@ def version_notes(name, versions):
             what = f"with different {library}"
             if library == "git commit":
                 what = "of different code versions"
-            notes.append(f"{name}: some rows average runs {what}: {found}")
+            notes.append(f"{name}: {AVERAGED} {what}: {found}")
     return notes

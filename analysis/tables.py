@@ -39,7 +39,7 @@ from analysis.statistics import (
     PERMUTATIONS,
     holm,
 )
-from analysis.verdicts import counted, verdict
+from analysis.verdicts import counted, seeds_of, verdict
 
 # After those that name a study
 _COLUMNS = {
@@ -69,8 +69,8 @@ _COLUMNS_WITH = {
     WHOLE: """n n_baseline n_baseline_most environments chosen_from configurations seeds
         seeds_needed steps_to_baseline percent_of_environments best_beyond_luck consistent
         consistent_beyond_luck consistently_worse consistently_worse_beyond_luck""",
-    P_VALUE: """p p_adjusted smallest_p smallest_p_adjusted p_luck paper_p_luck p_consistent
-        p_consistently_worse""",
+    P_VALUE: """p p_adjusted smallest_p smallest_p_adjusted p_luck p_luck_of_best paper_p_luck
+        p_consistent p_consistently_worse""",
     SHARE: "probability_of_improvement probability_low probability_high",
     PLAIN: "steps_millions",
 }
@@ -168,50 +168,67 @@ def listed(numbers):
     return ", ".join(map(str, numbers))
 
 
+# Captions have at most two lines in the report; HOW is its last section.
 CAPTIONS = {
-    "best": """Best noise tried for each algorithm and environment, which may be worse than none,
-against the baseline without noise: final test return, mean \u00b1 sample standard deviation over n
-seeds; p: exact Mann-Whitney test, then adjusted for all noises tried there. The best of many is
-chosen on the seeds that it is reported on, which flatters it. Luck: the improvement that the best
-of as many configurations would show if none did anything, its median and 95 % quantile; p luck is
-the probability that it is at least as high as the one observed. Leave one seed out values the
-procedure of choosing, not the noise that is named here: it chooses on all seeds but one, measures
-on that one and takes the mean over seeds. It is descriptive: its terms share seeds, so it has no
-interval.""",
-    "consistent": """Noise that matches or betters the baseline in at least 80 % of two or more
-environments: improvement over |baseline|, mean \u00b1 standard deviation over environments; p: the
-exact test over all of them, then adjusted for all configurations (Benjamini-Hochberg); p luck: the
-probability that the highest average of as many configurations is as high if none does anything; n
-is the smallest number of seeds in any environment.""",
-    "consistently_worse": """Noise that is worse than the baseline in each of two or more
-environments (0 %); columns as in the table of consistent noise, p luck with the lowest average.
-Worse at every rate that was tried:""",
-    "luck": f"""What luck alone would show. {DRAWS:,} sweeps are drawn in which no noise does
-anything: the baseline and all configurations anew, with their numbers of seeds, from a normal
-distribution with the pooled standard deviation within configurations (from {SEEDS_TO_RESAMPLE}
-seeds of the baseline on with the shape of their returns). By luck: the mean number of rows in the
-tables of consistent and consistently worse noise, and its 95 % quantile; p: the probability of at
-least as many rows as observed. Beyond luck: rows with a p luck of {LUCKY} or less. Configurations
-are those in two or more environments. The p luck of a best noise is right for normal returns of
-equal spread: that of 90 useless configurations is then {LUCKY} or less in 5 % of simulated studies.
-Where a fifth of the runs end around a second, higher peak, it is in {FALSE_ALARMS[5]} % with five
-seeds and {FALSE_ALARMS[10]} % with ten. One configuration of 90 with a true gain of 1, 1.5 and 2
-standard deviations is beyond luck in {listed(POWER_OF_BEST[5])} % of studies with five seeds, and
-in {listed(POWER_OF_BEST[10])} % with ten.""",
-    "early_performance": """Test return during training, by noise rate (0.00 is the baseline):
-mean \u00b1 sample standard deviation over (n) seeds.""",
-    "summary": """Final test return of every configuration: mean \u00b1 sample standard deviation
-over n seeds, improvement over |baseline| with the p of the exact Mann-Whitney test, not corrected,
-and change of the standard deviation. Steps to
-baseline: the first evaluation at which the mean over seeds reaches the baseline's final mean.""",
-    "statistics": f"""IQM: interquartile mean of the final returns over n seeds. Improvement: IQM
-of (return - baseline mean) / |baseline mean| over seeds and environments, minus that of the
-baseline's own returns. [ ]: 95 % intervals from a stratified bootstrap over seeds (Student's t
-times the bootstrap standard error, with Satterthwaite's degrees of freedom: few seeds of the
-baseline widen it as much as few with noise). In simulated samples of one
-environment they held the true IQM in at least
-{", ".join(f"{c} % (n = {n})" for n, c in COVERAGE.items())} of the cases where returns were
-normal, skewed or 20 % of them in a low peak, but in
+    "best": """The best noise in each environment, which may still be worse than no noise. Mean
+\u00b1 standard deviation of the final return over n seeds (with / without noise).""",
+    "consistent": f"""Noise that matches or beats no noise in at least {CONSISTENT_PERCENT} % of two
+or more environments. Average improvement \u00b1 standard deviation over environments.""",
+    "consistently_worse": "Noise that is worse than no noise in each of two or more environments.",
+    "luck": f"""How many rows the tables above would have if no noise did anything, from
+{DRAWS:,} simulated sweeps.""",
+    "early_performance": """Mean test return \u00b1 standard deviation during training, by noise
+rate (0.00: no noise), with the number of seeds in brackets.""",
+    "summary": """Final test return of every configuration: mean \u00b1 standard deviation over n
+seeds, and the improvement over no noise. Here p is not corrected.""",
+    "statistics": """Every noise against no noise: the improvement of the interquartile mean (IQM)
+with its 95 % interval, and the test behind the verdict.""",
+    "interactions": """What two noises do together beyond the sum of their effects, with 95 %
+intervals. Above zero, both together are better than the sum.""",
+    "choice": """How the noise was chosen: each round of the search drops the worse half, and fresh
+seeds confirm the winner or not.""",
+    "missing": "Runs that are in no table and no figure, with their seeds.",
+    "compare_luck": """The same for the paper's tables.""",
+    "compare": "The paper's table (environments v2, 1,000,000 steps) beside ours.",
+}
+HOW = {
+    "best": f"""The best noise is the one with the highest mean final return. It is chosen on the
+seeds that it is reported on, which flatters it. Improvement and p corrected are those of the
+statistics. Luck 95 %: if no noise did anything, the best mean of as many noises would still look
+this much better than no noise in one of twenty sweeps; in brackets, the probability that luck alone
+gives a mean at least as high as the best one has. best.csv has more columns. Its leave-one-seed-out
+value measures the procedure of choosing, not the noise that is named: choose on all seeds but one,
+measure on that one, average over seeds. It is descriptive: its terms share seeds, so it has no
+interval. A best noise counts as beyond luck where that probability is at most {LUCKY}.""",
+    "consistent": """p is the exact test over all environments, then corrected for all
+configurations (Benjamini-Hochberg). p luck: the probability that the highest average of as many
+configurations is as high if none does anything. n is the smallest number of seeds in any
+environment.""",
+    "consistently_worse": """Columns as in the table of consistent noise, p luck with the lowest
+average. Worse at every rate that was tried:""",
+    "luck": f"""{DRAWS:,} sweeps are drawn in which no noise does anything: the baseline and all
+configurations anew, with their numbers of seeds, from a normal distribution with the pooled
+standard deviation within configurations (from {SEEDS_TO_RESAMPLE} seeds of the baseline on, with
+the shape of their returns). By luck: the mean number of rows in the tables of consistent and
+consistently worse noise, and its 95 % quantile. p: the probability of at least as many rows as
+observed. Beyond luck: rows with a p luck of {LUCKY} or less. Configurations are those in two or
+more environments. The p luck of a best noise is right for normal returns of equal spread: that of
+90 useless configurations is then {LUCKY} or less in 5 % of simulated studies. Where a fifth of the
+runs end around a second, higher peak, it is in {FALSE_ALARMS[5]} % with five seeds and
+{FALSE_ALARMS[10]} % with ten. One configuration of 90 with a true gain of 1, 1.5 and 2 standard
+deviations is beyond luck in {listed(POWER_OF_BEST[5])} % of studies with five seeds, and in
+{listed(POWER_OF_BEST[10])} % with ten.""",
+    "summary": """Improvement: of the mean, in percent of |mean without noise|, with the p of the
+exact Mann-Whitney test. Steps to baseline: the first evaluation at which the mean over seeds
+reaches the final mean without noise.""",
+    "statistics": f"""IQM: interquartile mean of the final returns over n seeds. Improvement: IQM of
+(return - baseline mean) / |baseline mean| over seeds and environments, minus that of the baseline's
+own returns; the baseline are the runs without noise. [ ]: 95 % intervals from a stratified
+bootstrap over seeds (Student's t times the bootstrap standard error, with Satterthwaite's degrees
+of freedom: few seeds of the baseline widen it as much as few with noise). In simulated samples of
+one environment they held the true IQM in at least
+{", ".join(f"{c} % (n = {n})" for n, c in COVERAGE.items())} of the cases where returns were normal,
+skewed or 20 % of them in a low peak, but in
 {", ".join(f"{c} % (n = {n})" for n, c in COVERAGE_OF_MIXTURES.items())} where 40 % were in a low
 and narrow peak. P(improvement): probability that a noisy run beats a baseline run, averaged over
 environments, with Newcombe's interval. No interval for n < {MIN_SEEDS}. p: exact two-sided
@@ -220,39 +237,37 @@ counts alike ({PERMUTATIONS:,} random orders with a fixed seed where the exact d
 than {MOST_VALUES:,} values). The test decides, also where an interval says otherwise: that of the
 improvement is for the interquartile mean. In a full grid the rows of all environments together are
 primary: in one environment alone no configuration with five seeds can reach 0.05 on its own after
-the adjustment. p adjusted: Benjamini-Hochberg over one
-family, all configurations of an algorithm in one environment, or in all of them together; the
-verdict is better or worse where it is at most 0.05, and perhaps so where only p is. Smallest p
-adjusted: what one configuration alone could reach at most with its number of seeds. Detectable: the
-improvement that these seeds find at the 5 % level, uncorrected, with 80 % power; seeds needed: how
-many on each side the observed improvement takes. Both are for normal returns with the standard
-deviation of these seeds.""",
-    "interactions": """Two noises together: interaction = mean with both - mean with the first -
-mean with the second + mean without noise, of the final test returns, where each of the four has at
-least 3 seeds (n is the smallest number), with a 95 % interval (Welch, Satterthwaite), and in
-percent of |mean without noise|. Above zero, both together are better than their two effects added
-up. This is descriptive: nothing is corrected for the number of rows.""",
-    "choice": """How ./benchmark.sh choose came to its noise: rounds of the search, in which the
-better half survives (score: mean over the seeds, and over each run's tests in the last 15 % of its
-steps), and the confirmation of
-the winner on fresh seeds (1001 and up; score: mean final test return; survives: whether it was
-shown to be better than no noise). Search and confirmation have rows of their own everywhere, and
-only the confirmation is judged: the search's seeds chose the noise, which flatters it.""",
-    "missing": """Runs that are in no table and no figure, with their seeds. Missing are the seeds
-that at least half of an algorithm's configurations with noise have, and baselines.""",
-    "compare_luck": f"""The same for the paper's tables: {PAPER_CONFIGURATIONS} configurations in
-each environment. Only means and standard deviations are printed there, so returns are taken as
-normal, with the standard deviation of each baseline, known from 5 seeds (PPO 10). Where a fifth of
-the runs end around a second, higher peak, the best of 90 useless configurations has a p luck of
-{LUCKY} or less in {FALSE_ALARMS_IN_THE_PAPER[5]} % of studies with five seeds and
-{FALSE_ALARMS_IN_THE_PAPER[10]} % with ten; one with a true gain of 1, 1.5 and 2 standard deviations
-in {listed(POWER_IN_THE_PAPER[5])} % and {listed(POWER_IN_THE_PAPER[10])} %, if returns are
-normal.""",
-    "compare": """The paper's table (environments v2, 1,000,000 steps) beside ours, with the
-difference in standard errors where the steps are the same; listed by: whose table has the row.
-Paper: luck: see the table of luck. Ours:""",
+the correction. p corrected: Benjamini-Hochberg over one family, all configurations of an algorithm
+in one environment, or in all of them together. The verdict is better or worse where p corrected is
+at most 0.05, and perhaps so where only p is. statistics.csv also has the smallest p that one
+configuration alone could reach with its number of seeds. Detectable: the improvement that these
+seeds find at the 5 % level, uncorrected, with 80 % power. Seeds needed: how many on each side the
+observed improvement takes. Both are for normal returns with the standard deviation of these
+seeds.""",
+    "interactions": """Interaction = mean with both - mean with the first - mean with the second +
+mean without noise, of the final test returns, where each of the four has at least 3 seeds (n is the
+smallest number), with a 95 % interval (Welch, Satterthwaite), and in percent of |mean without
+noise|. This is descriptive: nothing is corrected for the number of rows.""",
+    "choice": """Score in the search: the mean over the seeds, and over each run's tests in the last
+15 % of its steps. Score in the confirmation, on fresh seeds (1001 and up): the mean final test
+return. Survives, in the confirmation: whether the winner was shown to be better than no noise.
+Search and confirmation have rows of their own everywhere, and only the confirmation is judged: the
+search's seeds chose the noise, which flatters it.""",
+    "missing": """Missing are the seeds that at least half of an algorithm's configurations with
+noise have, and baselines.""",
+    "compare_luck": f"""{PAPER_CONFIGURATIONS} configurations in each environment. The paper prints
+only means and standard deviations, so returns are taken as normal, with the standard deviation of
+each baseline, known from 5 seeds (PPO 10). Where a fifth of the runs end around a second, higher
+peak, the best of 90 useless configurations has a p luck of {LUCKY} or less in
+{FALSE_ALARMS_IN_THE_PAPER[5]} % of studies with five seeds and {FALSE_ALARMS_IN_THE_PAPER[10]} %
+with ten; one with a true gain of 1, 1.5 and 2 standard deviations in
+{listed(POWER_IN_THE_PAPER[5])} % and {listed(POWER_IN_THE_PAPER[10])} %, if returns are normal.""",
+    "compare": """The difference is in standard errors, where the steps are the same. Listed by:
+whose table has the row. Paper, luck: see the table of luck. Our steps:""",
 }
-CAPTIONS = {name: " ".join(text.split()) for name, text in CAPTIONS.items()}
+CAPTIONS, HOW = (
+    {name: " ".join(text.split()) for name, text in texts.items()} for texts in (CAPTIONS, HOW)
+)
 
 
 def make_tables(studies, paper=None):
@@ -279,41 +294,64 @@ def make_tables(studies, paper=None):
     luck = frame("luck", luck_rows(lucks, best, good, bad))
     failing = bad[bad["fails_at_every_rate"] == "yes"][[*STUDY, "noise"]].drop_duplicates()
     failing = "; ".join(f"{noise} ({study_name(*study)})" for *study, noise in failing.values)
-    worse = f"{CAPTIONS['consistently_worse']} {failing or 'none'}."
-    limits = "\n".join(family_notes(statistics))
     tables = [
-        table_of("best", best, only_csv=("leave_one_seed_out_mean",)),
+        table_of("best", best, view=best_view(best, statistics)),
         table_of("consistent", good),
-        table_of("consistently_worse", bad, worse),
+        table_of(
+            "consistently_worse", bad, how=f"{HOW['consistently_worse']} {failing or 'none'}."
+        ),
         table_of("luck", luck, only_csv=LUCK_ONLY_CSV),
         table_of(
             "statistics",
             statistics,
-            f"{CAPTIONS['statistics']}\n{limits}",
             only_csv=("environments", "comparisons", "smallest_p", "smallest_p_adjusted"),
         ),
-        table_of("early_performance", early),
+        table_of("early_performance", early, rates_beside=True),
     ]
     found = frame("interactions", (row for study in judging for row in interaction_rows(study)))
     if len(found):
         tables.append(table_of("interactions", found))
     for algorithm, table in summary.groupby("algorithm"):
-        tables.append(table_of(f"summary_{algorithm}", table, CAPTIONS["summary"], "summary"))
+        tables.append(table_of("summary", table, name=f"summary_{algorithm}"))
     if paper:
         lengths = {study.key: study.steps[-1] for study in studies}
-        caption = ", ".join(f"{study_name(*key)} {n:,} steps" for key, n in lengths.items())
-        caption = f"{CAPTIONS['compare']} {caption}."
+        steps = ", ".join(f"{study_name(*key)} {n:,}" for key, n in lengths.items())
         listed = judged, best, consistency, good, bad, early
         for name, table in compare_tables(paper, lengths, *listed):
             section = name.removeprefix("compare_")
             if section == "luck":
-                text = CAPTIONS["compare_luck"]
-                tables.append(table_of(name, table, text, section, LUCK_ONLY_CSV))
+                more = {"kind": name, "only_csv": LUCK_ONLY_CSV}
             else:
-                tables.append(table_of(name, table, caption, section))
+                more = {"kind": "compare", "how": f"{HOW['compare']} {steps}."}
+            tables.append(table_of(frame=table, section=section, name=name, **more))
     return {table.name: table for table in tables}
 
 
-def table_of(name, frame, caption=None, section=None, only_csv=()):
-    """Make a Table with the formats of this module; caption and section are those of its name."""
-    return Table(name, frame, caption or CAPTIONS[name], section or name, FORMATS, only_csv)
+def table_of(kind, frame, name=None, section=None, how=None, **more):
+    """Make a Table with the formats and texts of this module; name and section may be its kind."""
+    how = HOW.get(kind, "") if how is None else how
+    return Table(name or kind, frame, CAPTIONS[kind], section or kind, FORMATS, how, **more)
+
+
+def best_view(best, statistics):
+    """Return the best noises as people read them, in nine columns.
+
+    The improvement is that of the verdict, of the interquartile mean, with its interval.
+    """
+    keys = [*KEYS, "scope"]
+    tests = statistics.set_index(keys)[
+        ["improvement_iqm_percent", "improvement_low", "improvement_high"]
+    ]
+    rows = pd.MultiIndex.from_frame(best.assign(scope="environment")[keys])
+    view = pd.DataFrame(index=best.index)
+    names = [study_name(*key) for key in best[STUDY].itertuples(index=False)]
+    view["algorithm, environment"] = [
+        f"{name}, {environment}"
+        for name, environment in zip(names, best["environment"], strict=True)
+    ]
+    same = ["noise", "noise_rate", "baseline_mean", "baseline_std", "noisy_mean", "noisy_std"]
+    view = view.join(best[same]).join(tests.reindex(rows).set_index(best.index))
+    view = view.join(best[["p_adjusted", "luck_95_percent"]])
+    view["p_luck_of_best"] = best["p_luck"]
+    view["n"] = [seeds_of(*pair) for pair in best[["n", "n_baseline"]].to_numpy()]
+    return view

@@ -16,7 +16,8 @@ from analysis.runs import STUDY, rows_of, study_name
 from analysis.statistics import LEVEL, improvement_percent
 
 UNCLEAR = "no clear difference"
-VERDICTS = ["better", "worse", "perhaps better", "perhaps worse", UNCLEAR]  # in this order
+CLEAR = ["better", "worse"]
+VERDICTS = [*CLEAR, "perhaps better", "perhaps worse", UNCLEAR]  # in this order
 MAX_SEEDS = 1000  # a difference that would take more seeds is said to take more than these
 
 
@@ -48,6 +49,11 @@ def interval(low, high):
 def counted(number, word):
     """Spell how many there are: "1 seed", "5 seeds"."""
     return f"{number:.0f} {word}" + ("" if number == 1 else "s")
+
+
+def seeds_of(n, n_baseline):
+    """Spell the seeds with and without noise: "5", or "5/10" where they differ."""
+    return f"{n:.0f}" if n == n_baseline else f"{n:.0f}/{n_baseline:.0f}"
 
 
 def p_value(p):
@@ -156,6 +162,64 @@ def tally(verdicts):
     counts = verdicts.value_counts()
     parts = [f"{counts[name]} {name}" for name in VERDICTS if name in counts]
     return f"{counted(len(verdicts), 'comparison')}: {', '.join(parts)}"
+
+
+def luck_sentence(best):
+    """Say whether the best noises of a study look better than luck alone would make them, or "".
+
+    best: its rows of the table of best noises, one for each environment.
+    """
+    best = best[best["p_luck"].notna()]
+    if best.empty:
+        return ""
+    if not (best["improvement_percent"] > 0).any():
+        return "Nothing that was tried has a higher mean return than no noise."
+    tried = set(best["chosen_from"])
+    rivals = f"the best of {max(tried):.0f} useless noises would"
+    if tried == {1}:
+        rivals = "one useless noise might"
+    elif len(tried) > 1:
+        rivals = "the best of as many useless noises would"
+    beyond = best[best["p_luck"] <= LEVEL]
+    if beyond.empty:
+        where = " in each environment" if len(best) > 1 else ""
+        return f"The best noise{where} looks no better than {rivals}."
+    where = [f"{row.environment} (p {p_value(row.p_luck)})" for row in beyond.itertuples()]
+    elsewhere = "; elsewhere it does not" if len(beyond) < len(best) else ""
+    return f"On {together(where)} the best noise looks better than {rivals}{elsewhere}."
+
+
+def together(names):
+    """Join names for a sentence: "A, B and C"."""
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+def headlines(statistics, best):
+    """Return for each study its name, its comparisons in words, its counts of verdicts, its luck.
+
+    Counted are the verdicts of single environments. statistics, best: the frames of these tables.
+    """
+    lines = []
+    alone = statistics[statistics["p"].notna() & (statistics["scope"] == "environment")]
+    for key, rows in alone.groupby(STUDY, sort=False):
+        noises = counted(len(rows.drop_duplicates(["noise", "noise_rate"])), "noise")
+        tried = f"{noises} in {counted(rows['environment'].nunique(), 'environment')}"
+        if len(rows) > 1:
+            tried = f"{counted(len(rows), 'comparison')} ({tried})"
+        counts = [(word, (rows["verdict"] == word).sum()) for word in VERDICTS]
+        counts = [(word, n) for word, n in counts if n or word in CLEAR]
+        luck = luck_sentence(best[rows_of(best, key)])
+        lines.append({"name": study_name(*key), "tried": tried, "counts": counts, "luck": luck})
+    return lines
+
+
+def clear_first(verdicts, number):
+    """Split a frame of sentences: the first clear ones, at most `number`, and all others.
+
+    What is better comes before what is worse.
+    """
+    clear = verdicts[verdicts["verdict"].isin(CLEAR)].sort_values("verdict", kind="stable")
+    return clear[:number], verdicts.drop(clear.index[:number])
 
 
 def sentences(studies, statistics):

@@ -180,7 +180,7 @@ def test_the_captions_say_how_often_p_luck_is_wrong_and_how_often_it_finds_an_ef
     assert paper == pytest.approx(analysis.luck.POWER_IN_THE_PAPER[n][1], abs=8)
     for name, found in (("luck", "POWER_OF_BEST"), ("compare_luck", "POWER_IN_THE_PAPER")):
         powers = ", ".join(map(str, getattr(analysis.luck, found)[n]))
-        assert f"{powers} %" in analysis.tables.CAPTIONS[name]
+        assert f"{powers} %" in analysis.tables.HOW[name]
 
 
 def p_of_the_best(n, gain, draw, studies=300):
@@ -224,7 +224,7 @@ def test_luck_stands_beside_the_best_and_the_consistent(tmp_path):
     assert luck["consistent_by_luck"] == pytest.approx(3 / 4, abs=0.05)
     assert luck["consistent_beyond_luck"] == luck["consistently_worse_beyond_luck"] == 1
     page = (tmp_path / "results/report.html").read_text()
-    assert all(name in page for name in ("p luck", 'id="luck"', 'id="compare_luck"'))
+    assert all(name in page for name in ("p luck", 'id="luck"', 'id="table-compare_luck"'))
 
 
 def test_luck_in_the_papers_tables():

@@ -11,7 +11,6 @@ import analysis.runs
 import analysis.statistics
 import analysis.tables
 import analysis.verdicts
-import analyze
 from analysis.configurations import BASELINE, Configuration
 
 NOISE = "RandomEarlyTermination(50)"
@@ -190,12 +189,16 @@ def test_of_many_comparisons_the_first_are_shown_and_all_are_counted():
     noisy = {f"{rate:.2f}": four + rate for rate in np.linspace(0, 1, 20)}
     noisy["0.99"] = four + 50
     _, said = judge(four, noisy)
-    lines = list(analyze.shortened(said))
-    assert len(lines) == 16 and "at rate 0.99 is perhaps better" in lines[0]
-    assert lines[-1].startswith("(21 comparisons: 1 perhaps better, 20 no clear difference;")
-    assert list(analyze.shortened(said[:0])) == [
-        "There is no noise to compare with a baseline yet."
-    ]
+    first, rest = analysis.verdicts.clear_first(said, 10)
+    assert len(first) == 0 and len(rest) == 21
+    tally = analysis.verdicts.tally(rest["verdict"])
+    assert tally == "21 comparisons: 1 perhaps better, 20 no clear difference"
+
+    ten = {f"{rate:.2f}": TEN + (50 if rate > 0.5 else -50) for rate in np.linspace(0.1, 1, 19)}
+    _, said = judge(TEN, ten)
+    first, rest = analysis.verdicts.clear_first(said, 12)
+    assert list(first["verdict"]) == 10 * ["better"] + 2 * ["worse"]
+    assert list(rest["verdict"]) == 7 * ["worse"]
 
 
 def test_a_row_of_all_environments_shows_the_range_of_its_baselines():

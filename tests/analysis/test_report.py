@@ -1,0 +1,213 @@
+"""report.html: what stands where, in a browser; what its sentences say; how large it is."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import tempfile
+from html import escape, unescape
+
+import pandas as pd
+import pytest
+from fabricated import fabricate
+from test_analyze import RESULTS, SCALE, main, run, small_sweep, write_run
+
+import analysis.verdicts
+import analyze
+from sweep.grid import NOISES
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    """Return the folder of the analysis of a small sweep."""
+    path = tmp_path_factory.mktemp("sweep")
+    small_sweep(path / "runs")
+    run(path, drawn=True)
+    return path / "results"
+
+
+@pytest.fixture(scope="module")
+def large_results(tmp_path_factory):
+    """Return those of all noises of the paper for PPO, in 2,275 runs."""
+    path = tmp_path_factory.mktemp("grid")
+    fabricate(path / "runs", seeds=range(1, 6))
+    main(analyze.Args(path / "runs", path / "results"), drawn=True)
+    return path / "results"
+
+
+def browser():
+    """Path of Chromium: without it the tests of the report skip, or fail under CI."""
+    found = (
+        shutil.which("chromium")
+        or shutil.which("chromium-browser")
+        or shutil.which("google-chrome")
+    )
+    if not found and os.environ.get("CI"):
+        pytest.fail("chromium is missing, and CI must have it")
+    if not found:
+        pytest.skip("chromium is not installed")
+    return found
+
+
+def in_browser(page, script, width, tmp_path):
+    """Open `page` in a frame of this width and return what `script` returns there."""
+    # In a frame, because a headless window is never narrower than 500 pixels.
+    frame = f'style="width: {width}px; height: 800px; border: 0"'
+    wrapper = f"""<!DOCTYPE html><meta charset="utf-8"><pre id="answer"></pre><script>
+        const answer = frame => {{ document.getElementById("answer").textContent =
+          JSON.stringify(frame.contentWindow.eval({json.dumps(f"(() => {{ {script} }})()")})); }}
+        </script>
+        <base href="{page.parent.as_uri()}/">
+        <iframe {frame} onload="answer(this)" srcdoc="{escape(page.read_text())}"></iframe>"""
+    copy = tmp_path / "wrapper.html"
+    copy.write_text(wrapper)
+    flags = """--headless --no-sandbox --disable-gpu --disable-quic --no-first-run
+        --disable-background-networking --disable-component-update --disable-sync --dump-dom
+        --virtual-time-budget=10000 --window-size=1400,900"""
+    with tempfile.TemporaryDirectory() as profile:
+        command = [browser(), *flags.split(), f"--user-data-dir={profile}", copy.as_uri()]
+        dom = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
+    return json.loads(unescape(re.search(r'<pre id="answer">(.*?)</pre>', dom, re.DOTALL)[1]))
+
+
+def test_report_sorts_in_a_browser(results, tmp_path):
+    script = """
+        const table = document.getElementById("table-summary_SAC");
+        const heads = [...table.tHead.rows[0].cells];
+        const column = name => heads.findIndex(head => head.textContent === name);
+        const read = name => [...table.tBodies[0].rows].map(r => r.cells[column(name)].textContent);
+        const click = name => { heads[column(name)].querySelector("button").click();
+          return [heads[column(name)].getAttribute("aria-sort"), read(name)]; };
+        return [number("-1,234.5 \u00b1 6"), click("mean"), click("mean"), click("improvement %"),
+          click("noise")];"""
+    answer = in_browser(results / "report.html", script, 1280, tmp_path)
+    value, (_, first), (_, second), (state, improvements), (_, noises) = answer
+    assert value == -1234.5
+    means = [float(text.split()[0]) for text in (*first, *second)]
+    values = [-80, -55, -40, -25, 25, 115, 115, 145]
+    assert means == [*reversed(values), *values]  # numbers: the highest first
+    assert improvements[-2:] == ["\u2013", "\u2013"]  # the baselines' dashes come last
+    numbers = [float(text) for text in improvements[:-2]]
+    assert numbers == sorted(numbers, reverse=state == "descending")
+    assert noises == sorted(noises, key=str.lower)
+
+
+FIRST_SCREEN = """
+    document.querySelectorAll("details").forEach(details => details.open = true);
+    const images = [...document.images], inside = images.filter(i => i.src.startsWith("data:"));
+    const sentence = document.querySelector("#verdict li");
+    return [innerWidth, document.documentElement.scrollWidth,
+      images.filter(image => !image.alt).length,
+      [...document.querySelectorAll("body *")].filter(node => !node.closest("table") &&
+        !node.matches(".scroll") && node.scrollWidth > node.clientWidth + 1 &&
+        getComputedStyle(node).overflowX !== "visible").length,
+      inside.filter(image => !image.naturalWidth).length,
+      inside.map(image => image.naturalWidth),
+      images.filter(image => !inside.includes(image)).map(image => image.getAttribute("src")),
+      Boolean(images[0].compareDocumentPosition(sentence) & Node.DOCUMENT_POSITION_FOLLOWING)];"""
+
+
+@pytest.mark.parametrize("width", [420, 1280])
+def test_a_picture_comes_first_and_only_tables_scroll(width, results, tmp_path):
+    answer = in_browser(results / "report.html", FIRST_SCREEN, width, tmp_path)
+    inner, needed, nameless, scrolling, broken, sizes, beside, picture_first = answer
+    assert inner == width and needed <= width and picture_first
+    assert nameless == scrolling == broken == 0
+    assert max(sizes) <= (width if width < 700 else 1200)  # pictures for a telephone are narrow
+    folded = sorted(path.name for path in results.glob("curves_*.svg"))
+    assert sorted(beside) == folded and len(folded) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["fabricated", "committed"])
+def test_no_table_of_a_large_report_scrolls_or_cuts_a_number(kind, large_results, tmp_path):
+    if kind == "committed":
+        large_results = tmp_path
+        main(analyze.Args(RESULTS / "data/runs", tmp_path, RESULTS / "paper"))
+    script = """
+        document.querySelectorAll("details").forEach(details => details.open = true);
+        const cells = [...document.querySelectorAll("td")];
+        const box = node => node.getBoundingClientRect();
+        const lines = cell => { const range = document.createRange();
+          range.selectNodeContents(cell);
+          return new Set([...range.getClientRects()].map(line => line.top)).size; };
+        return [document.documentElement.scrollWidth,
+          [...document.querySelectorAll(".scroll")].filter(node =>
+            node.scrollWidth > node.clientWidth || node.scrollHeight > node.clientHeight).length,
+          cells.filter(cell => box(cell).right > 1280).length,
+          cells.filter(cell => /^-?[0-9,.]+$/.test(cell.textContent) && lines(cell) > 1).length,
+          cells.length,
+          document.getElementById("table-best").tHead.rows[0].cells.length];"""
+    page = in_browser(large_results / "report.html", script, 1280, tmp_path)
+    width, scrolling, outside, broken, cells, columns = page
+    assert width <= 1280 and scrolling == outside == broken == 0 and cells > 500 and columns == 9
+
+
+@pytest.mark.slow
+def test_the_report_of_a_full_grid_is_small(large_results):
+    assert (large_results / "report.html").stat().st_size < 2.5e6
+    figures = {path.name for path in large_results.glob("curves_*.svg")}
+    assert len(figures) == len(NOISES)
+
+
+def test_an_empty_section_is_left_out(tmp_path):
+    for seed in range(3):
+        write_run(tmp_path / "runs", [10 + seed], seed=seed)
+        write_run(tmp_path / "runs", [20 + seed], seed=seed, noise=SCALE, rate=0.5)
+    run(tmp_path)
+    page = (tmp_path / "results/report.html").read_text()
+    assert 'id="best"' in page and 'id="statistics"' in page
+    for name in ("consistent", "consistently_worse", "missing", "robustness"):
+        assert f'id="{name}"' not in page and f'href="#{name}"' not in page
+    assert "None." not in page
+
+
+def test_of_many_versions_is_said_at_the_end(tmp_path):
+    for seed in (1, 2):
+        write_run(tmp_path / "runs", [seed], seed=seed, versions={"mujoco": f"3.{seed}.0"})
+        write_run(tmp_path / "runs", [seed], seed=seed, noise=SCALE, rate=0.5)
+    run(tmp_path)
+    page = (tmp_path / "results/report.html").read_text()
+    limit = page.index("with 2 seeds no difference can be significant")
+    assert limit < page.index('id="best"') < page.index("runs with different mujoco")
+
+
+@pytest.mark.parametrize(
+    ("improvements", "p_luck", "tried", "expected"),
+    [
+        (
+            [-5, 0],
+            [0.9, 1],
+            [3, 3],
+            "Nothing that was tried has a higher mean return than no noise.",
+        ),
+        ([5], [0.3], [1], "The best noise looks no better than one useless noise might."),
+        (
+            [5, -1],
+            [0.3, 0.9],
+            [3, 3],
+            "The best noise in each environment looks no better than "
+            "the best of 3 useless noises would.",
+        ),
+        (
+            [5, 9],
+            [0.3, 0.01],
+            [3, 4],
+            "On Hopper-v5 (p = 0.01) the best noise looks better than "
+            "the best of as many useless noises would; elsewhere it does not.",
+        ),
+        (
+            [5, 9],
+            [0.0001, 0.01],
+            [90, 90],
+            "On Ant-v5 (p < 0.001) and Hopper-v5 (p = 0.01) the "
+            "best noise looks better than the best of 90 useless noises would.",
+        ),
+        ([float("nan")], [float("nan")], [3], ""),
+    ],
+)
+def test_luck_is_said_in_one_sentence(improvements, p_luck, tried, expected):
+    best = {"environment": ["Ant-v5", "Hopper-v5"][: len(tried)], "chosen_from": tried}
+    best |= {"improvement_percent": improvements, "p_luck": p_luck}
+    assert analysis.verdicts.luck_sentence(pd.DataFrame(best)) == expected
