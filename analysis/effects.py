@@ -103,11 +103,11 @@ def effects_figure(statistics, narrow=False):
     axes[0].set_yticks(range(len(lines)), lines)
     axes[0].set_ylim(len(lines) - 0.5, -0.5)  # the first noise on top
     label = "improvement over no noise (%)"
+    below = fig.supxlabel if across > 1 else axes[-1].set_xlabel
+    below(label if forest else "noise rate", fontsize=9)
     if forest:
         scale_forest(axes[0], rows, limit, (width - 2) / across)
-        fig.supxlabel(label, fontsize=9)
     else:
-        fig.supxlabel("noise rate", fontsize=9)
         beyond = "both" if rows[ENDS[0]].abs().max() > limit else "neither"
         place = {"location": "bottom", "fraction": 0.05} if narrow else {"fraction": 0.02}
         fig.colorbar(image, ax=list(axes), extend=beyond, label=label, pad=0.01, **place)

@@ -27,6 +27,7 @@ from analysis.verdicts import seeds_of
 
 STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
 STYLE["svg.hashsalt"] = "noisy"  # equal figures are equal files
+STYLE["axes.titley"] = 1.0  # above the axes, without a search for labels that are in the way
 matplotlib.rcParams.update(STYLE)
 HEIGHT = 5.5  # inches of every figure; one with many rows is higher
 NARROW = "_narrow"  # ends the names of figures for narrow windows

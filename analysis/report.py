@@ -87,6 +87,9 @@ def write_report(out, verdicts, tables, drawn, overview, problems, notes):
     pages.filters["breakable"] = breakable
     effects, sections = sections_of(out, tables, drawn)
     first, rest = clear_first(verdicts, SENTENCES)
+    names_of = {}  # text -> the tables that it explains
+    for table in (table for section in sections for table in section["tables"] if table["how"]):
+        names_of.setdefault(table["how"], []).append(table["name"])
     averaged = [note for note in notes if AVERAGED in note]  # these change no verdict
     html = pages.get_template("report.html.jinja").render(
         effects=effects,
@@ -96,6 +99,7 @@ def write_report(out, verdicts, tables, drawn, overview, problems, notes):
         rest_tally=tally(rest["verdict"]),
         together=(rest["scope"] == "all").any(),
         sections=sections,
+        names_of=names_of,
         most_rows=ROWS,
         overview=overview,
         problems=problems,
