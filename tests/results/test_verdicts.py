@@ -523,6 +523,18 @@ SENTENCES = [
     ),
     (
         "future_work.md",
+        "Nothing suggests that a falling rate is better than a constant one.",
+        lambda n: n["falling"]["all"]["difference"] < 0,
+        lambda n: n["falling"]["all"].update(difference=0.1),
+    ),
+    (
+        "future_work.md",
+        "Nor do ten seeds show that the two together differ from no noise;",
+        lambda n: n["together"]["holm"][1] > 0.05,
+        lambda n: n["together"].update(holm=[0.7, 0.04, 0.7]),
+    ),
+    (
+        "future_work.md",
         "**nothing shown**: interaction",
         lambda n: n["together"]["low"] < 0 < n["together"]["high"],
         lambda n: n["together"].update(low=1),
