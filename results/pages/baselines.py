@@ -6,6 +6,8 @@ The three algorithms beside the paper and CleanRL, and which way of testing PPO 
 paper's returns. baselines.md.jinja has the text, this file and ways.py every number in it.
 """
 
+from pathlib import Path
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
@@ -33,51 +35,7 @@ from analysis.statistics import MIN_SEEDS, holm
 
 plt.rcParams["svg.hashsalt"] = "noisy"  # equal figures are equal files
 
-# Training returns in CleanRL's documentation: mean and standard deviation over three seeds, the
-# population's, as its rlops takes it (np.std). PPO: the first two at commit 2d660b6 (October 2023),
-# the last since commit 35896b1 (November 2023). SAC and TD3: at commit fe8d8a0.
-CLEANRL_PPO = {
-    "v2": {
-        "HalfCheetah": (2262.50, 1196.81),
-        "Hopper": (2311.49, 440.99),
-        "Humanoid": (676.34, 78.68),
-        "Pusher": (-60.49, 4.37),
-        "Walker2d": (3312.32, 429.87),
-    },
-    "v4": {
-        "HalfCheetah": (2905.85, 1129.37),
-        "Hopper": (2051.80, 313.94),
-        "Humanoid": (742.19, 155.77),
-        "Pusher": (-55.60, 3.98),
-        "Walker2d": (2890.97, 231.40),
-    },
-    "v4, newer": {
-        "HalfCheetah": (1442.64, 46.03),
-        "Hopper": (2382.86, 271.74),
-        "Humanoid": (716.11, 49.08),
-        "Pusher": (-40.38, 7.15),
-        "Walker2d": (2287.95, 571.78),
-    },
-}
-CLEANRL_SAC = {
-    "v2": {
-        "HalfCheetah": (9634.89, 1423.73),
-        "Hopper": (2310.46, 342.82),
-        "Walker2d": (3591.45, 911.33),
-    },
-    "v4": {"Humanoid": (4996.29, 686.40), "Pusher": (-22.45, 0.51)},
-}
-CLEANRL_TD3 = {
-    "v4": {
-        "HalfCheetah": (9583.22, 126.09),
-        "Hopper": (3134.61, 360.18),
-        "Humanoid": (5035.36, 21.67),
-        "Pusher": (-30.92, 1.05),
-        "Walker2d": (4057.59, 658.78),
-    }
-}
-# The one that stands beside ours: the newest of each
-CLEANRL = {"PPO": {"v4": CLEANRL_PPO["v4, newer"]}, "SAC": CLEANRL_SAC, "TD3": CLEANRL_TD3}
+CLEANRL_CSV = Path(__file__).with_name("cleanrl.csv")  # training returns in its documentation
 CLEANRL_SEEDS = 3
 FULL_LENGTH, SHORT_LENGTH = 1_000_000, 200_000
 COLORS = {"PPO": "C0", "SAC": "C1", "TD3": "C2"}
@@ -110,11 +68,20 @@ def groups(runs):
             yield key, group
 
 
-def cleanrl(returns):
-    """Return CleanRL's {environment: (mean, std)} as a frame with the sample's deviation."""
-    table = pd.DataFrame(returns, index=["mean", "std"]).T
-    table["std"] *= np.sqrt(CLEANRL_SEEDS / (CLEANRL_SEEDS - 1))
+def read_cleanrl(path=CLEANRL_CSV):
+    """Return the training returns of CleanRL's documentation, with the sample's deviation.
+
+    It prints the population's (np.std in its rlops). PPO: releases v2 and v4 at commit 2d660b6
+    (October 2023), the newer one since 35896b1 (November 2023). SAC and TD3: at fe8d8a0.
+    """
+    table = pd.read_csv(path)
+    table["std"] = table["population_std"] * np.sqrt(CLEANRL_SEEDS / (CLEANRL_SEEDS - 1))
     return table.assign(n=CLEANRL_SEEDS)
+
+
+def newest_of_cleanrl():
+    """Return CleanRL's newest returns by (algorithm, environment)."""
+    return read_cleanrl().groupby(["algorithm", "environment"]).last()
 
 
 def paper_baselines(paper):
@@ -139,11 +106,11 @@ def published(paper, algorithm, environment, total):
         early = early[np.isclose(early["steps_millions"] * 1e6, total)]
         sample = early.assign(n=PAPER_SEEDS[algorithm]).set_index("environment")[VALUES]
         return sample if len(sample) else None, None, None
-    sample = paper_baselines(paper).loc[algorithm].loc[name]
-    for version, returns in CLEANRL[algorithm].items():
-        if environment in returns:
-            return sample, cleanrl(returns).loc[name], version
-    return sample, None, None
+    sample, newest = paper_baselines(paper).loc[algorithm].loc[name], newest_of_cleanrl()
+    if (algorithm, environment) not in newest.index:
+        return sample, None, None
+    theirs = newest.loc[algorithm].loc[name]
+    return sample, theirs[VALUES], theirs["version"].item()
 
 
 # ----------------------------------------------------------------------------------------- the rows
@@ -211,14 +178,14 @@ def cleanrls_versions(runs, paper):
     base = runs.query("algorithm == 'PPO' and version == 'v5'")
     training = sample(base, "training")
     columns, apart = {"": training.index, "ours, v5": spell(training)}, []
-    for version, returns in CLEANRL_PPO.items():
-        theirs = cleanrl(returns).loc[training.index]
+    releases = read_cleanrl().query("algorithm == 'PPO'").set_index(["release", "environment"])
+    for release in dict.fromkeys(releases.index.get_level_values("release")):
+        theirs = releases.loc[release].loc[training.index, VALUES]
         errors, p = welch(training, theirs)
-        columns[f"CleanRL, {version} (SE)"] = cells("{} ({:+.1f})", spell(theirs), errors)
+        columns[f"CleanRL, {release} (SE)"] = cells("{} ({:+.1f})", spell(theirs), errors)
         for name, se, value in zip(training.index, errors, p, strict=True):
-            apart.append((value, f"{se:+.1f} on {name} ({version}, p = {value:.2g})"))
-    ppo = paper_baselines(paper).loc["PPO"]
-    errors, p = welch(cleanrl(CLEANRL_PPO["v2"]), ppo)
+            apart.append((value, f"{se:+.1f} on {name} ({release}, p = {value:.2g})"))
+    errors, p = welch(releases.loc["v2"], paper_baselines(paper).loc["PPO"])
     return {
         "table": markdown(columns),
         "v2_to_paper": pd.DataFrame({"se": errors, "p": p}).to_dict("index"),
@@ -333,7 +300,7 @@ def page():
 
 def draw():
     """Draw the learning curves without noise, a panel an environment, with published end points."""
-    paper = paper_baselines(read_paper(RESULTS / "paper"))
+    paper, cleanrls = paper_baselines(read_paper(RESULTS / "paper")), newest_of_cleanrl()
     runs = read_baselines().query("version == 'v5'")
     fig, axes = plt.subplots(2, 3, figsize=(10, 6), layout="constrained")
     panels = dict(zip(ENVIRONMENTS, axes.flat, strict=False))
@@ -341,10 +308,9 @@ def draw():
         for place, (algorithm, color) in enumerate(COLORS.items()):
             mean, std, _ = paper.loc[algorithm, environment]
             ax.errorbar(1.04 + 0.025 * place, mean, std, fmt="o", color=color, markersize=4)
-            for returns in CLEANRL[algorithm].values():
-                if environment in returns:
-                    mean, std, _ = cleanrl(returns).loc[environment]
-                    ax.errorbar(1.14 + 0.025 * place, mean, std, fmt="x", color=color, markersize=5)
+            if (algorithm, environment) in cleanrls.index:
+                mean, std, _ = cleanrls.loc[(algorithm, environment), VALUES]
+                ax.errorbar(1.14 + 0.025 * place, mean, std, fmt="x", color=color, markersize=5)
         ax.set_title(environment)
         ax.set_xlabel("training steps (millions)")
     for (algorithm, total, environment, _), group in groups(runs):

@@ -62,11 +62,19 @@ def test_what_is_published():
     assert baselines.published(PAPER, "TD3", "HalfCheetah", 200_000) == (None, None, None)
 
 
-def test_cleanrls_deviations_are_those_of_a_population():
+def test_cleanrls_deviations_are_those_of_a_population(tmp_path):
     """Three seeds: their sample standard deviation is sqrt(3/2) times what CleanRL prints."""
     returns = np.array([1.0, 2, 6])
-    printed = {"Hopper": (returns.mean(), returns.std())}
-    assert baselines.cleanrl(printed).loc["Hopper"].tolist() == [3, returns.std(ddof=1), 3]
+    path = tmp_path / "cleanrl.csv"
+    path.write_text(f"mean,population_std\n{returns.mean()},{returns.std()}\n")
+    [row] = baselines.read_cleanrl(path)[["mean", "std", "n"]].to_numpy()
+    assert row == pytest.approx([3, returns.std(ddof=1), 3])
+
+
+def test_the_newest_of_cleanrl():
+    newest = baselines.newest_of_cleanrl()
+    assert newest.loc[("PPO", "Hopper"), ["release", "mean"]].tolist() == ["v4, newer", 2382.86]
+    assert newest.loc[("SAC", "Hopper"), ["version", "mean"]].tolist() == ["v2", 2310.46]
 
 
 def test_fewer_than_three_seeds_are_named_and_not_compared():
