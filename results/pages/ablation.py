@@ -11,6 +11,7 @@ import pandas as pd
 from common import DATA, ENVIRONMENTS, RESULTS, markdown, plain, read_returns, render
 from scipy import stats
 
+from analysis.effects import PALETTE
 from analysis.paper import read_paper
 from analysis.statistics import MIN_SEEDS, holm, improvement_percent
 from noisy_wrappers import canonical_noises
@@ -115,7 +116,7 @@ def draw(runs):
             bars |= {f"{beta:g}": here.get_group(noise) for beta, noise in noises.items()}
             heights = [returns.mean() for returns in bars.values()]
             errors = [returns.std(ddof=1) for returns in bars.values()]
-            colors = ["grey"] + ["C0"] * len(noises)
+            colors = ["grey"] + [PALETTE[0]] * len(noises)
             ax.bar(list(bars), heights, yerr=errors, color=colors)
             ax.set_title(environment)
             ax.set_xlabel("\u03b2")

@@ -29,6 +29,7 @@ from common import (
     welch_interval,
 )
 
+from analysis.effects import PALETTE
 from analysis.paper import PAPER_SEEDS, read_paper
 from analysis.runs import KEYS, read_runs
 from analysis.statistics import MIN_SEEDS, holm
@@ -38,7 +39,7 @@ plt.rcParams["svg.hashsalt"] = "noisy"  # equal figures are equal files
 CLEANRL_CSV = Path(__file__).with_name("cleanrl.csv")  # training returns in its documentation
 CLEANRL_SEEDS = 3
 FULL_LENGTH, SHORT_LENGTH = 1_000_000, 200_000
-COLORS = {"PPO": "C0", "SAC": "C1", "TD3": "C2"}
+COLORS = dict(zip(("PPO", "SAC", "TD3"), PALETTE, strict=True))
 VALUES = ["mean", "std", "n"]
 
 

@@ -13,6 +13,7 @@ from scipy import stats
 
 RESULTS = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(RESULTS.parent))
+from analysis.effects import PALETTE  # noqa: E402
 from analysis.runs import read_runs  # noqa: E402
 
 runs = read_runs(RESULTS / "data/precision")
@@ -25,7 +26,7 @@ fig, axes = plt.subplots(
 for ax, (algorithm, group) in zip(axes[0], algorithms, strict=True):
     steps = group["steps"].iloc[0]
     curves = {name: np.stack(list(same)) for name, same in group.groupby("precision")["returns"]}
-    for name, line, color in (("bf16", "--", "C1"), ("medium", "-", "black")):
+    for name, line, color in (("bf16", "--", PALETTE[1]), ("medium", "-", "black")):
         mean, std = curves[name].mean(0), curves[name].std(0, ddof=1)
         ax.plot(steps / 1e3, mean, line, color=color, label=f"{name} (n = {len(curves[name])})")
         ax.fill_between(steps / 1e3, mean - std, mean + std, color=color, alpha=0.15, linewidth=0)

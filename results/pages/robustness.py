@@ -25,6 +25,7 @@ from common import (
 )
 from helpful import FAR_ABOVE
 
+from analysis.effects import PALETTE
 from analysis.figures import STYLE
 from analysis.robustness import (
     CONDITION,
@@ -44,7 +45,7 @@ SHORT = {
     "RandomNormalNoisyAction(0.3)": "action noise",
     "RandomDropoutObservation(0.9)": "dropout",
 }
-COLORS = {"no noise": "black", "observation noise": "C0", "action noise": "C1"}
+COLORS = {"no noise": "black", "observation noise": PALETTE[0], "action noise": PALETTE[1]}
 
 
 def scores(found, counts):
