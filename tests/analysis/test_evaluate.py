@@ -5,13 +5,13 @@ import json
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import time
 import zlib
 from pathlib import Path
 
+import commands
 import gymnasium as gym
 import imageio.v3 as imageio
 import numpy as np
@@ -213,19 +213,19 @@ def test_another_seed_plays_everything_and_stores_nothing(runs, capsys):
 def test_a_kill_leaves_whole_conditions_and_the_same_command_goes_on(runs):
     run_dir = one(runs, "PPO")
     options = ["--noise", OBSERVATION, ACTION, "--noise-rate", "0.3", "0.6", "--episodes", "30"]
-    process = subprocess.Popen(**command(run_dir, *options))
+    process = commands.start(evaluate.__file__, [run_dir, *options])
     while not (run_dir / "robustness.csv").exists():
-        assert process.poll() is None
+        assert process.is_alive()
         time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    process.kill()
+    commands.ended(process)
     rows = stored(run_dir)
     assert [int(row["episode"]) for row in rows] == [*range(30)] * (len(rows) // 30)
-    result = run(run_dir, one(runs, "SAC"), *options, "--jobs", "2")
-    assert (result.returncode, result.stderr) == (0, "")
+    again = Args((run_dir,), (OBSERVATION, ACTION), (0.3, 0.6), episodes=30)
+    main(again)
     before = (run_dir / "robustness.csv").read_bytes()
     (run_dir / "robustness.csv").unlink()
-    main(Args((run_dir,), (OBSERVATION, ACTION), (0.3, 0.6), episodes=30))
+    main(again)
     assert (run_dir / "robustness.csv").read_bytes() == before
 
 
@@ -238,11 +238,10 @@ def test_two_processes_on_one_run_lose_nothing(runs):
     processes = []
     for noise, episodes in zip(noises, ("1", "2"), strict=True):
         options = ["--noise", noise, "--noise-rate", *rates, "--episodes", episodes]
-        line = command(run_dir, *options)
-        processes.append(subprocess.Popen(**line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT))
+        processes.append(commands.start(evaluate.__file__, [run_dir, *options]))
     for process in processes:
-        output, _ = process.communicate(timeout=100)
-        assert process.returncode == 0, output
+        result = commands.ended(process)
+        assert (result.code, result.err) == (0, "")
     found = sorted((row["noise"], row["noise_rate"], row["episode"]) for row in stored(run_dir))
     expected = [("", "0.0", "0"), ("", "0.0", "1")]  # the longer one
     expected += [(noises[0], str(float(rate)), "0") for rate in rates]
@@ -342,15 +341,16 @@ def test_trainings_with_other_settings_are_other_rows_of_the_table(runs, capsys)
     ]
 
 
+@pytest.mark.slow
 def test_all_of_a_folder_with_logs_and_an_analysis(runs, capsys):
     (runs / "logs").mkdir()
     (runs / "results").mkdir()
     (runs / "results" / "report.html").touch()
     (runs / "choice.csv").touch()
     options = ["--noise", OBSERVATION, "--noise-rate", "0.5", "1.0", "--episodes", "3"]
-    result = run(*sorted(runs.iterdir()), *options)
-    assert (result.returncode, result.stderr) == (0, "")
-    table = [re.split(r" {2,}", line) for line in result.stdout.splitlines()]
+    result = commands.run(evaluate.__file__, [*sorted(runs.iterdir()), *options])
+    assert (result.code, result.err) == (0, "")
+    table = [re.split(r" {2,}", line) for line in result.out.splitlines()]
     assert [row[1:5] for row in table[4:]] == [
         ["PPO", "no noise", "0.00", "2"],
         ["TD3", "no noise", "0.00", "1"],
@@ -366,7 +366,7 @@ def test_all_of_a_folder_with_logs_and_an_analysis(runs, capsys):
     assert table[4][6] == f"{np.mean(means):.1f} ± {np.std(means, ddof=1):.1f}"
     before = files(runs)
     main(Args((runs,), (OBSERVATION,), (0.5, 1.0), episodes=3))  # the folder stands for its runs
-    assert capsys.readouterr().out == result.stdout
+    assert capsys.readouterr().out == result.out
     assert files(runs) == before
 
 
@@ -442,20 +442,12 @@ def register(tmp_path, name, code):
 
 
 @pytest.mark.slow
-def test_how_to_draw_is_settled_before_environments_are_imported(runs, tmp_path):
-    """As dm_control does, this one reads MUJOCO_GL when it is imported."""
-    register(tmp_path, "early", "import os\nos.environ['MUJOCO_GL']\n")
-    run_dir = one(runs, "PPO")
-    other_environment(run_dir, "early:Mine-v0")
-    result = run(run_dir, "--video", tmp_path / "videos", cwd=tmp_path)
-    assert (result.returncode, result.stderr) == (0, "")
-    assert len(list((tmp_path / "videos").iterdir())) == 1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_a_run_that_cannot_be_drawn_is_skipped_and_named(runs, tmp_path, jobs):
+def test_a_run_that_cannot_be_drawn_is_skipped_and_named(runs, tmp_path):
+    """As dm_control does, its environment reads how to draw when it is imported."""
     code = """
+import os
+os.environ["MUJOCO_GL"]
+
 class Blind(gym.Wrapper):
     frames = 0
 
@@ -471,7 +463,7 @@ gym.register("Blind-v0", lambda **given: Blind(gym.make("InvertedPendulum-v5", *
     first, second = sorted(runs.glob("*ppo_continuous_noisy*"))
     other_environment(first, "blind:Blind-v0")
     videos = tmp_path / "videos"
-    for _ in range(3 - jobs):  # the second time, nothing is left of the first
+    for jobs in (1, 2):  # the second time, nothing is left of the first
         result = run(first, second, "--video", videos, "--jobs", jobs, cwd=tmp_path)
         assert result.returncode == 1
         cause = r"\w+Error: nothing to see \(.*blind.py, line \d+\)"
@@ -482,6 +474,7 @@ gym.register("Blind-v0", lambda **given: Blind(gym.make("InvertedPendulum-v5", *
         assert list(videos.iterdir()) == [videos / f"{second.name}__clean.mp4"]
 
 
+@pytest.mark.slow
 def test_without_an_opengl_library(runs, tmp_path):
     """PyOpenGL is told to load a library that does not exist."""
     run_dir = one(runs, "PPO")
@@ -492,6 +485,7 @@ def test_without_an_opengl_library(runs, tmp_path):
     assert not list(tmp_path.rglob("*.mp4"))
 
 
+@pytest.mark.slow
 def test_a_window_needs_a_display(runs):
     result = run(one(runs, "PPO"), "--render")
     assert (result.returncode, result.stdout) == (2, "")
@@ -591,9 +585,10 @@ def refused(args, message, runs, capsys):
     assert files(runs) == before
 
 
+@pytest.mark.slow
 def test_help_has_a_sentence_for_every_argument():
-    result = run("--help")
-    assert result.returncode == 0
-    assert "python evaluate.py runs --video videos" in result.stdout
+    result = commands.run(evaluate.__file__, ["--help"])
+    assert result.code == 0
+    assert "python evaluate.py runs --video videos" in result.out
     for name in ("--noise-rate", "--episodes", "--seed", "--jobs", "--render", "--video"):
-        assert name in result.stdout
+        assert name in result.out
