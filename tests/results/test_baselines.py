@@ -12,6 +12,8 @@ import ways
 
 from analysis.paper import read_paper
 
+pytestmark = pytest.mark.slow  # they read the committed runs again
+
 RESULTS, DATA = common.RESULTS, common.DATA
 PAPER = read_paper(RESULTS / "paper")
 

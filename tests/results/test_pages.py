@@ -24,10 +24,11 @@ from analysis.paper import read_paper, with_luck
 from analysis.runs import read_runs
 from analysis.statistics import detectable_shift
 
+pytestmark = pytest.mark.slow  # they read the committed runs again
+
 RESULTS, DATA = common.RESULTS, common.DATA
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("script", "path"),
     [
@@ -43,7 +44,6 @@ def test_a_page_is_what_its_command_writes(script, path):
     assert (RESULTS / path).read_text() == script.page()
 
 
-@pytest.mark.slow
 def test_further_tables_are_what_their_command_writes():
     for name, table in further_tables.tables().items():
         written = table.to_csv(index=False, float_format=further_tables.DIGITS)

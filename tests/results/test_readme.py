@@ -7,6 +7,8 @@ import readme
 import verdicts
 from common import RESULTS
 
+pytestmark = pytest.mark.slow  # they read the committed runs again
+
 OTHERS = ["HalfCheetah", "Hopper", "Humanoid", "Walker2d"]
 
 

@@ -14,6 +14,8 @@ import robustness
 import verdicts
 from verdicts import CONFIRMED, CONTRADICTED, NOT_TESTED, UNDECIDED
 
+pytestmark = pytest.mark.slow  # they read the committed runs again
+
 OTHERS = ["HalfCheetah", "Hopper", "Humanoid", "Walker2d"]
 NOISES = [harmful.NORMAL, harmful.MIXUP]
 PAGES = {
