@@ -28,7 +28,7 @@ def broken(label):
 
 def ink_on(value, limit):
     """Return the colour of a number that can be read on its cell of a heatmap."""
-    return "white" if abs(value) > 0.7 * limit else "black"
+    return "white" if value > 0.7 * limit else "black"  # only the blue is dark
 
 
 def of_environments(statistics):

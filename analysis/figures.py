@@ -235,12 +235,11 @@ def heatmap(grid, framed=None, below=0.9):
     lines = max(name.count("\n") for name in rows) + 1
     longest = max(len(line) for name in rows for line in name.split("\n"))
     left = 0.4 + 0.075 * longest
-    height = max(HEIGHT, 0.5 + below + max(0.3, 0.17 * lines) * len(rows))
     wide = min(1.2 * len(columns), WIDTH - left - 1.5)
-    high = min(0.8 * len(rows), height - 0.5 - below)
-    bottom = height - 0.5 - high
+    high = max(0.5, 0.17 * lines) * len(rows)
+    height = 0.5 + high + below
     fig = Figure(figsize=(WIDTH, height))
-    ax = fig.add_axes([left / WIDTH, bottom / height, wide / WIDTH, high / height])
+    ax = fig.add_axes([left / WIDTH, below / height, wide / WIDTH, high / height])
     image = ax.imshow(grid, cmap=DIVERGING, vmin=-limit, vmax=limit, aspect="auto")
     for (i, j), value in np.ndenumerate(grid.to_numpy()):
         if np.isfinite(value):
@@ -251,7 +250,7 @@ def heatmap(grid, framed=None, below=0.9):
             ax.add_patch(box)
     ax.set_xticks(range(len(columns)), columns)
     ax.set_yticks(range(len(rows)), rows)
-    bar = fig.add_axes([(left + wide + 0.2) / WIDTH, bottom / height, 0.15 / WIDTH, high / height])
+    bar = fig.add_axes([(left + wide + 0.2) / WIDTH, below / height, 0.15 / WIDTH, high / height])
     clipped = np.nanmax(np.abs(grid.to_numpy())) > limit
     fig.colorbar(image, cax=bar, extend="both" if clipped else "neither", label="percent")
     return fig, ax, limit

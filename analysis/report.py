@@ -12,6 +12,7 @@ from markupsafe import Markup, escape
 
 from analysis.figures import NARROW
 from analysis.formatting import shown
+from analysis.robustness import robustness_sentences
 from analysis.runs import AVERAGED
 from analysis.verdicts import clear_first, headlines, tally
 
@@ -38,7 +39,10 @@ ROWS = 15  # a longer table is folded
 def breakable(text):
     """Mark where a browser may break a cell: a noise between its words, but never a number."""
     if re.match("-?[0-9]", text):
-        return text.replace(" \u00b1 ", "\u00a0\u00b1\u00a0").replace(", ", ",\u00a0")
+        text = text.replace(" \u00b1 ", "\u00a0\u00b1\u00a0").replace(", ", ",\u00a0")
+        whole = Markup('<span class="whole">{}</span>')  # a browser would break "1e-05"
+        parts = [whole.format(part) if "e-" in part else part for part in text.split(" ")]
+        return Markup(" ").join(parts)
     return Markup(re.sub("(?<=[a-z0-9])(?=[A-Z(])", "<wbr>", str(escape(text))))
 
 
@@ -53,7 +57,7 @@ def sections_of(out, tables, drawn):
     Return the figures of the effects, which are in no section, and a list of dicts.
     """
     sections = {
-        key: {"id": key, "title": title, "tables": [], "figures": [], "folded": []}
+        key: {"id": key, "title": title, "said": [], "tables": [], "figures": [], "folded": []}
         for key, title in SECTIONS.items()
     }
     effects = []
@@ -64,6 +68,9 @@ def sections_of(out, tables, drawn):
             entry = {"name": table.name, "caption": table.caption, "how": table.how}
             entry |= {"columns": text.columns, "rows": text.values.tolist()}
             sections[table.section]["tables"].append(entry)
+    if "robustness_score" in tables:
+        said = robustness_sentences(tables["robustness_score"].frame)
+        sections["robustness"]["said"] = list(said)
     kinds = [name.split("_")[0] for name, _ in drawn]
     for kind, (name, caption) in zip(kinds, drawn, strict=True):
         section = sections.get(FIGURES_OF.get(kind, kind))

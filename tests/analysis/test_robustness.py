@@ -115,7 +115,8 @@ def test_score_and_conditions_by_hand(tmp_path, capsys):
     text = capsys.readouterr().out
     assert f"PPO on Hopper-v5, trained with {PUSH} at rate 1.00: perhaps more robust" in text
     assert f"trained with {SENSOR} at rate 0.20: perhaps less robust" in text
-    assert "Primary figure" in (tmp_path / "results/report.html").read_text()
+    page = (tmp_path / "results/report.html").read_text()
+    assert "Primary figure" in page and "at rate 1.00: perhaps more robust" in page
 
 
 def test_environments_count_equally_and_the_test_is_stratified(tmp_path):
