@@ -229,16 +229,23 @@ def test_a_kill_leaves_whole_conditions_and_the_same_command_goes_on(runs):
     assert (run_dir / "robustness.csv").read_bytes() == before
 
 
+def wait(*args):
+    time.sleep(0.02)
+
+
 @pytest.mark.slow
 def test_two_processes_on_one_run_lose_nothing(runs):
-    """Both find nothing stored; then each stores the clean condition and a noise at 20 rates."""
+    """Both find nothing stored; then each stores the clean condition and a noise at 20 rates.
+
+    They wait between reading what the other has stored and writing it.
+    """
     run_dir = one(runs, "PPO")
     rates = [str(i / 20) for i in range(1, 21)]
     noises = ("RandomNormalNoisyReward(1.0)", "RandomUniformNoisyReward(0.0, 1.0)")
-    processes = []
+    slow, processes = ("os.fsync", None, wait), []
     for noise, episodes in zip(noises, ("1", "2"), strict=True):
         options = ["--noise", noise, "--noise-rate", *rates, "--episodes", episodes]
-        processes.append(commands.start(evaluate.__file__, [run_dir, *options]))
+        processes.append(commands.start(evaluate.__file__, [run_dir, *options], slow))
     for process in processes:
         result = commands.ended(process)
         assert (result.code, result.err) == (0, "")
@@ -388,9 +395,16 @@ def test_a_folder_stands_for_its_finished_runs(runs, capsys):
 @pytest.mark.slow
 def test_an_environment_of_the_folder_that_it_is_called_from(runs, tmp_path):
     run_dir = one(runs, "PPO")
-    limited = "gymnasium.envs.mujoco.inverted_pendulum_v5:InvertedPendulumEnv"
-    text = f"import gymnasium as gym\ngym.register('Mine-v0', '{limited}', max_episode_steps=3)\n"
-    (tmp_path / "my_envs.py").write_text(text)
+    (tmp_path / "my_envs.py").write_text(
+        "import gymnasium\n"
+        "from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv\n\n\n"
+        "class Mine(InvertedPendulumEnv):\n"
+        "    def reset(self, **kwargs):\n"
+        "        import my_physics  # only now\n\n"
+        "        return super().reset(**kwargs)\n\n\n"
+        "gymnasium.register('Mine-v0', Mine, max_episode_steps=3)\n"
+    )
+    (tmp_path / "my_physics.py").touch()
     other_environment(run_dir, "my_envs:Mine-v0")
     result = run(run_dir, "--episodes", "2", "--jobs", "2", cwd=tmp_path)
     assert (result.returncode, result.stderr) == (0, "")
