@@ -28,6 +28,7 @@ from common import (
     welch,
     welch_interval,
 )
+from side_by_side import side_by_side
 
 from analysis.effects import PALETTE
 from analysis.paper import PAPER_SEEDS, read_paper
@@ -281,6 +282,7 @@ def numbers():
         "full": full,
         "short": short,
         "far": far_from_both(full["numbers"]),
+        "side": side_by_side(),
         "holm": corrected(full["numbers"]),
         "too_few": too_few(runs),
         "share": share.to_dict(),

@@ -8,6 +8,7 @@ import common
 import numpy as np
 import pandas as pd
 import pytest
+import side_by_side
 import ways
 
 from analysis.paper import read_paper
@@ -171,3 +172,16 @@ def test_ways_by_hand():
     row = cells(found["table"])["training, mean"]
     assert row[:2] == ["1,470 (+0.0)", "1,806 (+0.0)"] and row[4] == "+90 %"
     assert baselines.judge_ways(tests[tests["seed"] < 3], PAPER) is None
+
+
+def test_side_by_side_sees_a_difference_where_there_is_one(tmp_path):
+    folder = shutil.copytree(DATA / "side_by_side", tmp_path / "runs")
+    found = side_by_side.side_by_side(folder)
+    cleanrl = pd.read_csv(folder / "cleanrl.csv")
+    assert set(cleanrl.groupby("seed").size()) == {100}
+    assert found["n"] == cleanrl["seed"].nunique() == len(list(folder.glob("*/result.json")))
+    spread = cleanrl.groupby("seed")["episodic_return"].mean().std()
+    cleanrl["episodic_return"] -= 10 * max(spread, 100)
+    cleanrl.to_csv(folder / "cleanrl.csv", index=False)
+    shifted = side_by_side.side_by_side(folder)
+    assert shifted["differs"] and shifted["difference"] > found["difference"]
