@@ -91,7 +91,7 @@ def verdicts_in_short(verdicts, tables):
     first, rest = clear_first(verdicts, SENTENCES)
     yield from first["sentence"]
     if len(first) and len(rest):
-        yield f"The report also has {tally(rest['verdict'])}."
+        yield f"Not shown here, but in the report: {tally(rest['verdict'])}."
     if "robustness_score" in tables:
         yield from robustness_sentences(tables["robustness_score"].frame)
 

@@ -11,6 +11,7 @@ from analysis.configurations import rate_order
 from analysis.verdicts import seeds_of
 
 WIDTH = 10  # inches of most figures
+WIDTHS = (5.2, 8, WIDTH, 12, 12)  # with one to five panels in a row
 NARROW_WIDTH = 4.2  # inches of those for a telephone
 # Colour-blind readers tell these apart (Okabe and Ito, 2008); report.html.jinja has them, too.
 BETTER, WORSE, UNCLEAR = "#0072B2", "#D55E00", "#8C8C8C"
@@ -85,7 +86,7 @@ def effects_figure(statistics, narrow=False):
         lines = [re.sub(r"(?<=\w)\((?=.{10})", "\n(", line) for line in lines]
     across = 1 if narrow else min(ACROSS, len(environments))
     down = -(-len(environments) // across)
-    width = NARROW_WIDTH if narrow else (5.2, 8, WIDTH, 12, 12)[across - 1]
+    width = NARROW_WIDTH if narrow else WIDTHS[across - 1]
     high = (0.18 if narrow else 0.22) * len("\n".join(lines).split("\n"))
     fig = Figure(figsize=(width, 0.6 + down * (0.7 + high)), layout="constrained")
     axes = fig.subplots(down, across, sharex=True, sharey=True, squeeze=False).ravel()

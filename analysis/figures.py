@@ -15,6 +15,7 @@ from analysis.effects import (
     NARROW_WIDTH,
     UNCLEAR,
     WIDTH,
+    WIDTHS,
     broken,
     cut_at,
     effects_caption,
@@ -29,7 +30,7 @@ STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
 STYLE["svg.hashsalt"] = "noisy"  # equal figures are equal files
 STYLE["axes.titley"] = 1.0  # above the axes, without a search for labels that are in the way
 matplotlib.rcParams.update(STYLE)
-HEIGHT = 5.5  # inches of every figure; one with many rows is higher
+HEIGHT = 3.6  # inches, at least
 NARROW = "_narrow"  # ends the names of figures for narrow windows
 viridis = matplotlib.colormaps["viridis"]  # ordered by lightness, so it reads in grey
 
@@ -74,12 +75,13 @@ def span(numbers):
     return f"{low}" if low == high else f"{low} to {high}"
 
 
-def panels(environments, labels, width=WIDTH):
+def panels(environments, labels, narrow=False):
     """Make one panel per environment, three in a row, above a legend with as many labels.
 
-    A figure of less than half the usual width has one panel in a row.
+    A narrow figure, for a telephone, has one panel in a row.
     """
-    across = 1 if width < WIDTH / 2 else min(3, len(environments))
+    across = 1 if narrow else min(3, len(environments))
+    width = NARROW_WIDTH if narrow else WIDTHS[across - 1]
     down = -(-len(environments) // across)
     columns = max(1, min(4, int(13 * width / max(map(len, labels)))))
     legend = 0.2 + 0.2 * -(-len(labels) // columns)
@@ -118,7 +120,7 @@ def best_curves_figure(study, best, statistics, narrow=False):
     """Draw no noise against the best noise of each environment: means and standard deviations."""
     labels = ["no noise", "best noise, in the colour of its verdict"]
     environments = list(best["environment"])
-    fig, axes, _ = panels(environments, labels, NARROW_WIDTH if narrow else WIDTH)
+    fig, axes, _ = panels(environments, labels, narrow)
     # Three lines of title above each panel
     fig.subplots_adjust(top=1 - 0.6 / fig.get_figheight(), hspace=0.75)
     unit, word = time_unit(study)

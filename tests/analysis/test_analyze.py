@@ -980,10 +980,12 @@ def test_markdown_and_latex_tables(sweep):
     assert "%" not in body and "_" not in body and latex.isascii()
 
 
-def test_learning_curves_are_of_one_size(sweep):
-    figures = sorted((sweep.path / "results").glob("*curves*[!w].svg"))  # no narrow one
-    sizes = {re.search(r'width="([^"]*)" height="([^"]*)"', f.read_text())[0] for f in figures}
-    assert len(figures) == 3 and sizes == {'width="720pt" height="396pt"'}
+@pytest.mark.parametrize("number, width", [(1, 5.2), (2, 8), (3, 10), (5, 10)])
+def test_a_figure_is_as_wide_as_its_panels_need(number, width):
+    figure, axes, _ = analysis.figures.panels(list("ABCDE"[:number]), ["no noise"])
+    assert figure.get_figwidth() == width and len(axes) == number
+    figure, _, _ = analysis.figures.panels(list("ABCDE"[:number]), ["no noise"], narrow=True)
+    assert figure.get_figwidth() == 4.2
 
 
 # ------------------------------------------------------------------------------------ command line
