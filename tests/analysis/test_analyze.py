@@ -544,6 +544,7 @@ def test_shuffling_the_run_folders_changes_nothing(sweep, tmp_path):
         assert path.read_bytes() == (tmp_path / "results" / path.name).read_bytes(), path.name
 
 
+@pytest.mark.slow
 def test_a_second_analysis_gives_the_same_bytes(sweep):
     command = [sys.executable, analyze.__file__, "--runs-dir", "runs", "--out", "again"]
     env = os.environ | {"PYTHONHASHSEED": "7"}
@@ -1126,6 +1127,7 @@ def test_one_baseline_run_is_enough_for_a_report(tmp_path, capsys):
     assert "Finished runs: 1." in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_committed_tables_are_those_of_the_committed_runs(committed):
     names = sorted(path.name for path in committed.glob("*.csv"))
     assert len(names) > 10

@@ -71,6 +71,7 @@ def in_browser(page, script, width, tmp_path):
     return json.loads(unescape(re.search(r'<pre id="answer">(.*?)</pre>', dom, re.DOTALL)[1]))
 
 
+@pytest.mark.slow
 def test_report_sorts_in_a_browser(results, tmp_path):
     script = """
         const table = document.getElementById("table-summary_SAC");
@@ -108,6 +109,7 @@ FIRST_SCREEN = """
       Boolean(images[0].compareDocumentPosition(sentence) & Node.DOCUMENT_POSITION_FOLLOWING)];"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [420, 1280])
 def test_a_picture_comes_first_and_only_tables_scroll(width, results, tmp_path):
     answer = in_browser(results / "report.html", FIRST_SCREEN, width, tmp_path)

@@ -37,6 +37,7 @@ def tested(tmp_path):
     return folder, pd.read_csv(folder / "tests.csv")
 
 
+@pytest.mark.slow
 def test_training_does_not_notice_the_tests(tested, tmp_path):
     folder, _ = tested
     noise = {"noise": ("RandomNormalNoisyReward(0.5)",), "noise_rate": (0.5,)}

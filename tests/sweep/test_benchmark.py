@@ -244,6 +244,7 @@ def engine(request, stub):
     return ["--executor", request.param, "--jobs", "2"], stub
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", [ENGINES[0], SSH, ENGINES[2]], indirect=True)
 def test_a_failing_and_a_killed_run(engine, tmp_path):
     executor, env = engine
@@ -278,6 +279,7 @@ def test_a_failing_and_a_killed_run(engine, tmp_path):
     assert logs == {folder: log_of(folder).read_text() for folder in logs}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", [*ENGINES, SSH], indirect=True)
 def test_ctrl_c(engine, tmp_path):
     executor, env = engine

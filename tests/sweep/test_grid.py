@@ -347,9 +347,10 @@ def test_the_grid_reads_options_as_the_scripts_do(algorithm):
         ("demo -- --exp-name my_ppo", "--exp-name is part of the grid: use --runs-dir, before"),
         ("best --algos sac -- --nope", "sac_continuous_noisy.py has no option --nope"),
         ("best --algos sac ppo -- --tau 0.1", "ppo_continuous_noisy.py has no option --tau"),
-        (
+        pytest.param(
             "best --algos sac -- --tau abc",
             "sac_continuous_noisy.py: Error parsing --tau: could not",
+            marks=pytest.mark.slow,  # it starts the script
         ),
     ],
 )

@@ -62,6 +62,7 @@ def test_monitor_records_true_returns_and_evaluation_ends():
     assert all(-50 * 16.3 < value < 0 for value in returns)  # noise of 100 would leave this range
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vector", [DummyVecEnv, SubprocVecEnv])
 def test_progress_reaches_the_environments_of_a_vec_env(vector):
     env = VecNormalize(vector([noisy_pendulum, noisy_pendulum]))
