@@ -15,7 +15,7 @@ demo: $(BIN)/.run
 	@echo "The curves in TensorBoard: .venv/bin/tensorboard --logdir runs/demo"
 
 test: $(BIN)/.dev
-	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal
+	$(BIN)/python -m pytest --numprocesses 3 --dist worksteal
 
 lint: $(BIN)/.dev
 	$(BIN)/ruff check .

@@ -4,6 +4,8 @@ README.md.jinja has the text. paper_tables.py, helpful.py, harmful.py and robust
 numbers, and verdicts.py makes the verdicts from them.
 """
 
+from functools import cache
+
 import ablation
 import headline
 import verdicts
@@ -41,6 +43,7 @@ from analysis.runs import make_studies, read_runs
 from analysis.tables import make_tables
 
 
+@cache  # reading the committed runs takes seconds
 def numbers():
     """Compute all that the page says."""
     paper, luck = with_luck(read_paper(RESULTS / "paper"))
