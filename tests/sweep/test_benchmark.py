@@ -454,7 +454,7 @@ def undisturbed(tmp_path_factory):
 @pytest.mark.parametrize("engine", ["local", "parallel", "slurm"], indirect=True)
 def test_choose_survives_being_killed(engine, tmp_path, undisturbed):
     executor, env = engine
-    command = [*CHOOSE, "--total-timesteps", "20000", "--runs-dir", tmp_path, *executor]
+    command = [*CHOOSE, "--total-timesteps", "8000", "--runs-dir", tmp_path, *executor]
     dice = random.Random(1)
 
     def begun():
