@@ -33,7 +33,6 @@ from analysis.runs import left_out, make_studies, read_choice, read_runs
 from analysis.tables import family_notes, make_tables, table_of
 from analysis.verdicts import clear_first, headlines, sentences, tally
 
-SENTENCES = 10  # of clear verdicts, before a terminal points to the report
 # Columns that a terminal may have room for, the most important ones first
 BEST_IN_SHORT = ["algorithm, environment", "noise", "noise_rate", *ENDS, "p_adjusted", "n"]
 BEST_IN_SHORT += ["luck_95_percent", "p_luck_of_best", "baseline_mean", "baseline_std"]
@@ -88,7 +87,7 @@ def verdicts_in_short(verdicts, tables):
     for line in lines:
         counts = ", ".join(f"{count} {word}" for word, count in line["counts"])
         yield f"{line['name']}: {line['tried']}: {counts}. {line['luck']}".strip()
-    first, rest = clear_first(verdicts, SENTENCES)
+    first, rest = clear_first(verdicts)
     yield from first["sentence"]
     if len(first) and len(rest):
         yield f"Not shown here, but in the report: {tally(rest['verdict'])}."

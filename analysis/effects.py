@@ -20,6 +20,7 @@ COLORS = {"better": BETTER, "worse": WORSE}  # of verdicts; all others are grey
 DIVERGING = LinearSegmentedColormap.from_list("effects", [WORSE, "white", BETTER])
 FOREST_ROWS = 25  # configurations of a forest plot; more of them are a heatmap
 ACROSS = 5  # panels of effects side by side
+ENDS = ["improvement_iqm_percent", "improvement_low", "improvement_high"]
 
 
 def broken(label):
@@ -36,9 +37,6 @@ def of_environments(statistics):
     """Keep the rows of single environments that have an improvement."""
     known = statistics["improvement_iqm_percent"].notna() & statistics["p"].notna()
     return statistics[known & (statistics["scope"] == "environment")]
-
-
-ENDS = ["improvement_iqm_percent", "improvement_low", "improvement_high"]
 
 
 def cut_at(values):

@@ -32,7 +32,6 @@ SECTIONS = {
 }
 FIGURES_OF = {"best": "early_performance", "curves": "early_performance"}
 FOLDED = ("curves", "parameters")  # where there are several: one for each noise
-SENTENCES = 10  # of clear verdicts, before the others are folded
 ROWS = 15  # a longer table is folded
 
 
@@ -93,7 +92,7 @@ def write_report(out, verdicts, tables, drawn, overview, problems, notes):
     )
     pages.filters["breakable"] = breakable
     effects, sections = sections_of(out, tables, drawn)
-    first, rest = clear_first(verdicts, SENTENCES)
+    first, rest = clear_first(verdicts)
     names_of = {}  # text -> the tables that it explains
     for table in (table for section in sections for table in section["tables"] if table["how"]):
         names_of.setdefault(table["how"], []).append(table["name"])

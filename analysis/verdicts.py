@@ -213,7 +213,7 @@ def headlines(statistics, best):
     return lines
 
 
-def clear_first(verdicts, number):
+def clear_first(verdicts, number=10):
     """Split a frame of sentences: the first clear ones, at most `number`, and all others.
 
     What is better comes before what is worse.
