@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 from noisy_wrappers import run_folder  # noqa: E402
 
 EPISODES = 10  # the scripts' default
-STEPS, SECONDS = 2000, 0.02
+STEPS, SECONDS = 4000, 0.04
 STOPPED = []  # the signals that have come
 
 

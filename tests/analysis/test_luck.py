@@ -133,7 +133,7 @@ def test_useless_noise_is_seldom_beyond_luck(n, n_baseline, most, monkeypatch):
     Five runs resampled from only twenty are a little less spread than five new ones: 7 %.
     """
     monkeypatch.setattr(analysis.luck, "DRAWS", 1000)
-    rng, studies, p = np.random.default_rng(n), 600, []
+    rng, studies, p = np.random.default_rng(n), 400, []
     for _ in range(studies):
         seeds = max(n, n_baseline)
         baseline, noisy = np.full((seeds, 1), NAN), np.full((90, seeds, 1), NAN)

@@ -57,10 +57,10 @@ def test_coverage(n):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["percentile", "basic", "BCa"])
-def test_coverage_of_the_alternatives_at_five_seeds_is_lower(method):
-    measured = covered(5, lambda samples: scipys(samples, method))
-    assert measured < 93 < covered(5, ours)
+def test_coverage_of_the_alternatives_at_five_seeds_is_lower():
+    for method in ("percentile", "basic", "BCa"):
+        assert covered(5, lambda samples, method=method: scipys(samples, method)) < 93
+    assert covered(5, ours) > 93
 
 
 @pytest.mark.slow
@@ -87,7 +87,7 @@ def test_coverage_of_the_improvement_over_environments():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*DISTRIBUTIONS, *MIXTURES])
+@pytest.mark.parametrize("name", ["skewed", "40 % low, narrow"])
 def test_noise_that_does_nothing_improves_nothing(name):
     """The IQM of skewed returns is not their mean; no improvement must come of that."""
     rng, draw, found = np.random.default_rng(0), (DISTRIBUTIONS | MIXTURES)[name], []

@@ -153,10 +153,11 @@ def test_only_whole_seeds_of_the_headline_count(monkeypatch):
 @pytest.mark.slow
 def test_the_sections_appear_with_the_runs(monkeypatch, tmp_path):
     runs = made_up([1, 2, 3], effect=5)
-    monkeypatch.setattr(ablation, "read_ablation", lambda: runs)
     found = (STEPS, curves(7900, 8000, 8100), 2 * curves(9000, 9100, 3000))
-    monkeypatch.setattr(headline, "read_curves", lambda: found)
-    monkeypatch.setattr(readme, "numbers", readme.numbers.__wrapped__)  # of these runs
+    numbers = readme.numbers() | {"headline": headline.numbers(found)}
+    numbers |= {"ablation": ablation.numbers(runs, PAPER)}
+    monkeypatch.setattr(readme, "numbers", lambda: numbers)
+    monkeypatch.setattr(ablation, "read_ablation", lambda: runs)
     page, scale = readme.page(), ablation.page()
     for text in (
         "3 of 10 seeds are complete",

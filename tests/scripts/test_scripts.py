@@ -829,7 +829,8 @@ def test_a_module_beside_the_caller_and_steps_as_1e2(tmp_path):
 @pytest.mark.slow
 def test_a_module_of_the_callers_wins_over_one_of_ours(tmp_path):
     (tmp_path / "analyze.py").write_text("from toy_envs import *\n")
-    options = ["--total-timesteps", "20", "--eval-episodes", "1", "--runs-dir", tmp_path / "runs"]
+    options = ["--total-timesteps", "20", "--eval-episodes", "1", "--no-compile"]
+    options += ["--runs-dir", tmp_path / "runs"]
     result = command("SAC", "--env-id", "analyze:Tiny-v0", *options, cwd=tmp_path)
     assert (result.code, result.err) == (0, "")
     (tmp_path / "tqdm.py").write_text("from toy_envs import *\n")
