@@ -384,7 +384,7 @@ def test_ctrl_c_while_arrays_are_submitted(program, slurm, tmp_path):
     wanted = 2 if program == "sbatch" else 1
     (tmp_path / program).write_text(
         f"#!/bin/sh\necho >>{tmp_path}/calls\n"
-        f"[ $(wc -l <{tmp_path}/calls) -lt {wanted} ] || sleep 100\n"
+        f"[ $(wc -l <{tmp_path}/calls) -lt {wanted} ] || exec sleep 100\n"
         f'exec {shutil.which(program, path=PATH)} "$@"\n'
     )
     (tmp_path / program).chmod(0o755)
