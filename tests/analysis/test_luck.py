@@ -181,7 +181,7 @@ def test_the_captions_say_how_often_p_luck_is_wrong_and_how_often_it_finds_an_ef
         assert f"{powers} %" in analysis.tables.HOW[name]
 
 
-def p_of_the_best(n, gain, draw, studies=300):
+def p_of_the_best(n, gain, draw, studies=200):
     """Percent of studies of 90 configurations, one with a true gain, whose best is beyond luck.
 
     As analyze.py judges its own runs, and as it judges the paper's table.

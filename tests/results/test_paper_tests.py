@@ -1,8 +1,8 @@
 """How the paper tested PPO: the program plays six ways beside training; the verdicts by hand."""
 
+import multiprocessing
 import os
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -134,17 +134,23 @@ def test_bad_input(monkeypatch, capsys):
     assert capsys.readouterr().err == "error: --jobs must be at least 1, not 0\n"
 
 
+def start_program(runs_dir):
+    os.setsid()
+    sys.argv = ["paper_tests.py", "--runs-dir", str(runs_dir)]
+    sys.exit(paper_tests.main())
+
+
 @pytest.mark.slow
 def test_sigterm_ends_the_program_and_its_runs(tmp_path):
-    line = [sys.executable, paper_tests.__file__, "--runs-dir", str(tmp_path), "--jobs", "1"]
-    with open(tmp_path / "out", "w") as out:
-        process = subprocess.Popen(line, stdout=out, start_new_session=True)
+    process = multiprocessing.get_context("fork").Process(target=start_program, args=(tmp_path,))
+    process.start()
     deadline = time.time() + 200
     while not list(tmp_path.glob("*/eval.csv")) and time.time() < deadline:
         time.sleep(0.2)
     assert list(tmp_path.glob("*/eval.csv"))
-    process.send_signal(signal.SIGTERM)
-    assert process.wait(60) == 128 + signal.SIGTERM
+    process.terminate()
+    process.join(60)
+    assert process.exitcode == 128 + signal.SIGTERM
     with pytest.raises(ProcessLookupError):  # nothing of its process group is left
         for _ in range(100):
             os.killpg(process.pid, 0)

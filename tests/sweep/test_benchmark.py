@@ -441,31 +441,32 @@ def play(*command):
             stub_run.train([one.script, *one.arguments])
 
 
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory):
-    """The choice that the sweeps below should make, from run folders made in this process."""
-    folder = tmp_path_factory.mktemp("undisturbed")
-    play(*CHOOSE, "--runs-dir", str(folder))
-    said = verdicts(view("report", *CHOOSE, "--runs-dir", folder).out)  # writes choice.csv
+def undisturbed(folder, *command):
+    """What a choice leaves behind, and says, if its runs are made in this process."""
+    play(*command, "--runs-dir", str(folder))
+    said = verdicts(view("report", *command, "--runs-dir", folder).out)  # writes choice.csv
     return *chosen(folder), said
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["parallel", "slurm"], indirect=True)
-def test_choose_on_other_engines(engine, tmp_path, undisturbed):
+def test_choose_on_other_engines(engine, tmp_path):
     executor, env = engine
-    result = run(*CHOOSE, "--runs-dir", tmp_path, *executor, env=env)
+    command = [*CHOOSE[:-1], "--budget", "2"]  # a batch of 2 runs, and one of 8
+    result = run(*command, "--runs-dir", tmp_path / "runs", *executor, env=env)
     assert result.code == 0, result.out + result.err
-    assert (*chosen(tmp_path), verdicts(result.out)) == undisturbed
+    found = *chosen(tmp_path / "runs"), verdicts(result.out)
+    assert found == undisturbed(tmp_path / "expected", *command) and len(found[1]) == 10
 
 
 @pytest.mark.slow
-def test_choose_survives_being_killed(stub, tmp_path, undisturbed):
-    command = [*CHOOSE, "--total-timesteps", "8000", "--runs-dir", tmp_path, "--jobs", "2"]
+def test_choose_survives_being_killed(stub, tmp_path):
+    runs = tmp_path / "runs"
+    command = [*CHOOSE, "--total-timesteps", "8000", "--runs-dir", runs, "--jobs", "2"]
     dice = random.Random(1)
 
     def begun():
-        return len(list(tmp_path.glob("*/config.json")))
+        return len(list(runs.glob("*/config.json")))
 
     for number in (signal.SIGINT, signal.SIGKILL):
         wanted = begun() + dice.randint(1, 4)
@@ -476,11 +477,11 @@ def test_choose_survives_being_killed(stub, tmp_path, undisturbed):
         assert sweep.returncode == (130 if number == signal.SIGINT else -signal.SIGKILL)
     last = run(*command, env=stub)
     assert last.code == 0, last.out + last.err
-    assert (*chosen(tmp_path), verdicts(last.out)) == undisturbed
-    logs = {path.name: path.read_text() for path in tmp_path.glob("logs/*__*.log")}
+    assert (*chosen(runs), verdicts(last.out)) == undisturbed(tmp_path / "expected", *CHOOSE)
+    logs = {path.name: path.read_text() for path in runs.glob("logs/*__*.log")}
     again = run(*command, env=stub)
     assert again.code == 0 and again.out == last.out and not again.err
-    assert logs == {path.name: path.read_text() for path in tmp_path.glob("logs/*__*.log")}
+    assert logs == {path.name: path.read_text() for path in runs.glob("logs/*__*.log")}
 
 
 @pytest.mark.slow
