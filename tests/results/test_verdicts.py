@@ -398,6 +398,12 @@ SENTENCES = [
         lambda n: of_paper(n, "PPO on Hopper-v4").update(p=0.01),
     ),
     (
+        "baselines.md",
+        "All six ways are excluded",
+        lambda n: set(n["ways"]["verdicts"].values()) == {"excluded"},
+        lambda n: n["ways"]["verdicts"].update({"own_per_test-mean": "not excluded"}),
+    ),
+    (
         "reconstruction.md",
         "So the paper's runs probably had a memory.",
         lambda n: n["mixtures"]["needed"] < -100 and n["mixtures"]["high"] < 0,
