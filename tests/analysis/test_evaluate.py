@@ -392,25 +392,6 @@ def test_a_folder_stands_for_its_finished_runs(runs, capsys):
     assert sum((run_dir / "robustness.csv").exists() for run_dir in runs.glob("*Inv*")) == 3
 
 
-@pytest.mark.slow
-def test_an_environment_of_the_folder_that_it_is_called_from(runs, tmp_path):
-    run_dir = one(runs, "PPO")
-    (tmp_path / "my_envs.py").write_text(
-        "import gymnasium\n"
-        "from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv\n\n\n"
-        "class Mine(InvertedPendulumEnv):\n"
-        "    def reset(self, **kwargs):\n"
-        "        import my_physics  # only now\n\n"
-        "        return super().reset(**kwargs)\n\n\n"
-        "gymnasium.register('Mine-v0', Mine, max_episode_steps=3)\n"
-    )
-    (tmp_path / "my_physics.py").touch()
-    other_environment(run_dir, "my_envs:Mine-v0")
-    result = run(run_dir, "--episodes", "2", "--jobs", "2", cwd=tmp_path)
-    assert (result.returncode, result.stderr) == (0, "")
-    assert [row["episodic_length"] for row in stored(run_dir)] == ["3", "3"]
-
-
 def test_an_environment_that_takes_no_arguments(tmp_path):
     short = {"total_timesteps": 64, "num_steps": 32, "num_minibatches": 2, "compile": False}
     ppo.train(ppo.Args(env_id="toy_envs:Tiny-v0", runs_dir=str(tmp_path), **short))
@@ -457,13 +438,20 @@ def register(tmp_path, name, code):
 
 @pytest.mark.slow
 def test_a_run_that_cannot_be_drawn_is_skipped_and_named(runs, tmp_path):
-    """As dm_control does, its environment reads how to draw when it is imported."""
+    """As dm_control does, its environment reads how to draw when it is imported.
+
+    It lies in the folder of the caller, with another module that it imports late.
+    """
     code = """
 import os
 os.environ["MUJOCO_GL"]
 
 class Blind(gym.Wrapper):
     frames = 0
+
+    def reset(self, **kwargs):
+        import my_physics
+        return self.env.reset(**kwargs)
 
     def render(self):
         self.frames += 1
@@ -474,6 +462,7 @@ class Blind(gym.Wrapper):
 gym.register("Blind-v0", lambda **given: Blind(gym.make("InvertedPendulum-v5", **given)))
 """
     register(tmp_path, "blind", code)
+    (tmp_path / "my_physics.py").touch()
     first, second = sorted(runs.glob("*ppo_continuous_noisy*"))
     other_environment(first, "blind:Blind-v0")
     videos = tmp_path / "videos"
