@@ -352,17 +352,17 @@ def test_events_are_on_the_disk_before_the_checkpoint_is(algorithm, alone, tmp_p
 
 
 @pytest.mark.slow
-def test_killed_by_somebody_else_at_a_random_time_compiled(tmp_path, capsys):
+def test_killed_by_somebody_else_at_a_random_time_compiled(tmp_path):
     """With torch.compile, by kill -9 from outside."""
     # The networks, the batch and the precision of test_compiled_and_plain_updates_agree, so that
     # the compiler finds its own results.
     small = {"env_id": "toy_envs:Tiny-v0", "num_steps": 16, "matmul_precision": "highest"}
     small |= {"total_timesteps": 1000, "eval_frequency": 250, "compile": True}
     words = options("ppo", tmp_path / "killed", **small)
-    for name in ("alone", "killed"):
-        (tmp_path / name).mkdir()
-    assert train("ppo", options("ppo", tmp_path / "alone", **small))
-    if "not compiled" in capsys.readouterr().out:
+    (tmp_path / "killed").mkdir()
+    uninterrupted = run("ppo", options("ppo", tmp_path / "alone", **small))
+    assert (uninterrupted.code, uninterrupted.err) == (0, "")
+    if "not compiled" in uninterrupted.out:
         pytest.skip("no C++ compiler")
     process, step = start("ppo", words), 0
     while step < 200:  # it has learned, and has written checkpoints since
@@ -373,8 +373,9 @@ def test_killed_by_somebody_else_at_a_random_time_compiled(tmp_path, capsys):
     time.sleep(random.uniform(0, 0.2))
     process.kill()
     assert ended(process).code == -signal.SIGKILL
-    assert train("ppo", words)
-    assert "resumed at step" in capsys.readouterr().out
+    result = run("ppo", words)
+    assert (result.code, result.err) == (0, "")
+    assert "resumed at step" in result.out
     assert_finished(folder(tmp_path / "killed"))
     assert not differing(outcome(folder(tmp_path / "killed")), outcome(folder(tmp_path / "alone")))
 
