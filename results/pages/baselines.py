@@ -230,6 +230,11 @@ def read_tests(folder):
     return table[table["seed"].isin(planned.index[there == planned])]
 
 
+def in_words(way):
+    """Return a way of testing as the page names it: statistics, actions."""
+    return way.replace("_", " ").replace("-", ", ")
+
+
 def judge_ways(tests, paper):
     """Judge each way of testing: a table, and {way: verdict}; None without three whole seeds."""
     seeds = sorted(set(tests["seed"]))
@@ -257,7 +262,7 @@ def judge_ways(tests, paper):
             p_none,
             p_paper,
         )
-        row = {"statistics, actions": way.replace("_", " ").replace("-", ", ")}
+        row = {"statistics, actions": in_words(way)}
         row |= {
             f"{name} (SE)": f"{returns[name, False].mean():,.0f} ({found[name][0]:+.1f})"
             for name in found
@@ -265,7 +270,8 @@ def judge_ways(tests, paper):
         row["gain on Walker2d"] = f"{ours:+.0f} %"
         row |= {"p of no gain": f"{p_none:.2g}", "p of the paper's": f"{p_paper:.2g}"}
         rows.append(row | {"the paper's way?": f"**{verdicts[way]}**"})
-    return {"table": markdown(rows), "verdicts": verdicts, "gain": gain}
+    left = [in_words(way) for way in ways.WAYS if verdicts[way] != "excluded"]
+    return {"table": markdown(rows), "verdicts": verdicts, "left": left, "gain": gain}
 
 
 # ----------------------------------------------------------------------------------------- the page
