@@ -6,6 +6,7 @@ import headline
 import numpy as np
 import pandas as pd
 import pytest
+import readme
 from scipy import stats
 
 from analysis.paper import read_paper
@@ -149,16 +150,23 @@ def test_only_whole_seeds_of_the_headline_count(monkeypatch):
         assert headline.read_curves() is None
 
 
-def test_the_page_appears_with_the_runs(monkeypatch, tmp_path):
+@pytest.mark.slow
+def test_the_sections_appear_with_the_runs(monkeypatch, tmp_path):
     runs = made_up([1, 2, 3], effect=5)
+    found = (STEPS, curves(7900, 8000, 8100), 2 * curves(9000, 9100, 3000))
+    numbers = readme.numbers() | {"headline": headline.numbers(found)}
+    numbers |= {"ablation": ablation.numbers(runs, PAPER)}
+    monkeypatch.setattr(readme, "numbers", lambda: numbers)
     monkeypatch.setattr(ablation, "read_ablation", lambda: runs)
-    page = ablation.page()
+    page, scale = readme.page(), ablation.page()
     for text in (
         "3 of 10 seeds are complete",
         "`RandomUniformScaleReward`: p = 0.0002",
         "ablation.svg",
     ):
-        assert text in page
+        assert text in scale
+    assert "1,000,000, 800,000, 800,000" in page and "not complete" not in page
+    assert "3 of 10 seeds" in page and "(#step-variance-and-speed)" in page
     (tmp_path / "figures").mkdir()
     monkeypatch.setattr(ablation, "RESULTS", tmp_path)
     ablation.draw_if_whole()

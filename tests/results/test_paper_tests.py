@@ -5,7 +5,6 @@ import os
 import signal
 import sys
 import time
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -19,7 +18,6 @@ from scipy import stats
 import ppo_continuous_noisy as ppo
 from noisy_wrappers import make_noisy
 
-ROOT = Path(__file__).parents[2]
 SMALL = {"total_timesteps": 60, "num_steps": 12, "num_minibatches": 3, "update_epochs": 2}
 SMALL |= {"env_id": "toy_envs:Tiny-v0", "eval_frequency": 20, "eval_episodes": 3, "compile": False}
 

@@ -38,7 +38,7 @@ def slow(*values):
     return pytest.param(*values, marks=pytest.mark.slow)
 
 
-# TD3 trains in the order of SAC, which is resumed in WHAT A CHECKPOINT HOLDS with each of the three
+# TD3 trains in SAC's order; that each script resumes exactly is tested in WHAT A CHECKPOINT HOLDS
 two_scripts = pytest.mark.parametrize("algorithm", ["sac", "ppo"])
 # Resuming, stopping and what is refused are in THE RUN, which is the same text in the three scripts
 # (test_scripts.py compares them): where the algorithm's own part has no say, one script is enough.

@@ -494,6 +494,8 @@ def test_a_failing_run_stops_its_choice_and_no_other(tmp_path, stub):
     assert '--exclude "RandomDropoutObservation(0.9)@1.0"' in result.out
     assert verdicts(result.out)[-1] == "SAC on Pendulum-v1: all runs are done"
     assert not (tmp_path / "choice.csv").exists()
+    status = view("status", *command)
+    assert status.code == 0 and "1 failed" in status.out
     command += ["--exclude", "RandomDropoutObservation(0.90)@1"]
     play(*map(str, command))
     without = view("report", *command)
