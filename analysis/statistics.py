@@ -6,14 +6,15 @@ NaN marks a run that does not exist. IQM and probability of improvement are thos
 
 from functools import cache, reduce
 from math import ceil, comb, inf, isnan, lcm, nan, pi, prod, sqrt
+from statistics import NormalDist
 
 import numpy as np
-from scipy import stats
-from scipy.optimize import brentq
+import scipy  # scipy.stats, which takes most of a second, is imported when it is first used
 
 LEVEL, POWER = 0.05, 0.8
+normal_quantile = NormalDist().inv_cdf
 # A test at this level finds an effect of so many standard errors with this power.
-DETECTABLE = stats.norm.ppf(1 - LEVEL / 2) + stats.norm.ppf(POWER)
+DETECTABLE = normal_quantile(1 - LEVEL / 2) + normal_quantile(POWER)
 MIN_SEEDS = 3  # with fewer there is no interval
 RESAMPLES = 2000
 PERMUTATIONS = 100_000  # where a null distribution has more than MOST_VALUES
@@ -97,7 +98,7 @@ def bootstrap_iqm(scores, baseline=None, resamples=RESAMPLES):
     if variance == 0:  # all seeds alike
         return value, value, value
     df = variance**2 / (variances**2 / (n - 1)).sum()
-    half = stats.t.ppf(0.975, df) * np.sqrt(variance)
+    half = scipy.stats.t.ppf(0.975, df) * np.sqrt(variance)
     return value, value - half, value + half
 
 
@@ -112,15 +113,15 @@ def newcombe_interval(p, n, m):
     Unlike the percentile bootstrap it does not collapse to a point at p = 0 or 1.
     https://doi.org/10.1002/sim.2324
     """
-    z, k = stats.norm.ppf(0.975), (n + m) / 2 - 1
+    z, k = normal_quantile(0.975), (n + m) / 2 - 1
 
     def gap(t):
         variance = t * (1 - t) * (1 + k * (1 - t) / (2 - t) + k * t / (1 + t)) / (n * m)
         return (p - t) ** 2 - z**2 * variance
 
     inside = np.clip(p, 1e-9, 1 - 1e-9)  # at 0 and 1 the gap is zero without being a limit
-    low = brentq(gap, 0, inside) if p > 0 else 0.0
-    high = brentq(gap, inside, 1) if p < 1 else 1.0
+    low = scipy.optimize.brentq(gap, 0, inside) if p > 0 else 0.0
+    high = scipy.optimize.brentq(gap, inside, 1) if p < 1 else 1.0
     return low, high
 
 
@@ -264,7 +265,7 @@ def satterthwaite(variances, sizes):
     """
     total = np.sum(variances, axis=0)
     freedom = total**2 / np.sum(np.square(variances) / (sizes - 1), axis=0)
-    return np.sqrt(total), np.sqrt(total) * stats.t.ppf(0.975, freedom)
+    return np.sqrt(total), np.sqrt(total) * scipy.stats.t.ppf(0.975, freedom)
 
 
 def holm(p):
@@ -283,7 +284,7 @@ def normal_shift(n, m, level=LEVEL):
     In standard deviations, for normal returns. Noether (1987),
     https://doi.org/10.1080/01621459.1987.10478478.
     """
-    errors = stats.norm.ppf(1 - level / 2) + stats.norm.ppf(POWER)
+    errors = normal_quantile(1 - level / 2) + normal_quantile(POWER)
     return errors * sqrt((1 / n + 1 / m) * pi / 3)
 
 

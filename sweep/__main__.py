@@ -193,7 +193,7 @@ def main(view, caller, argv):
     else:
         check_arguments(args)
         if args.preset == "choose":
-            from sweep import choose  # and with it SciPy: no other preset should wait for that
+            from sweep import choose  # and with it pandas: no other preset should wait for that
 
             choices = choose.choices(args)
             runs = choose.runs_of(choices)

@@ -182,10 +182,14 @@ def wall_time(run):
 
 
 def plan(found):
-    """Return lines that say, before a batch starts, what is due and what all of it will take."""
-    if any(choice.state.due for choice in found):
-        return [*map(describe, found), total(found), reach(found)]
-    return []
+    """Return lines that say, before a batch starts, what is due and what all of it will take.
+
+    Before the first batch, also what gain can be confirmed.
+    """
+    if not any(choice.state.due for choice in found):
+        return []
+    begun = any(choice.returns for choice in found)
+    return [*map(describe, found), total(found), *([] if begun else [reach(found)])]
 
 
 def total(found):

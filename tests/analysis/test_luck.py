@@ -132,7 +132,7 @@ def test_useless_noise_is_seldom_beyond_luck(n, n_baseline, most, monkeypatch):
 
     Five runs resampled from only twenty are a little less spread than five new ones: 7 %.
     """
-    monkeypatch.setattr(analysis.luck, "DRAWS", 1000)
+    monkeypatch.setattr(analysis.luck, "DRAWS", 400)
     rng, studies, p = np.random.default_rng(n), 400, []
     for _ in range(studies):
         seeds = max(n, n_baseline)
@@ -150,7 +150,7 @@ def test_useless_noise_is_seldom_beyond_luck(n, n_baseline, most, monkeypatch):
 @pytest.mark.slow
 def test_useless_noise_in_a_paper_is_beyond_luck_in_five_percent_of_studies(monkeypatch):
     """Only the baseline's standard deviation is known there, from n seeds."""
-    monkeypatch.setattr(analysis.luck, "DRAWS", 1000)
+    monkeypatch.setattr(analysis.luck, "DRAWS", 400)
     n = 5
     rng, studies, p = np.random.default_rng(n), 500, []
     names = ["environment", "baseline_mean", "baseline_std", "improvement_percent"]
@@ -169,7 +169,7 @@ def test_useless_noise_in_a_paper_is_beyond_luck_in_five_percent_of_studies(monk
 def test_the_captions_say_how_often_p_luck_is_wrong_and_how_often_it_finds_an_effect(
     n, monkeypatch
 ):
-    monkeypatch.setattr(analysis.luck, "DRAWS", 1000)
+    monkeypatch.setattr(analysis.luck, "DRAWS", 400)
     own, paper = p_of_the_best(n, 0, simulate_choose.two_peaked)
     assert own == pytest.approx(analysis.luck.FALSE_ALARMS[n], abs=5)
     assert paper == pytest.approx(analysis.luck.FALSE_ALARMS_IN_THE_PAPER[n], abs=6)

@@ -509,11 +509,13 @@ def test_defaults_are_cleanrls(algorithm, defaults):
 @pytest.mark.slow
 @each_script
 def test_compiled_and_plain_updates_agree(algorithm, tmp_path, capsys, monkeypatch):
-    graphs, left_plain, real = [], [], torch.compile
+    # SAC and PPO are compiled to C++; for TD3, whose graphs are much like SAC's, tracing is enough
+    backend = "aot_eager" if algorithm == "TD3" else "inductor"
+    graphs, real = [], torch.compile
 
     def spy(function, **kwargs):
         graphs.append(function.__name__)
-        return function if graphs[-1] in left_plain else real(function, **kwargs)
+        return real(function, backend=backend, **kwargs)
 
     monkeypatch.setattr(torch, "compile", spy)
     short = {} if algorithm == "PPO" else {"total_timesteps": 30}
@@ -534,8 +536,6 @@ def test_compiled_and_plain_updates_agree(algorithm, tmp_path, capsys, monkeypat
 
     if algorithm == "PPO":
         return  # too small for bfloat16 to be an option
-    # One graph in bfloat16 is enough: a compiler needs 10 CPU seconds for each
-    left_plain.append("critic_loss")
     bf16 = {"matmul_precision": "bf16", "compile": algorithm == "TD3"}
     rough = run(algorithm, tmp_path / "bf16", **bf16, **short)
     assert json.loads((rough / "config.json").read_text())["matmul_precision"] == "bf16"

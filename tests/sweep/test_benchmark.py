@@ -519,6 +519,7 @@ def test_a_dry_run_of_choose_prints_the_batch_that_is_due(tmp_path, stub):
     second = run(*command, "--dry-run", env=stub)
     assert [" --seed 2 " in line for line in second.out.splitlines()] == [True, True]
     assert "round 2 of 2: 2 of 3 noises, seeds 1 to 2; runs to do: 2" in second.err
+    assert "4 fresh seeds confirm" in first.err and "fresh seeds confirm" not in second.err
     # The three finished runs say that they have taken 36 seconds each; ten are left.
     assert "3 are done, about 0.1 core-hours are left" in second.err
 
