@@ -581,6 +581,7 @@ class Run:
             # Without an experiment of its own (hparams()[0]), TensorBoard shows all runs' columns
             self.writer.file_writer.add_summary(hparams(columns, {})[1])
         self.saved_step, self.printed, self.last_test = step, time.time(), ""
+        self.first_step, self.first_time = step, time.time()
         total = self.args.total_timesteps
         self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None)  # on terminals
         return step
@@ -634,9 +635,10 @@ class Run:
                 self.writer.add_scalar(tag, value, step)
 
     def _show_progress(self, step):
-        total, sps = self.args.total_timesteps, step / (time.time() - self.start)
         self.bar.update(step - self.bar.n)
-        if self.bar.disable and time.time() - self.printed > 10:
+        taken = step - self.first_step
+        if self.bar.disable and taken and time.time() - self.printed > 10:
+            total, sps = self.args.total_timesteps, taken / (time.time() - self.first_time)
             eta = tqdm.format_interval((total - step) / sps)
             # sweep/__main__.py reads this line
             say(f"step={step}/{total} sps={sps:.0f} {self.last_test}eta={eta}")

@@ -537,6 +537,19 @@ def test_an_unchanged_checkpoint_gives_the_same_run(
     assert not differing(ended, alone(algorithm))
 
 
+@one_script
+def test_the_time_left_is_told_by_the_speed_since_resuming(
+    algorithm, checkpoints, tmp_path, capsys
+):
+    runs_dir, checkpoint = checkpoints(algorithm, LATE)
+    capsys.readouterr()
+    ending(algorithm, runs_dir, checkpoint | {"seconds": 1e6}, tmp_path)
+    [line, *_] = re.findall(r"step=(\d+)/260 sps=(\d+) .*eta=00:0\d\n", capsys.readouterr().out)
+    assert int(line[0]) > checkpoint["step"] and int(line[1]) > 20
+    result = json.loads((folder(tmp_path / "copy") / "result.json").read_text())
+    assert result["wall_time_seconds"] > 1e6  # of all attempts
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "algorithm, field", [(name, field) for name in NEEDED for field in sorted(NEEDED[name])]
