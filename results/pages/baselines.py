@@ -63,11 +63,14 @@ def read_baselines():
     return runs[ours].assign(algorithm=runs["algorithm"].str.split().str[0])
 
 
-def groups(runs):
-    """Yield ((algorithm, total steps, environment, version), its runs), with enough seeds each."""
+def groups(runs, enough=True):
+    """Yield ((algorithm, total steps, environment, version), its runs): those with enough seeds.
+
+    enough=False: those with fewer.
+    """
     for key, group in runs.groupby(["algorithm", "total", "environment", "version"]):
-        if len(group) >= MIN_SEEDS:
-            yield key, group
+        if (len(group) >= MIN_SEEDS) == enough:
+            yield key, group.sort_values("seed")
 
 
 def read_cleanrl(path=CLEANRL_CSV):
@@ -165,14 +168,21 @@ def far_from_both(numbers):
     ]
 
 
-def too_few(runs):
-    """Say which runs are not in the tables, because there are fewer than three seeds of them."""
-    keys = ["algorithm", "total", "environment", "version"]
-    return [
-        f"{algorithm} on {environment}-{version} ({len(group)} of {total:,} steps)"
-        for (algorithm, total, environment, version), group in runs.groupby(keys)
-        if len(group) < MIN_SEEDS
-    ]
+def too_few(runs, paper):
+    """Say what the runs returned that are not in the tables, for want of seeds: a line each."""
+    lines = []
+    for (algorithm, total, environment, version), group in groups(runs, enough=False):
+        theirs, cleanrls, _ = published(paper, algorithm, environment, total)
+        paper_s = "" if theirs is None else f" (the paper: {spell(theirs)[0]})"
+        cleanrl_s = "" if cleanrls is None else f" (CleanRL: {spell(cleanrls)[0]})"
+        test, training = (
+            " and ".join(f"{value:,.0f}" for value in group[name]) for name in ("test", "training")
+        )
+        lines.append(
+            f"{algorithm} on {environment}-{version} after {total:,} steps: test return {test}"
+            f"{paper_s}, training return {training}{cleanrl_s}"
+        )
+    return lines
 
 
 def cleanrls_versions(runs, paper):
@@ -290,7 +300,7 @@ def numbers():
         "far": far_from_both(full["numbers"]),
         "side": side_by_side(),
         "holm": corrected(full["numbers"]),
-        "too_few": too_few(runs),
+        "too_few": too_few(runs, paper),
         "share": share.to_dict(),
         "highest_share": share.drop("Humanoid").max(),
         "cleanrl": cleanrls_versions(runs, paper),
@@ -330,6 +340,11 @@ def draw():
         ax, color = panels[environment], COLORS[algorithm]
         ax.plot(steps, mean, line, color=color)
         ax.fill_between(steps, mean - std, mean + std, color=color, alpha=0.15, linewidth=0)
+    alone = list(groups(runs, enough=False))
+    for (algorithm, total, environment, _), group in alone:
+        for steps, curve in zip(group["steps"], group["returns"], strict=True):
+            line = "-" if total == FULL_LENGTH else ":"
+            panels[environment].plot(steps / 1e6, curve, line, color=COLORS[algorithm], lw=0.7)
     for ax in axes[:, 0]:
         ax.set_ylabel("test return")
     last = axes.flat[-1]
@@ -337,6 +352,8 @@ def draw():
     for algorithm, color in COLORS.items():
         last.plot([], [], color=color, label=algorithm)
     last.plot([], [], ":", color="grey", label="a run of 200,000 steps")
+    if alone:
+        last.plot([], [], color="grey", lw=0.7, label="one seed, where there are fewer than three")
     last.plot([], [], "o", color="grey", markersize=4, label="the paper, v2, test")
     last.plot([], [], "x", color="grey", markersize=5, label="CleanRL, v2 or v4, training")
     last.legend(loc="center", frameon=False)

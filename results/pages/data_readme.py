@@ -40,8 +40,13 @@ def commits_of_the_five():
 def numbers():
     """Compute all that the page says."""
     counts = read_returns(DATA / "runs").groupby("algorithm").size()
+    long = read_returns(DATA / "long").groupby(["algorithm", "environment", "noise"]).size()
     return {
         "runs": ", ".join(f"{name} {n}" for name, n in counts.items()),
+        "long": ", ".join(
+            f"{algorithm} on {environment} {f'with `{noise}`' if noise else 'without noise'} {n}"
+            for (algorithm, environment, noise), n in long.items()
+        ),
         "rate_error": noise_rates(DATA / "runs"),
         "commits": commits_of_the_five(),
         "normal": NORMAL,
