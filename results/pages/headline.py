@@ -20,7 +20,7 @@ LEVEL, POWER = 0.05, 0.8
 def read_curves(folder=DATA / "long"):
     """Return (steps, without noise, with noise), curves (steps x seeds) of the whole seeds.
 
-    A seed is whole when both runs are there. None without three of them.
+    A seed is whole when both runs are there. None without any.
     """
     runs = plain(read_runs(folder)).query(
         "status == 'finished' and algorithm == 'SAC' and environment == 'HalfCheetah'"
@@ -32,7 +32,7 @@ def read_curves(folder=DATA / "long"):
         if (noise, rate) in (("", "0.00"), (NOISE, RATE))
     }
     seeds = sorted(set.intersection(*(set(found.get(n, pd.Series()).index) for n in ("", NOISE))))
-    if len(seeds) < MIN_SEEDS:
+    if not seeds:
         return None
     curves = [np.stack([found[noise][seed] for seed in seeds], axis=1) for noise in ("", NOISE)]
     return runs["steps"].iloc[0], *curves
@@ -55,13 +55,14 @@ def smallest_shown(x, y):
 
 
 def numbers(curves):
-    """Compute steps and final returns from the result of read_curves; None where that is None.
+    """Compute steps and final returns from the result of read_curves.
 
     The target is the baseline's final mean. A run that never reaches it counts with all of its
-    steps, so the mean with noise is a lower limit then.
+    steps, so the mean with noise is a lower limit then. "p" is None without three seeds.
     """
+    undecided = {"p": None, "verdict": "not tested"}
     if curves is None:
-        return None
+        return undecided | {"n": 0}
     steps, without, noisy = curves
     target = without[-1].mean()
     reached = {}
@@ -72,24 +73,24 @@ def numbers(curves):
             "never": int(np.isnan(first).sum()),
             "runs": np.where(np.isnan(first), steps[-1], first),
         }
-    x, y = reached["noisy"]["runs"], reached["without"]["runs"]
-    final = stats.ttest_ind(noisy[-1], without[-1], equal_var=False)
-    low, high = final.confidence_interval(0.95)
-    p_steps = stats.ttest_ind(x, y, equal_var=False).pvalue
     rows = [
         {
             "": name,
-            "final return": f"{returns[-1].mean():,.0f} ± {returns[-1].std(ddof=1):,.0f}",
+            "final return": spell_returns(returns[-1]),
             "the mean is there after": spell_steps(reached[key]["mean_curve"]),
             "each run": ", ".join(f"{value:,.0f}" for value in reached[key]["runs"]),
             "never": reached[key]["never"],
         }
         for name, key, returns in (("no noise", "without", without), ("noise", "noisy", noisy))
     ]
-    return {
-        "n": without.shape[1],
-        "table": markdown(rows),
-        "target": target,
+    found = {"n": without.shape[1], "table": markdown(rows), "target": target}
+    if found["n"] < MIN_SEEDS:
+        return found | undecided
+    x, y = reached["noisy"]["runs"], reached["without"]["runs"]
+    final = stats.ttest_ind(noisy[-1], without[-1], equal_var=False)
+    low, high = final.confidence_interval(0.95)
+    p_steps = stats.ttest_ind(x, y, equal_var=False).pvalue
+    return found | {
         "difference": noisy[-1].mean() - target,
         "low": low,
         "high": high,
@@ -99,6 +100,12 @@ def numbers(curves):
         "steps_shown": smallest_shown(x, y),
         "verdict": verdict(reached["noisy"]["mean_curve"], x.mean() < y.mean(), p_steps),
     }
+
+
+def spell_returns(values):
+    """Write returns as mean ± sample standard deviation, or a single one as it is."""
+    spread = f" ± {values.std(ddof=1):,.0f}" if len(values) > 1 else ""
+    return f"{values.mean():,.0f}{spread}"
 
 
 def spell_steps(value):

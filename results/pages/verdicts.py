@@ -207,8 +207,8 @@ def claims(numbers):
         "Noise halves the steps to the baseline's return",
         "step-variance-and-speed",
         f"SAC on HalfCheetah: by {numbers['paper_speed']['reached']} million",
-        f"p = {headline['p_steps']:.2g}, n = {headline['n']}" if headline else "\u2013",
-        headline["verdict"] if headline else NOT_TESTED,
+        f"p = {headline['p_steps']:.2g}, n = {headline['n']}" if headline["p"] else "\u2013",
+        headline["verdict"],
     )
     p = ablation["p"]
     ours = f"p = {' and '.join(f'{value:.2g}' for value in p.values())}, " if p else ""

@@ -42,8 +42,11 @@ def test_only_whole_seeds_of_the_ablation_count(tmp_path, monkeypatch):
     monkeypatch.setattr(ablation, "read_returns", lambda folder: runs)
     assert set(ablation.read_ablation(tmp_path)["seed"]) == {1}
     found = ablation.numbers(ablation.read_ablation(tmp_path), PAPER)
-    assert found["whole_seeds"] == 1 and found["table"] is None
-    assert found["verdict"] == "not tested"
+    assert found["whole_seeds"] == 1 and found["verdict"] == "not tested" and found["p"] is None
+    assert "| +1 % " in found["table"] and "\u00b1" in found["table"]
+    page = common.render("ablation.md.jinja", {"ablation": found})
+    assert found["table"] in page and "1 of the 10 seeds is complete" in page
+    assert "Three are needed" in page and "ablation.svg" not in page
 
 
 def test_the_test_of_the_scales_is_kruskal_and_wallis():
@@ -102,6 +105,13 @@ def test_steps_to_the_baselines_return_by_hand():
     assert found["verdict"] == "undecided"
 
 
+def test_a_single_seed_is_shown_without_a_verdict():
+    found = headline.numbers((STEPS, curves(7900), 2 * curves(4500)))
+    assert (found["n"], found["p"], found["verdict"]) == (1, None, "not tested")
+    assert "| 7,900 " in found["table"] and "| 9,000 " in found["table"]
+    assert "nan" not in found["table"] and "\u00b1" not in found["table"]
+
+
 def test_the_smallest_difference_that_is_shown():
     """Simulated: three against three runs find it in 80 % of the draws."""
     x, y = np.array([1.0, 2, 3]), np.array([11.0, 12, 13])
@@ -145,9 +155,10 @@ def test_only_whole_seeds_of_the_headline_count(monkeypatch):
     steps, without, noisy = headline.read_curves()
     assert (steps == STEPS).all() and (without == noisy).all()
     assert (without[0] - STEPS[0]).tolist() == [2, 3, 4]
-    for left in (runs[runs["seed"] != 3], runs[runs["noise"] == ""], runs.iloc[:0]):
+    for left in (runs[runs["seed"].isin([1, 5])], runs[runs["noise"] == ""], runs.iloc[:0]):
         monkeypatch.setattr(headline, "read_runs", lambda folder, left=left: left)
         assert headline.read_curves() is None
+    assert headline.numbers(None) == {"n": 0, "p": None, "verdict": "not tested"}
 
 
 @pytest.mark.slow
@@ -160,13 +171,20 @@ def test_the_sections_appear_with_the_runs(monkeypatch, tmp_path):
     monkeypatch.setattr(ablation, "read_ablation", lambda: runs)
     page, scale = readme.page(), ablation.page()
     for text in (
-        "3 of 10 seeds are complete",
+        "3 of the 10 seeds are complete",
         "`RandomUniformScaleReward`: p = 0.0002",
         "ablation.svg",
     ):
         assert text in scale
     assert "1,000,000, 800,000, 800,000" in page and "not complete" not in page
     assert "3 of 10 seeds" in page and "(#step-variance-and-speed)" in page
+    assert "Ours, 3 seeds each" in page and "A verdict needs" not in page
+    one = headline.numbers((STEPS, curves(7900), 2 * curves(4500)))
+    monkeypatch.setattr(readme, "numbers", lambda: numbers | {"headline": one})
+    page = readme.page()
+    assert "Ours, 1 seed each" in page and "A verdict needs three seeds." in page
+    claim = next(line for line in page.splitlines() if "halves the steps" in line)
+    assert claim.endswith("| **not tested**   |") and "p =" not in claim
     (tmp_path / "figures").mkdir()
     monkeypatch.setattr(ablation, "RESULTS", tmp_path)
     ablation.draw_if_whole()
