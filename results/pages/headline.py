@@ -6,7 +6,7 @@ performance. Our runs are in data/long/; readme.py shows what is here.
 
 import numpy as np
 import pandas as pd
-from common import DATA, markdown, plain
+from common import DATA, plain
 from scipy import optimize, stats
 
 from analysis.runs import read_runs
@@ -57,8 +57,9 @@ def smallest_shown(x, y):
 def numbers(curves):
     """Compute steps and final returns from the result of read_curves.
 
-    The target is the baseline's final mean. A run that never reaches it counts with all of its
-    steps, so the mean with noise is a lower limit then. "p" is None without three seeds.
+    The target is the baseline's final mean. "without" and "noisy" have the steps after which the
+    mean curve ("mean") and each run ("runs") reach it. A run that never reaches it counts with all
+    of its steps, so the mean of "runs" is a lower limit then. "p" is None without three seeds.
     """
     undecided = {"p": None, "verdict": "not tested"}
     if curves is None:
@@ -67,23 +68,15 @@ def numbers(curves):
     target = without[-1].mean()
     reached = {}
     for name, returns in (("without", without), ("noisy", noisy)):
+        mean = steps_to_reach(returns, steps, target)
         first = [steps_to_reach(run[:, None], steps, target) for run in returns.T]
         reached[name] = {
-            "mean_curve": steps_to_reach(returns, steps, target),
-            "never": int(np.isnan(first).sum()),
-            "runs": np.where(np.isnan(first), steps[-1], first),
+            "final": spell_returns(returns[-1]),
+            "mean": mean,
+            "in_words": "never" if np.isnan(mean) else f"at {mean:,.0f} steps",
+            "runs": np.where(np.isnan(first), steps[-1], first).tolist(),
         }
-    rows = [
-        {
-            "": name,
-            "final return": spell_returns(returns[-1]),
-            "the mean is there after": spell_steps(reached[key]["mean_curve"]),
-            "each run": ", ".join(f"{value:,.0f}" for value in reached[key]["runs"]),
-            "never": reached[key]["never"],
-        }
-        for name, key, returns in (("no noise", "without", without), ("noise", "noisy", noisy))
-    ]
-    found = {"n": without.shape[1], "table": markdown(rows), "target": target}
+    found = {"n": without.shape[1], "target": target} | reached
     if found["n"] < MIN_SEEDS:
         return found | undecided
     x, y = reached["noisy"]["runs"], reached["without"]["runs"]
@@ -98,7 +91,7 @@ def numbers(curves):
         "shown": smallest_shown(noisy[-1], without[-1]),
         "p_steps": p_steps,
         "steps_shown": smallest_shown(x, y),
-        "verdict": verdict(reached["noisy"]["mean_curve"], x.mean() < y.mean(), p_steps),
+        "verdict": verdict(reached["noisy"]["mean"], np.mean(x) < np.mean(y), p_steps),
     }
 
 
@@ -106,11 +99,6 @@ def spell_returns(values):
     """Write returns as mean ± sample standard deviation, or a single one as it is."""
     spread = f" ± {values.std(ddof=1):,.0f}" if len(values) > 1 else ""
     return f"{values.mean():,.0f}{spread}"
-
-
-def spell_steps(value):
-    """Write a number of steps, or a dash for never."""
-    return "\u2013" if np.isnan(value) else f"{value:,.0f}"
 
 
 def verdict(steps_with_noise, is_faster, p):

@@ -96,20 +96,26 @@ def test_steps_to_the_baselines_return_by_hand():
     without, noisy = curves(7900, 8000, 8100), np.minimum(2.5 * curves(9900, 9900, 2000), 9900)
     found = headline.numbers((STEPS, without, noisy))
     assert found["target"] == 8000 and found["n"] == 3
-    rows = [line.split("|")[2:-1] for line in found["table"].splitlines()[2:]]
-    rows = [[cell.strip() for cell in row] for row in rows]
-    assert rows[0] == ["8,000 ± 100", "900,000", "1,000,000, 800,000, 800,000", "1"]
-    assert rows[1] == ["8,267 ± 2,829", "400,000", "400,000, 400,000, 1,000,000", "1"]
+    for name, final, steps, runs in (
+        ("without", "8,000 ± 100", 900_000, [1_000_000, 800_000, 800_000]),
+        ("noisy", "8,267 ± 2,829", 400_000, [400_000, 400_000, 1_000_000]),
+    ):
+        assert (found[name]["final"], found[name]["mean"]) == (final, steps)
+        assert found[name]["in_words"] == f"at {steps:,} steps"
+        assert found[name]["runs"] == runs
     expected = stats.ttest_ind(noisy[-1], without[-1], equal_var=False)
     assert (found["difference"], found["p"]) == pytest.approx((800 / 3, expected.pvalue))
     assert found["verdict"] == "undecided"
 
 
 def test_a_single_seed_is_shown_without_a_verdict():
-    found = headline.numbers((STEPS, curves(7900), 2 * curves(4500)))
+    found = headline.numbers((STEPS, curves(7900), 2 * curves(3500)))
     assert (found["n"], found["p"], found["verdict"]) == (1, None, "not tested")
-    assert "| 7,900 " in found["table"] and "| 9,000 " in found["table"]
-    assert "nan" not in found["table"] and "\u00b1" not in found["table"]
+    assert (found["without"]["final"], found["noisy"]["final"]) == ("7,900", "7,000")
+    assert (found["without"]["in_words"], found["noisy"]["in_words"]) == (
+        "at 800,000 steps",
+        "never",
+    )
 
 
 def test_the_smallest_difference_that_is_shown():
@@ -178,11 +184,11 @@ def test_the_sections_appear_with_the_runs(monkeypatch, tmp_path):
         assert text in scale
     assert "1,000,000, 800,000, 800,000" in page and "not complete" not in page
     assert "3 of 10 seeds" in page and "(#step-variance-and-speed)" in page
-    assert "Ours, 3 seeds each" in page and "A verdict needs" not in page
+    assert "Ours (3 seeds) ends at" in page and "too few" not in page
     one = headline.numbers((STEPS, curves(7900), 2 * curves(4500)))
     monkeypatch.setattr(readme, "numbers", lambda: numbers | {"headline": one})
     page = readme.page()
-    assert "Ours, 1 seed each" in page and "A verdict needs three seeds." in page
+    assert "Ours (1 seed, too few for a verdict) ends at 7,900" in page
     claim = next(line for line in page.splitlines() if "halves the steps" in line)
     assert claim.endswith("| **not tested**   |") and "p =" not in claim
     (tmp_path / "figures").mkdir()
