@@ -46,7 +46,13 @@ def test_only_whole_seeds_of_the_ablation_count(tmp_path, monkeypatch):
     assert "| +1 % " in found["table"] and "\u00b1" in found["table"]
     page = common.render("ablation.md.jinja", {"ablation": found})
     assert found["table"] in page and "1 of the 10 seeds is complete" in page
-    assert "Three are needed" in page and "ablation.svg" not in page
+    assert (
+        "Three are needed" in page
+        and "ablation.svg" in page
+        and "one standard deviation" not in page
+    )
+    page = common.render("ablation.md.jinja", {"ablation": ablation.numbers(runs.iloc[:0], PAPER)})
+    assert "None of the 10 seeds is complete" in page and "ablation.svg" not in page
 
 
 def test_the_test_of_the_scales_is_kruskal_and_wallis():
@@ -180,6 +186,7 @@ def test_the_sections_appear_with_the_runs(monkeypatch, tmp_path):
         "3 of the 10 seeds are complete",
         "`RandomUniformScaleReward`: p = 0.0002",
         "ablation.svg",
+        "The bars' lines are",
     ):
         assert text in scale
     assert "1,000,000, 800,000, 800,000" in page and "not complete" not in page
@@ -193,5 +200,7 @@ def test_the_sections_appear_with_the_runs(monkeypatch, tmp_path):
     assert claim.endswith("| **not tested**   |") and "p =" not in claim
     (tmp_path / "figures").mkdir()
     monkeypatch.setattr(ablation, "RESULTS", tmp_path)
-    ablation.draw_if_whole()
-    assert (tmp_path / "figures/ablation.svg").stat().st_size > 10_000
+    for seeds in (runs, runs[runs["seed"] == 1]):
+        ablation.draw(seeds)
+        assert (tmp_path / "figures/ablation.svg").stat().st_size > 10_000
+        (tmp_path / "figures/ablation.svg").unlink()
