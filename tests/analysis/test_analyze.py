@@ -537,6 +537,7 @@ def read(sweep, name):
     return (sweep.path / "results" / name).read_text()
 
 
+@pytest.mark.slow
 def test_shuffling_the_run_folders_changes_nothing(sweep, tmp_path):
     small_sweep(tmp_path / "runs", order=-1)
     run(tmp_path, drawn=True)
@@ -828,6 +829,7 @@ def test_compare_sets_the_paper_beside_ours(tmp_path):
     assert set(tables["compare_consistently_worse"]["listed_by"]) <= {"paper", "both", "ours"}
 
 
+@pytest.mark.slow
 def test_a_difference_needs_equal_steps_and_a_listing_one_version(tmp_path):
     """Short runs and runs of v4 stand beside the paper's, but are neither scored nor listed."""
     for seed in range(3):

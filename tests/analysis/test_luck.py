@@ -205,6 +205,7 @@ def p_of_the_best(n, gain, draw, studies=200):
 # -------------------------------------------------------------------------------------- tables
 
 
+@pytest.mark.slow
 def test_luck_stands_beside_the_best_and_the_consistent(tmp_path):
     small_sweep(tmp_path / "runs")
     tables = run(tmp_path, compare=PAPER)

@@ -120,6 +120,7 @@ def interval_without_the_baselines_seeds(x, y, resamples):
     [(500, 500, (8, 12), 7), (50, 500, (17, 23), 7)],
     ids=["alike", "wide baseline"],
 )
+@pytest.mark.slow
 def test_ten_noisy_seeds_do_not_make_up_for_three_of_the_baseline(
     spread, spread_baseline, usual, most
 ):
@@ -203,6 +204,7 @@ def test_p_is_that_of_all_orders_where_environments_differ_in_their_seeds():
         assert smallest == pytest.approx(2 / len(null))
 
 
+@pytest.mark.slow
 def test_the_direction_of_a_verdict_is_that_of_its_test():
     """0.94 of 10 against 10 are won, none of 3 against 3: the sum of U would have p = 0.0022."""
     ten = np.arange(10.0)

@@ -310,6 +310,7 @@ def read(path):
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_two_algorithms_and_environments_at_once(tmp_path):
     spellings = "RandomNormalNoisyReward(.1) | RandomNormalNoisyReward(0.10)"
     both = "RandomEarlyTermination(9)@0.3+RandomNormalNoisyReward(1)@1:0"
@@ -444,6 +445,7 @@ def test_a_second_choice_takes_the_same_fresh_seeds(tmp_path):
     assert {re.search(r"_s(\d+)_", name)[1] for name in more} == {"1005", "1006"}
 
 
+@pytest.mark.slow
 def test_another_choice_keeps_the_lines_of_the_first(tmp_path):
     first = arguments(
         "--algos | ppo | --envs | Pendulum-v1 | --noise-rates | 1 | --noises | "
@@ -465,6 +467,7 @@ def test_another_choice_keeps_the_lines_of_the_first(tmp_path):
         assert [line["phase"] for line in lines[-2:]] == ["confirmation"] * 2
 
 
+@pytest.mark.slow
 def test_two_commands_that_end_side_by_side_keep_each_others_lines(tmp_path, monkeypatch):
     path = tmp_path / "choice.csv"
     line = dict.fromkeys(CHOICE_COLUMNS, "x")
