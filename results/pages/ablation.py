@@ -8,7 +8,16 @@ rule was fixed before any run: for each noise, is the return the same at all val
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
-from common import DATA, ENVIRONMENTS, RESULTS, markdown, plain, read_returns, render
+from common import (
+    DATA,
+    ENVIRONMENTS,
+    RESULTS,
+    markdown,
+    plain,
+    read_returns,
+    render,
+    spell_average,
+)
 from scipy import stats
 
 from analysis.effects import PALETTE
@@ -97,9 +106,7 @@ def numbers(runs, paper):
             row["average"] = f"{change.mean():+.0f} ± {change.std(ddof=1):.0f} %"
             row["the paper"] = "\u2013"
             if (noise, f"{rate:.2f}") in averages.index:
-                theirs = averages.loc[noise, f"{rate:.2f}"]
-                average, std = theirs[["average_improvement_percent", "std_improvement_percent"]]
-                row["the paper"] = f"{average:+.0f} ± {std:.0f} %"
+                row["the paper"] = spell_average(averages.loc[noise, f"{rate:.2f}"])
             rows.append(row)
     if len(seeds) < MIN_SEEDS:
         return found | undecided | {"table": markdown(rows)}

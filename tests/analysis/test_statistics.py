@@ -115,12 +115,12 @@ def interval_without_the_baselines_seeds(x, y, resamples):
     return value - half, value + half
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spread", "spread_baseline", "usual", "most"),
     [(500, 500, (8, 12), 7), (50, 500, (17, 23), 7)],
     ids=["alike", "wide baseline"],
 )
-@pytest.mark.slow
 def test_ten_noisy_seeds_do_not_make_up_for_three_of_the_baseline(
     spread, spread_baseline, usual, most
 ):

@@ -92,9 +92,9 @@ def configurations(draw):
     return noises, rates
 
 
+@pytest.mark.slow
 @settings(hypothesis_settings, max_examples=400)
 @given(configurations(), configurations())
-@pytest.mark.slow
 def test_names_are_equal_exactly_if_the_configurations_are(one, two):
     names = [run_name("Hopper-v5", "sac", *configuration, 1) for configuration in (one, two)]
     assert (names[0] == names[1]) == (canonical_noises(*one) == canonical_noises(*two))
