@@ -210,13 +210,15 @@ def claims(numbers):
         f"p = {headline['p_steps']:.2g}, n = {headline['n']}" if headline["p"] else "\u2013",
         headline["verdict"],
     )
-    p = ablation["p"]
-    ours = f"p = {' and '.join(f'{value:.2g}' for value in p.values())}, " if p else ""
+    tests = [
+        f"{wrapper.removeprefix('RandomUniform')} p = {p:.2g}"
+        for wrapper, p in (ablation["p"] or {}).items()
+    ]
     add(
         "PPO is sensitive to the scale of the noise",
         "ablation.md",
         "a figure without numbers",
-        f"{ours}{ablation['whole_seeds']} of {ablation['planned_seeds']} seeds" if p else "\u2013",
+        f"{', '.join(tests)}, n = {ablation['whole_seeds']}" if tests else "\u2013",
         ablation["verdict"],
     )
     best = numbers["rates"]["best"]

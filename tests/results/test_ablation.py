@@ -69,8 +69,23 @@ def test_useless_scales_are_seldom_found():
     assert 0.3 < np.mean(p) < 0.7 and np.mean(np.array(p) <= 0.05) < 0.2
 
 
+def test_the_smallest_shift_that_the_test_of_the_scales_finds():
+    """For one environment, found again with scipy's test."""
+    shift = ablation.smallest_shown(1, 5, 8)
+    rng, found = np.random.default_rng(3), 0
+    for _ in range(1000):
+        returns = rng.normal(size=(5, 8))
+        returns[2] -= shift
+        found += stats.kruskal(*returns).pvalue <= 0.05
+    assert found / 1000 == pytest.approx(0.8, abs=0.05)
+    assert ablation.smallest_shown(5, 5, 3) < ablation.smallest_shown(5, 5, 2)
+
+
 def test_a_noise_whose_scale_matters():
     found = ablation.numbers(made_up([1, 2, 3], effect=5), PAPER)
+    page = common.render("ablation.md.jinja", {"ablation": found})
+    assert f"- `{SCALED}`: the return depends on beta (p = 0.0002, corrected)" in page
+    assert f"- `{UNIFORM}`: no dependence on beta is shown" in page
     assert found["p"][SCALED] == pytest.approx(2 / 10_001) and found["p"][UNIFORM] > 0.05
     assert found["verdict"] == "undecided"
     rows = {line.split("|")[1].strip(): line for line in found["table"].splitlines()[2:]}
@@ -179,13 +194,14 @@ def test_the_sections_appear_with_the_runs(monkeypatch, tmp_path):
     page, scale = readme.page(), ablation.page()
     for text in (
         "3 of the 10 seeds are complete",
-        "`RandomUniformScaleReward`: p = 0.0002",
+        "`RandomUniformScaleReward`: the return depends on beta (p = 0.0002, corrected)",
         "ablation.svg",
         "The bars' lines are",
     ):
         assert text in scale
     assert "1,000,000, 800,000, 800,000" in page and "not complete" not in page
-    assert "3 of 10 seeds" in page and "(#step-variance-and-speed)" in page
+    assert "| ScaleReward p = 0.0002, NoisyObservation p = " in page
+    assert "(#step-variance-and-speed)" in page
     assert "Ours (3 seeds) ends at" in page and "too few" not in page
     one = headline.numbers((STEPS, curves(7900), 2 * curves(4500)))
     monkeypatch.setattr(readme, "numbers", lambda: numbers | {"headline": one})
