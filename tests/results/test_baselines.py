@@ -134,7 +134,6 @@ def test_only_whole_seeds_are_read(tmp_path, monkeypatch):
     names = ("Hopper-v5", "Pusher-v5")
     plan = [(name, (), (), seed) for seed in (1, 2, 3) for name in names]
     monkeypatch.setattr(ways, "planned_runs", lambda: plan)
-    assert len(baselines.read_tests(tmp_path / "absent")) == 0
     for name, _, _, seed in plan:
         if (name, seed) == ("Pusher-v5", 2):
             continue
@@ -179,7 +178,6 @@ def test_ways_by_hand():
     assert found["verdicts"] == wanted and found["gain"] == 89.6
     row = cells(found["table"])["training, mean"]
     assert row[:2] == ["1,470 (+0.0)", "1,806 (+0.0)"] and row[4] == "+90 %"
-    assert baselines.judge_ways(tests[tests["seed"] < 3], PAPER) is None
 
 
 def test_side_by_side_sees_a_difference_where_there_is_one(tmp_path):
