@@ -212,14 +212,14 @@ def claims(numbers):
     )
     tests = [
         f"{wrapper.removeprefix('RandomUniform')} p = {p:.2g}"
-        for wrapper, p in (ablation["p"] or {}).items()
+        for wrapper, p in ablation["p"].items()
     ]
     add(
         "PPO is sensitive to the scale of the noise",
         "ablation.md",
         "a figure without numbers",
-        f"{', '.join(tests)}, n = {ablation['whole_seeds']}" if tests else "\u2013",
-        ablation["verdict"],
+        f"{', '.join(tests)}, n = {ablation['seeds']}",
+        of_all([of_effect(1, p) for p in ablation["p"].values()]),
     )
     best = numbers["rates"]["best"]
     add(

@@ -102,6 +102,7 @@ CHANGES = [
     ("gains from reward noise", lambda n: n["five"]["reward"].update(p=0.01), CONTRADICTED),
     ("helps all", lambda n: clear_sac(n, -1), CONTRADICTED),
     ("step of early", lambda n: n["pusher"]["step"].update(p=0.01), CONFIRMED),
+    ("scale of the noise", lambda n: scales(n).update(RandomUniformScaleReward=0.05), CONFIRMED),
 ]
 
 
@@ -111,6 +112,10 @@ def normal(n):
 
 def mixup(n):
     return n["worse_noises"][harmful.MIXUP]
+
+
+def scales(n):
+    return n["ablation"]["p"]
 
 
 def unseen(n, noise):
