@@ -303,6 +303,7 @@ def numbers():
         "ways": judge_ways(tests, paper),
         "whole_seeds": len(set(tests["seed"])),
         "planned_seeds": len(ways.SEEDS),
+        "control_seeds": tests.query("environment in @ways.CONTROLS")["seed"].nunique(),
         "level": ways.LEVEL,
     }
 
