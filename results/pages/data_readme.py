@@ -39,7 +39,7 @@ def commits_of_the_five():
     return len({config["git_commit"] for config in configs})
 
 
-def seeds_of(runs):
+def spell_seeds(runs):
     """Write the seeds of these runs as benchmark.sh reads them: "1", or "1-3"."""
     first, last = runs["seed"].min(), runs["seed"].max()
     return f"{first}" if first == last else f"{first}-{last}"
@@ -58,10 +58,10 @@ def numbers():
             for (algorithm, environment, noise), n in groups.size().items()
         ),
         "seeds": {
-            "sac": seeds_of(cheetah[cheetah["noise"] == SCALE]),
-            "td3": seeds_of(cheetah[cheetah["algorithm"] == "TD3"]),
-            "ablation": seeds_of(read_ablation()),
-            "paper_tests": seeds_of(read_tests(DATA / "paper_tests")),
+            "sac": spell_seeds(cheetah[cheetah["noise"] == SCALE]),
+            "td3": spell_seeds(cheetah[cheetah["algorithm"] == "TD3"]),
+            "ablation": spell_seeds(read_ablation()),
+            "paper_tests": spell_seeds(read_tests(DATA / "paper_tests")),
         },
         "rate_error": noise_rates(DATA / "runs"),
         "commits": commits_of_the_five(),

@@ -80,6 +80,14 @@ def test_a_noise_whose_largest_scale_alone_matters():
     assert f"no dependence is shown (p = {found['p_smaller'][UNIFORM]:.2g}, asked" in page
 
 
+@pytest.mark.slow
+def test_the_figure_is_drawn(monkeypatch, tmp_path):
+    (tmp_path / "figures").mkdir()
+    monkeypatch.setattr(ablation, "RESULTS", tmp_path)
+    ablation.draw(made_up([1, 2, 3], effect=5))
+    assert (tmp_path / "figures/ablation.svg").stat().st_size > 10_000
+
+
 def test_a_noise_whose_scale_matters():
     found = ablation.numbers(made_up([1, 2, 3], effect=5), PAPER)
     page = common.render("ablation.md.jinja", {"ablation": found})
@@ -87,6 +95,7 @@ def test_a_noise_whose_scale_matters():
     assert f"- `{UNIFORM}`: no dependence on beta is shown (p = " in page
     assert "Without the largest beta it still does (p = 0.0001, asked afterwards)." in page
     assert page.count("Without the largest") == 1
+    assert "ablation.svg" in page and "The bars' lines are" in page
     assert found["p"][SCALED] == pytest.approx(2 / 10_001) and found["p"][UNIFORM] > 0.05
     rows = {line.split("|")[1].strip(): line for line in found["table"].splitlines()[2:]}
     assert "| +20 ± 40 %" in rows["`RandomUniformScaleReward(0.8, 1.2)`"]
@@ -179,12 +188,14 @@ def test_only_whole_seeds_of_the_headline_count(monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_headline_appears_with_its_runs(monkeypatch):
+def test_readme_has_the_headline_and_the_scales(monkeypatch):
     found = (STEPS, curves(7900, 8000, 8100), 2 * curves(9000, 9100, 3000))
     numbers = readme.numbers() | {"headline": headline.numbers(found)}
+    numbers |= {"ablation": ablation.numbers(made_up([1, 2, 3], effect=5), PAPER)}
     monkeypatch.setattr(readme, "numbers", lambda: numbers)
     page = readme.page()
     assert "1,000,000, 800,000, 800,000" in page and "not complete" not in page
+    assert "| ScaleReward p = 0.0002, NoisyObservation p = " in page
     assert "(#step-variance-and-speed)" in page
     assert "Ours (3 seeds) ends at" in page and "too few" not in page
     one = headline.numbers((STEPS, curves(7900), 2 * curves(4500)))
