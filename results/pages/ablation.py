@@ -23,7 +23,7 @@ from scipy import stats
 
 from analysis.effects import PALETTE
 from analysis.paper import read_paper
-from analysis.statistics import holm, improvement_percent
+from analysis.statistics import LEVEL, POWER, holm, improvement_percent
 from noisy_wrappers import canonical_noises
 from sweep.grid import ABLATION
 
@@ -80,14 +80,14 @@ def smallest_shown(environments, scales, seeds):
     One scale moves the return in every environment; returns are normal.
     """
     draws = np.random.default_rng(0).normal(size=(SHUFFLES, environments, scales, seeds))
-    limit = np.quantile(spread(draws), 0.95)
+    limit = np.quantile(spread(draws), 1 - LEVEL)
     moved = np.arange(scales)[:, None] == 0
 
     def power(shift):
         return np.mean(spread(draws + shift * moved) > limit)
 
     shifts = np.arange(0, 10, 0.1)
-    return shifts[bisect_left(shifts, 0.8, key=power)]
+    return shifts[bisect_left(shifts, POWER, key=power)]
 
 
 def numbers(runs, paper):
@@ -120,6 +120,7 @@ def numbers(runs, paper):
     seeds = runs["seed"].nunique()
     return {
         "seeds": seeds,
+        "level": LEVEL,
         "p": corrected,
         "p_smaller": p_smaller,  # without the largest beta, asked afterwards
         "finds": smallest_shown(len(ENVIRONMENTS), len(noises), seeds),

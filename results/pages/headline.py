@@ -10,11 +10,10 @@ from common import DATA, plain
 from scipy import optimize, stats
 
 from analysis.runs import read_runs
-from analysis.statistics import MIN_SEEDS, steps_to_reach
+from analysis.statistics import LEVEL, MIN_SEEDS, POWER, steps_to_reach
 
 NOISE, RATE = "RandomUniformScaleReward(0.5, 1.5)", "0.01"
 TOTAL = 1_000_000
-LEVEL, POWER = 0.05, 0.8
 
 
 def read_curves(folder=DATA / "long"):

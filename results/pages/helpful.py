@@ -26,7 +26,14 @@ from scipy import stats
 
 from analysis.luck import DRAWS
 from analysis.paper import PAPER_SEEDS
-from analysis.statistics import holm, improvement_percent, mann_whitney, mann_whitney_null, wins
+from analysis.statistics import (
+    LEVEL,
+    holm,
+    improvement_percent,
+    mann_whitney,
+    mann_whitney_null,
+    wins,
+)
 
 FRESH_SEEDS = range(11, 31)
 CHEETAH_SEEDS = range(11, 51)
@@ -49,7 +56,7 @@ def fixed_beforehand(runs, chosen):
     return runs[wanted & runs["seed"].isin(FIXED_SEEDS)]
 
 
-def power(effect, std, n, other_std, other_n, level=0.05):
+def power(effect, std, n, other_std, other_n, level=LEVEL):
     """Probability that the exact Mann-Whitney test finds a shift of normal returns.
 
     With TRIALS samples its standard error is at most 0.0008.
@@ -98,7 +105,7 @@ def five_noises(base, noisy, paper_base, paper_noisy, percent, statistics):
     low, high = welch_interval(x, y)
     found, strict = (
         [power(paper_gain[e], x["std"][e], x["n"][e], y["std"][e], y["n"][e], at) for e in names]
-        for at in (0.05, 0.05 / len(names))
+        for at in (LEVEL, LEVEL / len(names))
     )
     rewarding = [e for e in names if kind(noise["noise"][e]) == "reward"]
     with_reward_noise, without = (

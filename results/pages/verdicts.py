@@ -9,10 +9,10 @@ from helpful import ENDING, ENDING_ANYWHERE
 from paper_tables import RATES
 
 from analysis.paper import PAPER_CONFIGURATIONS, PAPER_SEEDS
+from analysis.statistics import LEVEL
 
 CONFIRMED, CONTRADICTED = "confirmed", "contradicted"
 UNDECIDED, NOT_TESTED = "undecided", "not tested"
-LEVEL = 0.05
 PERCENT = ("percent", "low_percent", "high_percent")  # an estimate and its interval
 
 
