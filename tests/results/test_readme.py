@@ -66,17 +66,19 @@ def test_robustness(numbers, section):
 
 
 def test_baselines(section):
-    """ "Clear" is the paper's tests with Holm's correction, and CleanRL's without."""
+    """ "Clear" is PPO's tests against the paper with Holm's correction, and others without."""
     found = baselines.numbers()
     assert "except that PPO returns more than the paper's on Hopper and Walker2d" in section
     assert [name for name in found["holm"] if found["holm"][name] <= 0.05] == ["Hopper", "Walker2d"]
-    differences = found["full"]["numbers"] | found["short"]["numbers"]
     clear = [
-        (name, who)
-        for name, others in differences.items()
+        (name, who, other["se"] > 0)
+        for length in ("full", "short")
+        for name, others in found[length]["numbers"].items()
         for who, other in others.items()
         if other["p"] <= 0.05
     ]
-    of_ppo = ("PPO on Hopper-v5", "PPO on Walker2d-v4", "PPO on Walker2d-v5")
-    assert clear == [(name, "paper") for name in of_ppo]
-    assert all(differences[name]["paper"]["se"] > 0 for name in of_ppo)
+    of_ppo = [f"PPO on {name}" for name in ("Hopper-v5", "Walker2d-v4", "Walker2d-v5")]
+    td3 = "TD3 on HalfCheetah-v5"
+    assert clear == [(name, "paper", True) for name in (*of_ppo, td3)]
+    p = found["full"]["numbers"][td3]["paper"]["p"]
+    assert f"and TD3 on HalfCheetah (p = {p:.2g}, uncorrected)" in section
