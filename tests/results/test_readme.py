@@ -82,3 +82,7 @@ def test_baselines(section):
     assert clear == [(name, "paper", True) for name in (*of_ppo, td3)]
     p = found["full"]["numbers"][td3]["paper"]["p"]
     assert f"and TD3 on HalfCheetah (p = {p:.2g}, uncorrected)" in section
+    (line,) = found["too_few"]
+    assert line.startswith("SAC on HalfCheetah-v5 after 1,000,000 steps: ")
+    assert line.count(" and ") == 2  # two test returns, two training returns
+    assert "SAC on HalfCheetah has two seeds of a million steps, too few for a test" in section
