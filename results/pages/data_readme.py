@@ -6,7 +6,6 @@ data_readme.md.jinja has the text, this file every number in it.
 import json
 
 from ablation import read_ablation
-from baselines import read_tests
 from common import DATA, RESULTS, plain, read_returns, render
 from harmful import MIXUP, NORMAL, PLAIN_MIXUP
 from helpful import fixed_beforehand
@@ -61,7 +60,6 @@ def numbers():
             "sac": spell_seeds(cheetah[cheetah["noise"] == SCALE]),
             "td3": spell_seeds(cheetah[cheetah["algorithm"] == "TD3"]),
             "ablation": spell_seeds(read_ablation()),
-            "paper_tests": spell_seeds(read_tests(DATA / "paper_tests")),
         },
         "rate_error": noise_rates(DATA / "runs"),
         "commits": commits_of_the_five(),
