@@ -42,16 +42,6 @@ def scales():
     return found
 
 
-def read_ablation(folder=FOLDER):
-    """Return environment, noise, seed and test return of all runs of whole seeds.
-
-    A seed is whole when every noise and the baseline are there in every environment.
-    """
-    runs = read_returns(folder)[["environment", "noise", "seed", "test"]]
-    planned = len(ENVIRONMENTS) * (1 + len(ABLATION))
-    return runs[runs.groupby("seed")["seed"].transform("size") == planned]
-
-
 def spread(returns):
     """Return Kruskal and Wallis's H, up to constants, summed over environments.
 
@@ -91,7 +81,7 @@ def smallest_shown(environments, scales, seeds):
 
 
 def numbers(runs, paper):
-    """Compute what the page says; runs is a frame of read_ablation."""
+    """Compute what the page says; runs is a frame of read_returns."""
     by = runs.pivot(index=["environment", "noise"], columns="seed", values="test")
     averages = paper["consistent"].query("algorithm == 'PPO'").set_index(["noise", "noise_rate"])
     rows, p, p_smaller = [], {}, {}
@@ -153,10 +143,10 @@ def draw(runs):
 def page():
     """Return the text of ablation.md."""
     paper = read_paper(RESULTS / "paper")
-    return render("ablation.md.jinja", {"ablation": numbers(read_ablation(), paper)})
+    return render("ablation.md.jinja", {"ablation": numbers(read_returns(FOLDER), paper)})
 
 
 if __name__ == "__main__":
-    draw(read_ablation())
+    draw(read_returns(FOLDER))
     (RESULTS / "ablation.md").write_text(page())
     print(f"Wrote {RESULTS / 'ablation.md'}")

@@ -5,7 +5,6 @@ data_readme.md.jinja has the text, this file every number in it.
 
 import json
 
-from ablation import read_ablation
 from common import DATA, RESULTS, plain, read_returns, render
 from harmful import MIXUP, NORMAL, PLAIN_MIXUP
 from helpful import fixed_beforehand
@@ -38,29 +37,17 @@ def commits_of_the_five():
     return len({config["git_commit"] for config in configs})
 
 
-def spell_seeds(runs):
-    """Write the seeds of these runs as benchmark.sh reads them: "1", or "1-3"."""
-    first, last = runs["seed"].min(), runs["seed"].max()
-    return f"{first}" if first == last else f"{first}-{last}"
-
-
 def numbers():
     """Compute all that the page says."""
     counts = read_returns(DATA / "runs").groupby("algorithm").size()
     long = read_returns(DATA / "long")
     groups = long.groupby(["algorithm", "environment", "noise"])
-    cheetah = long[long["environment"] == "HalfCheetah"]
     return {
         "runs": ", ".join(f"{name} {n}" for name, n in counts.items()),
         "long": ", ".join(
             f"{algorithm} on {environment} {f'with `{noise}`' if noise else 'without noise'} {n}"
             for (algorithm, environment, noise), n in groups.size().items()
         ),
-        "seeds": {
-            "sac": spell_seeds(cheetah[cheetah["noise"] == SCALE]),
-            "td3": spell_seeds(cheetah[cheetah["algorithm"] == "TD3"]),
-            "ablation": spell_seeds(read_ablation()),
-        },
         "rate_error": noise_rates(DATA / "runs"),
         "commits": commits_of_the_five(),
         "normal": NORMAL,

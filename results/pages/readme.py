@@ -98,7 +98,7 @@ def numbers():
         "worse_noises": worse_noises(ppo, paper),
         "td3": td3(returns.query("algorithm == 'TD3'"), paper),
         "sac": sac(early, statistics),
-        "ablation": ablation.numbers(ablation.read_ablation(), paper),
+        "ablation": ablation.numbers(read_returns(ablation.FOLDER), paper),
         "headline": headline.numbers(headline.read_curves()),
         "scale": reward_scale(),
         "unseen": by_noise(scores(tests(), is_unseen)),

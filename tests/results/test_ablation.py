@@ -1,4 +1,6 @@
-"""Runs that are still to come, made up: the scale of PPO's noise, and SAC's steps to a return."""
+"""The scale of PPO's noise and SAC's steps to a return, with made-up runs."""
+
+from itertools import product
 
 import ablation
 import common
@@ -36,10 +38,13 @@ def test_the_scales_are_those_of_the_preset():
     assert scales[UNIFORM][0.001] == "RandomUniformNoisyObservation(-0.001, 0.001)"
 
 
-def test_only_whole_seeds_of_the_ablation_count(tmp_path, monkeypatch):
-    runs = made_up([1, 2]).iloc[:-1]  # the last run of seed 2 is not there
-    monkeypatch.setattr(ablation, "read_returns", lambda folder: runs)
-    assert set(ablation.read_ablation(tmp_path)["seed"]) == {1}
+@pytest.mark.slow
+def test_the_committed_runs_of_the_ablation_are_the_planned_ones():
+    runs = ablation.read_returns(ablation.FOLDER)
+    noises = {noise for scale in ablation.scales().values() for noise in scale.values()}
+    planned = product(common.ENVIRONMENTS, {"", *noises}, (1, 2, 3))
+    found = zip(runs["environment"], runs["noise"], runs["seed"], strict=True)
+    assert sorted(found) == sorted(planned)
 
 
 def test_the_test_of_the_scales_is_kruskal_and_wallis():
