@@ -33,7 +33,7 @@ from side_by_side import side_by_side
 from analysis.effects import PALETTE
 from analysis.paper import PAPER_SEEDS, read_paper
 from analysis.runs import KEYS, read_runs
-from analysis.statistics import MIN_SEEDS, holm
+from analysis.statistics import holm
 
 plt.rcParams["svg.hashsalt"] = "noisy"  # equal figures are equal files
 
@@ -63,14 +63,9 @@ def read_baselines():
     return runs[ours].assign(algorithm=runs["algorithm"].str.split().str[0])
 
 
-def groups(runs, enough=True):
-    """Yield ((algorithm, total steps, environment, version), its runs): those with enough seeds.
-
-    enough=False: those with fewer.
-    """
-    for key, group in runs.groupby(["algorithm", "total", "environment", "version"]):
-        if (len(group) >= MIN_SEEDS) == enough:
-            yield key, group.sort_values("seed")
+def groups(runs):
+    """Return pairs of (algorithm, total steps, environment, version) and its runs."""
+    return runs.groupby(["algorithm", "total", "environment", "version"])
 
 
 def read_cleanrl(path=CLEANRL_CSV):
@@ -166,23 +161,6 @@ def far_from_both(numbers):
         for name, found in numbers.items()
         if len(found) == 2 and all(abs(other["se"]) > 2 for other in found.values())
     ]
-
-
-def too_few(runs, paper):
-    """Say what the runs returned that are not in the tables, for want of seeds: a line each."""
-    lines = []
-    for (algorithm, total, environment, version), group in groups(runs, enough=False):
-        theirs, cleanrls, _ = published(paper, algorithm, environment, total)
-        paper_s = "" if theirs is None else f" (the paper: {spell(theirs)[0]})"
-        cleanrl_s = "" if cleanrls is None else f" (CleanRL: {spell(cleanrls)[0]})"
-        test, training = (
-            " and ".join(f"{value:,.0f}" for value in group[name]) for name in ("test", "training")
-        )
-        lines.append(
-            f"{algorithm} on {environment}-{version} after {total:,} steps: test return {test}"
-            f"{paper_s}, training return {training}{cleanrl_s}"
-        )
-    return lines
 
 
 def cleanrls_versions(runs, paper):
@@ -289,7 +267,6 @@ def numbers():
         "far": far_from_both(full["numbers"]),
         "side": side_by_side(),
         "holm": corrected(full["numbers"]),
-        "too_few": too_few(runs, paper),
         "share": share.to_dict(),
         "highest_share": share.drop("Humanoid").max(),
         "cleanrl": cleanrls_versions(runs, paper),
@@ -327,11 +304,6 @@ def draw():
         ax, color = panels[environment], COLORS[algorithm]
         ax.plot(steps, mean, line, color=color)
         ax.fill_between(steps, mean - std, mean + std, color=color, alpha=0.15, linewidth=0)
-    alone = list(groups(runs, enough=False))
-    for (algorithm, total, environment, _), group in alone:
-        for steps, curve in zip(group["steps"], group["returns"], strict=True):
-            line = "-" if total == FULL_LENGTH else ":"
-            panels[environment].plot(steps / 1e6, curve, line, color=COLORS[algorithm], lw=0.7)
     for ax in axes[:, 0]:
         ax.set_ylabel("test return")
     last = axes.flat[-1]
@@ -339,8 +311,6 @@ def draw():
     for algorithm, color in COLORS.items():
         last.plot([], [], color=color, label=algorithm)
     last.plot([], [], ":", color="grey", label="a run of 200,000 steps")
-    if alone:
-        last.plot([], [], color="grey", lw=0.7, label="one seed, where there are fewer than three")
     last.plot([], [], "o", color="grey", markersize=4, label="the paper, v2, test")
     last.plot([], [], "x", color="grey", markersize=5, label="CleanRL, v2 or v4, training")
     last.legend(loc="center", frameon=False)

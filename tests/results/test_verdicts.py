@@ -102,6 +102,7 @@ CHANGES = [
     ("gains from reward noise", lambda n: n["five"]["reward"].update(p=0.01), CONTRADICTED),
     ("helps all", lambda n: clear_sac(n, -1), CONTRADICTED),
     ("step of early", lambda n: n["pusher"]["step"].update(p=0.01), CONFIRMED),
+    ("halves the steps", lambda n: arrive(n, 400_000, 0.04), CONFIRMED),
     ("scale of the noise", lambda n: scales(n).update(RandomUniformScaleReward=0.05), CONFIRMED),
 ]
 
@@ -112,6 +113,12 @@ def normal(n):
 
 def mixup(n):
     return n["worse_noises"][harmful.MIXUP]
+
+
+def arrive(n, steps, p):
+    """Let SAC's runs with noise reach the baseline's return after these steps."""
+    n["headline"]["noisy"].update(mean=steps, runs=3 * [steps])
+    n["headline"].update(p_steps=p)
 
 
 def scales(n):
@@ -163,6 +170,28 @@ def test_one_algorithm_does_not_confirm_a_claim_about_several(numbers):
     clear_sac(found, 1)
     found["five"]["reward"].update(won=300, p=0.001)
     assert verdict_on("helps all", found) == verdict_on("gains from reward", found) == UNDECIDED
+
+
+def test_fewer_steps_must_be_half_and_not_by_chance(numbers):
+    found = numbers("README.md")
+    found["headline"]["without"].update(runs=[800_000, 800_000, 1_000_000])
+    for steps, p, expected in (
+        (400_000, 0.04, CONFIRMED),
+        (400_000, 0.06, UNDECIDED),
+        (400_000, float("nan"), UNDECIDED),
+        (500_000, 0.04, UNDECIDED),
+        (1_000_000, 0.04, UNDECIDED),
+    ):
+        arrive(found, steps, p)
+        assert verdict_on("halves the steps", found) == expected, (steps, p)
+
+
+def test_the_row_of_the_steps_says_when_the_mean_arrives(numbers):
+    found = numbers("README.md")
+    for steps, expected in ((400_000, "by 0.4 million, p = 0.04, n = 3"), (None, "never, n = 3")):
+        arrive(found, float("nan") if steps is None else steps, 0.04)
+        [ours] = (ours for claim, _, _, ours, _ in verdicts.claims(found) if "halves" in claim)
+        assert ours == expected
 
 
 def test_each_row_with_a_verdict_is_among_the_changes(numbers):
@@ -387,14 +416,17 @@ SENTENCES = [
     ),
     (
         "baselines.md",
-        "TD3 on HalfCheetah ends above the paper,",
-        lambda n: is_above_paper(n, "TD3 on HalfCheetah-v5"),
-        lambda n: of_paper(n, "TD3 on HalfCheetah-v5").update(p=0.06),
+        "On HalfCheetah SAC and TD3 end above the paper,",
+        lambda n: all(is_above_paper(n, f"{name} on HalfCheetah-v5") for name in ("SAC", "TD3")),
+        lambda n: of_paper(n, "SAC on HalfCheetah-v5").update(p=0.06),
     ),
     (
         "baselines.md",
         "but not clearly above CleanRL",
-        lambda n: n["full"]["numbers"]["TD3 on HalfCheetah-v5"]["cleanrl"]["p"] > 0.05,
+        lambda n: all(
+            n["full"]["numbers"][f"{name} on HalfCheetah-v5"]["cleanrl"]["p"] > 0.05
+            for name in ("SAC", "TD3")
+        ),
         lambda n: n["full"]["numbers"]["TD3 on HalfCheetah-v5"]["cleanrl"].update(p=0.04),
     ),
     (
