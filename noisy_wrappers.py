@@ -741,7 +741,7 @@ class RandomEarlyTermination(NoiseWrapper):
 
 
 class RandomNormalNoisyAction(NoiseWrapper):
-    """Adds Gaussian noise to the action: a + e with e ~ N(loc, scale^2 I). Ours, not the paper's.
+    """Adds Gaussian noise to the action: a + e with e ~ N(loc, scale^2 I). Not in the paper.
 
     The environment receives a + e clipped to its action space, in the space's dtype; the caller's
     action is left as it is. ``scale`` and ``loc`` are in units of the action, the same in every
@@ -785,7 +785,7 @@ class RandomNormalNoisyAction(NoiseWrapper):
 
 
 class RandomActionDelay(NoiseWrapper):
-    """Delays the actions of an episode by k steps, k uniform on low, ..., high. Not the paper's.
+    """Delays the actions of an episode by k steps, k uniform on low, ..., high. Not in the paper.
 
     At ``reset()`` the episode is chosen with probability p, and k is drawn,
     ``noise.integers(low, high, endpoint=True)``; it is drawn for the others too, so that a higher
@@ -856,7 +856,7 @@ _STATISTICS = ("meaninertia", "meanmass", "meansize", "extent", "center")
 
 
 class RandomDynamics(NoiseWrapper):
-    """Scales masses, frictions and the like of a MuJoCo model for an episode. Not the paper's.
+    """Scales masses, frictions and the like of a MuJoCo model for an episode. Not in the paper.
 
     At ``reset()`` the episode is chosen with probability p. In a chosen one, each row of the named
     ``fields`` of the simulator's model (that of a body, a geom, a joint, an actuator) is its own
@@ -1615,8 +1615,8 @@ def noise_slug(noises: Sequence[str], rates: Sequence[float | str]) -> str:
 
 def _words(noise: str) -> str:
     """Return a noise as a part of a file's name; different noises have different ones."""
-    joined = noise.replace("', '", "-")  # keys=('a', 'b') is keys=a-b
-    words = _safe("_".join(re.findall(r"[^(), ']+", joined)))
+    plain = noise.replace("=(", "=").replace("', '", "-").replace("'", "")  # keys=a-b
+    words = _safe("_".join(re.findall(r"[^(), ]+", plain)))
     if re.sub(r"'[A-Za-z_][A-Za-z0-9_.]*'", "", noise).count("'"):  # a key that is no plain name
         words += "_" + hashlib.sha256(noise.encode()).hexdigest()[:8]
     return words
