@@ -1209,7 +1209,8 @@ class EnvState:
         Raises:
             ValueError: a state of another number of generators or noise wrappers.
         """
-        random.setstate(state["python"])
+        version, words, normal = state["python"]
+        random.setstate((version, tuple(words), normal))
         np.random.set_state(state["numpy"])
         for generator, stream in zip(self._generators(), state["generators"], strict=True):
             if isinstance(generator, np.random.RandomState):

@@ -516,14 +516,14 @@ class Run:
             lock = os.open(self.folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
             self.lock = os.fdopen(lock)
             fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
-            old = [Path(name).with_suffix(".tmp") for name in self.FILES]  # of a killed process
+            result, _, self.checkpoint, *_ = ours = [self.folder / name for name in self.FILES]
+            old = [path.with_suffix(".tmp") for path in ours]  # of a process that was killed
             if args.overwrite:
-                old += [*self.FILES, "robustness.csv", *self.folder.glob(self.EVENTS)]
-            for name in old:
-                Path(self.folder, name).unlink(missing_ok=True)
-        self.checkpoint, result = self.folder / "checkpoint.pt", self.folder / "result.json"
+                old += [*ours, self.folder / "robustness.csv", *self.folder.glob(self.EVENTS)]
+            for path in old:
+                path.unlink(missing_ok=True)
         self.is_finished = result.exists()
-        if any((self.folder / name).exists() for name in self.FILES):
+        if any(path.exists() for path in ours):
             self.config = self._old_config()
         else:
             if args.eval_frequency is None:
