@@ -205,13 +205,14 @@ def tensors(value):
 
 
 def events(path):
-    """All scalars in TensorBoard, without the speed -> {tag: [(step, value), ...]}."""
+    """All scalars in TensorBoard, of the speed the steps alone -> {tag: [(step, value), ...]}."""
     accumulator = EventAccumulator(str(path), size_guidance={"scalars": 0, "tensors": 0})
     tags = accumulator.Reload().Tags()
     found = {tag: accumulator.Tensors(tag) for tag in tags["tensors"]}
     found = {tag: [event.step for event in found[tag]] for tag in found}
-    for tag in set(tags["scalars"]) - {"charts/SPS"}:
+    for tag in tags["scalars"]:
         found[tag] = [(event.step, repr(event.value)) for event in accumulator.Scalars(tag)]
+    found["charts/SPS"] = [(step, "") for step, _ in found.get("charts/SPS", [])]
     return found
 
 
