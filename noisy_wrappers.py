@@ -24,6 +24,7 @@ never touched, so initial states are the same with and without noise.
 
 import ast
 import contextlib
+import copy
 import functools
 import hashlib
 import importlib
@@ -717,10 +718,10 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     A learner that receives NaN does not recover, and may never show it. So this raises
     NotFiniteError, which says whether the action was already NaN, as after a divergence. Rewards
     become floats and the two ends bools; they may be arrays of one element, but not strings.
-    Observations are copied, because an environment may write the next one into the same array. An
-    observation that has not the shape of its space, and a step of four values, raise SpaceError.
-    The spaces are looked up once, because an environment may make new ones, with new generators, at
-    every access.
+    Observations are copied, because an environment may write the next one into the same array, and
+    actions, because it may write into those. An observation that has not the shape of its space,
+    and a step of four values, raise SpaceError. The spaces are looked up once, because an
+    environment may make new ones, with new generators, at every access.
 
     >>> env = FiniteNumbers(gym.make("Pendulum-v1", disable_env_checker=True))
     >>> _ = env.reset(seed=0)
@@ -752,7 +753,7 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """Step the environment and check the observation and the reward."""
         self._steps += 1
         try:
-            observation, reward, terminated, truncated, info = self.env.step(action)
+            observation, reward, terminated, truncated, info = self.env.step(copy.copy(action))
         except (TypeError, ValueError) as error:
             values = "(observation, reward, terminated, truncated, info)"
             self._refuse_old_api(f"step() must return {values}", error)
@@ -768,13 +769,13 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return self._of_right_shape(observation), number, bool(terminated), bool(truncated), info
 
     def _of_right_shape(self, observation: Any) -> NDArray[Any]:
-        copy = np.array(observation)
-        if copy.shape != self._shape:
+        array = np.array(observation)
+        if array.shape != self._shape:
             raise SpaceError(
                 f"step {self._steps} of an episode: the environment returned an observation of "
-                f"shape {copy.shape}, and its observation_space has shape {self._shape}"
+                f"shape {array.shape}, and its observation_space has shape {self._shape}"
             )
-        return copy
+        return array
 
     def _refuse_old_api(self, wanted: str, error: Exception) -> None:
         """Raise SpaceError if a wrapper, and not the environment's own code, could not unpack."""

@@ -167,8 +167,7 @@ class Rollout:
 
     def __init__(self, steps, env):
         self.observations = np.zeros((steps + 1, *env.observation_space.shape), np.float32)
-        self.eps = np.zeros((steps, *env.action_space.shape), np.float32)
-        self.actions = np.zeros((steps, *env.action_space.shape), np.float32)
+        self.eps, self.actions = np.zeros((2, steps, *env.action_space.shape), np.float32)
         self.rewards, self.dones = np.zeros((2, steps), np.float32)  # done: ended in whatever way
         self.discounted_return = 0.0
 
@@ -249,9 +248,8 @@ def updater(loss, network, optimizer, args):
 
 def make_policy(agent, observation_stats, env):
     """Return the test policy, NumPy to NumPy: mean actions, observation statistics as they are."""
-    act, space = in_numpy(agent.actor_mean), env.action_space
-    normalize = observation_stats.normalize
-    return lambda observation: noisy.into_space(act(normalize(observation)), space)
+    act, normalize = in_numpy(agent.actor_mean), observation_stats.normalize
+    return lambda observation: noisy.into_space(act(normalize(observation)), env.action_space)
 
 
 def learn(args, env, test_env, stop):
@@ -452,7 +450,6 @@ def make_envs(args):
         noise, noise_rate = noisy.canonical_noises(args.noise, args.noise_rate)
     except ValueError as error:
         fail(error)
-    args = replace(args, env_id=env_id, noise=noise, noise_rate=noise_rate)
     limit = {"max_episode_steps": args.max_episode_steps}
     noisy.seed_globals(args.seed)
     with make_env(env_id, **limit) as test_env, make_env(env_id, **limit) as env:
@@ -462,7 +459,7 @@ def make_envs(args):
             say(f"{env_id}: observations are flattened to {test_env.observation_space}")
         if not (args.max_episode_steps or gym.spec(env_id.rpartition(":")[2]).max_episode_steps):
             say(f"{env_id} declares no time limit, so --max-episode-steps is {STEP_LIMIT:,}")
-        yield args, env, test_env
+        yield replace(args, env_id=env_id, noise=noise, noise_rate=noise_rate), env, test_env
 
 
 def train(args, stop=lambda: False):
@@ -513,7 +510,8 @@ def prepare_compiler():
 def start_again(error):
     """If compiling failed, start again with a new cache for the compiler, and then without it."""
     if type(error).__module__.startswith(("torch._dynamo", "torch._inductor")):
-        say(f"not compiled, starting again: {str(error).strip().partition(chr(10))[0]}")
+        reason = str(getattr(error, "inner_exception", error)).strip()
+        say(f"not compiled, starting again: {reason.partition(chr(10))[0]}")
         cache = f"torchinductor_{os.getpid()}_"  # os.execv keeps the process number
         options = ["--no-compile"] if cache in os.environ["TORCHINDUCTOR_CACHE_DIR"] else []
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = tempfile.mkdtemp(prefix=cache)
@@ -562,9 +560,8 @@ class Run:
             noises = zip(args.noise, args.noise_rate, strict=True)
             noises = " + ".join(f"{noise} at {rate}" for noise, rate in noises)
             begun = f"{algorithm} on {args.env_id} | noise: {noises or 'none (baseline)'}"
-            device = "cuda" if args.cuda else "cpu"
-            steps = f"{args.total_timesteps:,} steps"
-            say(f"{begun} | seed {args.seed} | {steps} | {device} | {self.folder}")
+            begun += f" | seed {args.seed} | {args.total_timesteps:,} steps"
+            say(f"{begun} | {'cuda' if args.cuda else 'cpu'} | {self.folder}")
             self._note_versions(precision)
             if args.compile:
                 prepare_compiler()
@@ -611,12 +608,12 @@ class Run:
         self._write("config.json", json.dumps(self.config, indent=2) + "\n")
         self._write("eval.csv", self.eval_csv)
         with self._writing("events.*"):
-            for path in self.folder.glob(
-                self.EVENTS
-            ):  # cut off what was logged after the checkpoint
-                size = sizes.get(path.name, 0)
-                os.truncate(path, min(size, path.stat().st_size)) if size else path.unlink()
-            # a TensorBoard that is running has read it, and is told to forget it
+            # what was logged after the checkpoint is removed, and purged by a TensorBoard that runs
+            for path in self.folder.glob(self.EVENTS):
+                if path.name in sizes:
+                    os.truncate(path, min(path.stat().st_size, sizes[path.name]))
+                else:
+                    path.unlink()
             self.writer = SummaryWriter(str(self.folder), purge_step=step + 1)
         if step == 0:
             table = "".join(f"|{name}|{value}|\n" for name, value in asdict(self.args).items())
@@ -632,8 +629,9 @@ class Run:
             self.writer.file_writer.add_summary(hparams(columns, {})[1])
         self.saved_step, self.printed, self.last_test = step, time.monotonic(), ""
         self.first_step, self.first_time = step, time.monotonic() - 1e-6
-        total = self.args.total_timesteps
-        self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None)  # on terminals
+        self.bar = tqdm(
+            total=self.args.total_timesteps, initial=step, file=sys.stdout, disable=None
+        )
         return step
 
     def _load(self):
@@ -670,9 +668,7 @@ class Run:
 
     def log(self, step, **groups):
         """Log numbers as group/name to TensorBoard; show the progress."""
-        tags = {}
-        for group, values in groups.items():
-            tags |= {f"{group}/{name}": float(value) for name, value in values.items()}
+        tags = {f"{g}/{n}": float(x) for g, values in groups.items() for n, x in values.items()}
         if not all(map(math.isfinite, tags.values())):
             reason = f"step {step}: training diverged, some values are not finite: {tags}"
             raise noisy.NotFiniteError(reason)

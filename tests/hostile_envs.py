@@ -1,7 +1,8 @@
 """Somebody else's environment, `hostile_envs:Hostile-v0`: right by the API, and all unusual.
 
 It has worker processes, makes a new action space at every access and asserts that actions are in
-it, ends episodes with arrays, draws global random numbers, declares no time limit and writes a file
+it, ends episodes with arrays, draws global random numbers, writes
+into the actions it gets, declares no time limit and writes a file
 when it is closed: HOSTILE_LOG names it.
 """
 
@@ -67,6 +68,7 @@ class Hostile(gym.Env):
         self.ask(self.steps)
         observation = np.array([random.gauss(0, 1), np.random.normal()])
         reward = np.array([float(action[0]) * observation[0]])
+        action[:] = HIGH  # it is its own array, the environment thinks
         terminated, truncated = np.array([self.steps == self.length]), np.bool_(False)
         return observation, reward, terminated, truncated, {}
 

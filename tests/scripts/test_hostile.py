@@ -285,7 +285,9 @@ def test_actions_at_the_bounds_are_inside_the_space(algorithm, dtype, tmp_path):
                 actor = script.Actor(env).requires_grad_(False)
                 action = actor.policy(observation, np.float32([sign * 1000]))
             assert env.action_space.contains(action), action
+            before = action.copy()
             env.step(action)
+            np.testing.assert_array_equal(action, before)  # what a buffer stores
 
 
 @pytest.mark.parametrize("name", ["HostileHalf", "HostileDouble"])
