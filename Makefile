@@ -26,6 +26,7 @@ lint: $(BIN)/.dev
 # The tables that results/study computes from results/data, and the tables in the pages. Those of a
 # finished study were computed once, at the commit that results/tables/README.md names.
 results: $(BIN)/.dev
+	$(BIN)/python -m results.study
 	$(BIN)/cog -r -P -I . -p "from results.study.show import table" results/*.md results/data/*.md results/tables/*.md
 
 clean:

@@ -1,10 +1,10 @@
 """Train PPO and play each of its tests in six ways, to find how the paper tested PPO.
 
-    nice python results/experiments/paper_tests.py --runs-dir runs/paper_tests --jobs 2
+    nice python -m results.experiments.paper_tests --runs-dir runs/paper_tests --jobs 2
 
 50 runs of ppo_continuous_noisy.py, seed 1 of everything first. Beside the files of a run its folder
-gets tests.csv, with the columns way, step, episode and episodic_return; ways.py explains the ways.
-The training is the script's own: its eval.csv does not change.
+gets tests.csv, with the columns way, step, episode and episodic_return. The training is the
+script's own: its eval.csv does not change. results/baselines.md has the rules and the results.
 
 You can stop it at any time with Ctrl-C or SIGTERM. The same command again skips finished runs and
 starts unfinished ones anew.
@@ -15,19 +15,42 @@ import multiprocessing
 import signal
 import sys
 import traceback
-from pathlib import Path
+from itertools import product
 from unittest import mock
 
 import numpy as np
 from gymnasium.wrappers import NormalizeObservation
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from ways import ACTIONS, STATISTICS, planned_runs  # noqa: E402
+import ppo_continuous_noisy as ppo
+from noisy_wrappers import run_folder
 
-import ppo_continuous_noisy as ppo  # noqa: E402
-from noisy_wrappers import run_folder  # noqa: E402
+# The statistics that normalize the observations of a test: those of training, frozen; the test
+# environment's own, accumulated over all tests of a run; its own, begun anew in each test.
+STATISTICS = ("training", "own", "own_per_test")
+ACTIONS = ("mean", "sampled")
+WAYS = tuple(f"{statistics}-{actions}" for statistics, actions in product(STATISTICS, ACTIONS))
+COMPARED = {  # with and without the paper's best noise of PPO
+    "Hopper-v5": ("RandomNormalNoisyReward(1.0)", 1.0),
+    "Walker2d-v5": ("RandomUniformScaleReward(0.8, 1.2)", 0.05),
+}
+CONTROLS = ("HalfCheetah-v5", "Pusher-v5")  # without noise
+SEEDS, CONTROL_SEEDS = range(1, 11), range(1, 6)
 
 make_policy, evaluate = ppo.make_policy, ppo.evaluate  # the script's own
+
+
+def planned_runs():
+    """Return (env_id, noise, noise_rate, seed) of every run, seed 1 of everything first.
+
+    noise and noise_rate are tuples, as in the script's Args.
+    """
+    runs = []
+    for seed in SEEDS:
+        for env_id, (noise, rate) in COMPARED.items():
+            runs += [(env_id, (), (), seed), (env_id, (noise,), (rate,), seed)]
+        if seed in CONTROL_SEEDS:
+            runs += [(env_id, (), (), seed) for env_id in CONTROLS]
+    return runs
 
 
 class SixWays:
@@ -54,11 +77,8 @@ class SixWays:
         """Return the results of the script's test, and play it in the other ways."""
         results = evaluate(policy, env, episodes, stop)
         played = {"training-mean": results[:, 0]}
-        for statistics in STATISTICS:
-            for actions in ACTIONS:
-                way = f"{statistics}-{actions}"
-                if way not in played:
-                    played[way] = self.play(statistics, actions, episodes)[:, 0]
+        for way in WAYS[1:]:
+            played[way] = self.play(*way.split("-"), episodes)[:, 0]
         self.tests.append(played)
         return results
 

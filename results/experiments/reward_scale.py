@@ -1,6 +1,6 @@
 """How early termination changes the scale of PPO's reward.
 
-    python results/experiments/reward_scale.py
+    python -m results.experiments.reward_scale
 
 PPO divides the reward by the standard deviation of the discounted return so far. Gymnasium begins
 this return anew when an episode is terminated; gym and Gymnasium before 0.27 did so at any end of
@@ -9,15 +9,13 @@ data/reward_scale/reward_scale.csv: the standard deviation on Pusher-v5 with the
 an untrained policy (standard normal, clipped) under both rules.
 """
 
-import sys
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pandas as pd
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from noisy_wrappers import make_noisy  # noqa: E402
+from noisy_wrappers import make_noisy
 
 STEPS, GAMMA = 100_000, 0.99
 NOISES = ["", "RandomEarlyTermination(50)", "RandomEarlyTermination(50, truncate=True)"]

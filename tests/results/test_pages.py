@@ -5,8 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 from results.study import show
 
 RESULTS = Path(show.__file__).parents[1]
@@ -27,16 +25,27 @@ def test_every_table_is_described():
     assert described == files
 
 
-@pytest.mark.parametrize(
-    ("columns", "expected"),
-    [
-        (None, "| a [95 %] | b |\n|---|---|\n| 1.50 | – |\n| x | 2 |\n"),
-        ({"b": "{b:,.0f}"}, "| b |\n|---|\n| 2,000 |\n"),
-    ],
-)
-def test_a_table_by_hand(columns, expected, tmp_path, monkeypatch, capsys):
-    rows = "1.50,\nx,2\n" if columns is None else "1.50,2000\n"
-    (tmp_path / "t.csv").write_text(f"a [95 %],b\n{rows}")
-    monkeypatch.setattr(show, "TABLES", tmp_path)
-    show.table("t.csv", columns)
-    assert capsys.readouterr().out == expected
+def shown(text, folder, monkeypatch, capsys, **where):
+    (folder / "t.csv").write_text(text)
+    monkeypatch.setattr(show, "TABLES", folder)
+    show.table("t.csv", **where)
+    return capsys.readouterr().out
+
+
+def test_a_table_is_shown_as_it_is(tmp_path, monkeypatch, capsys):
+    out = shown("a [95 %],b\n1.50,\nx,2\n", tmp_path, monkeypatch, capsys)
+    assert out == "| a [95 %] | b |\n|---|---|\n| 1.50 | – |\n| x | 2 |\n"
+    out = shown("page,b\np,1\nq,2\n", tmp_path, monkeypatch, capsys, page="q")
+    assert out == "| b |\n|---|\n| 2 |\n"
+
+
+def test_a_comparison_is_spelled(tmp_path, monkeypatch, capsys):
+    text = "n,mean,sd,n_without,mean_without,sd_without,p\n3,1234.56,2,4,-9,1,0.0123\n,,,,,,0.5\n"
+    out = shown(text, tmp_path, monkeypatch, capsys).splitlines()
+    assert out[0] == "| n | with noise | without | p |"
+    assert out[2] == "| 3 + 4 | 1,234.6 ± 2.0 | -9.0 ± 1.0 | 0.012 |"
+    assert out[3] == "| – | – | – | 0.5 |"
+
+
+def test_no_minus_zero():
+    assert show.spell("{a:+z.0f}", {"a": "-0.2"}) == "+0"
