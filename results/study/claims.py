@@ -69,23 +69,19 @@ def best_noises_of_ppo(runs):
     corrected = dict(zip(found, holm([f["p"] for f in found.values()]), strict=True))
     everything = pooled.best_noises().set_index("environment")
     for name, f in found.items():
-        gain, planned = everything.loc[name, "paper_percent"], corrected[name]
-        claim = f"Best noise helps PPO on {name}"
+        gain, claim = everything.loc[name, "paper_percent"], f"Best noise helps PPO on {name}"
         if name == "Pusher":  # which had the smallest p: so it was run again
             fresh = runs[runs["seed"].isin(FRESH)]
             samples = select(fresh, "PPO", name, ENDING, "1.0"), select(fresh, "PPO", name)
             f = compare(*samples, mann_whitney_p)
-            page, planned = "pusher", f["p"]
-            claim = "Episodes of 50 steps help PPO on Pusher"
-        else:
-            page = "best"
-        effect = f["difference"], planned
-        rows.append(row(claim, page, gain, percents(f), [effect], f"runs: {sizes(f)}"))
+            effect, claim = (f["difference"], f["p"]), "Episodes of 50 steps help PPO on Pusher"
+            rows.append(row(claim, "pusher", gain, percents(f), [effect], f"runs: {sizes(f)}"))
+            continue
+        effect = f["difference"], corrected[name]
+        rows.append(row(claim, "best", gain, percents(f), [effect], f"runs: {sizes(f)}"))
         f = everything.loc[name]
-        if name != "Pusher":
-            effect, page = (f["difference"], f["holm"]), "all"
-            claim, n = f"{claim}, all runs", f"all: {sizes(f)}"
-            rows.append(row(claim, page, gain, percents(f), [effect], n, after=True))
+        effect, claim, n = (f["difference"], f["holm"]), f"{claim}, all runs", f"all: {sizes(f)}"
+        rows.append(row(claim, "all", gain, percents(f), [effect], n, after=True))
     return rows
 
 
