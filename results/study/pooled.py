@@ -4,7 +4,6 @@ Batches of runs for different questions share configurations. A run that two of 
 once. The test is that of the first page, Mann-Whitney's.
 """
 
-import numpy as np
 import pandas as pd
 
 from results.study.compare import average_change, compare, holm, mann_whitney_p
@@ -138,29 +137,3 @@ def consistent_rows():
             found |= {"average_percent": change, "low_percent": low, "high_percent": high}
             rows.append(found | {"p": p, "paper_percent": row.average_improvement_percent})
     return pd.DataFrame(rows)
-
-
-def sac_and_td3():
-    """Return the tests of SAC's and TD3's baselines against published returns, with Holm's p."""
-    table = pd.read_csv(RESULTS / "tables/baselines.csv")
-    rows = [
-        (row["baseline"], row["total_timesteps"], name, row[f"{who}_se"], row[f"{who}_p"])
-        for row in table[~table["baseline"].str.startswith("PPO")].to_dict("records")
-        for who, name in (("paper", "the paper"), ("cleanrl", "CleanRL"))
-    ]
-    found = pd.DataFrame(rows, columns=["baseline", "steps", "against", "se", "p"]).dropna()
-    return found.assign(holm=holm(found["p"]))
-
-
-def splits(gain=36.1, trials=200_000):
-    """Split 20 of the 50 baselines of PPO on HalfCheetah at random into two tens.
-
-    Return the percent of splits in which the first is better by the paper's gain (in percent) or
-    more, and in which one of the two is.
-    """
-    base = select(read_returns("runs"), "PPO", "HalfCheetah")
-    draws = np.random.default_rng(0).permuted(np.tile(base, (trials, 1)), axis=1)[:, :20]
-    first, second = draws.reshape(trials, 2, 10).mean(axis=2).T
-    better, worse = first >= (1 + gain / 100) * second, second >= (1 + gain / 100) * first
-    percents = [round(100 * which.mean(), 1) for which in (better, better | worse)]
-    return pd.DataFrame([percents], columns=["the first is better, %", "one of the two is, %"])

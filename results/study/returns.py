@@ -15,11 +15,12 @@ def read_returns(*names, step=None):
 
     Columns: folder, algorithm ("PPO"), environment ("Hopper"), version ("v5"), noise (as in
     "RandomNormalNoisyReward(1.0)", several joined by " + ", "" without noise), rate (a text, too),
-    seed, steps (of training), and test: the mean test return at the end, or after `step` steps.
+    seed, steps (of training), test: the mean test return at the end, or after `step` steps, and
+    training: the mean of the last 100 training episodes.
     """
     rows = []
     for name in names:
-        for path in sorted((DATA / name).glob("*/result.json")):
+        for path in sorted((DATA / name).rglob("result.json")):
             args = json.loads((path.parent / "config.json").read_text())["args"]
             environment, version = args["env_id"].split("-")
             row = {"folder": name, "algorithm": args["exp_name"].split("_")[0].upper()}
@@ -27,11 +28,11 @@ def read_returns(*names, step=None):
             row |= {"noise": " + ".join(args["noise"])}
             row |= {"rate": " + ".join(f"{rate}" for rate in args["noise_rate"])}
             row |= {"seed": args["seed"], "steps": args["total_timesteps"]}
-            if step is None:
-                row["test"] = json.loads(path.read_text())["final_return_mean"]
-            else:
+            result = json.loads(path.read_text())
+            row["test"] = result["final_return_mean"]
+            if step is not None:
                 row["test"] = read_curve(path.parent)[step]
-            rows.append(row)
+            rows.append(row | {"training": result["train_return_mean_last_100"]})
     return pd.DataFrame(rows)
 
 

@@ -30,11 +30,13 @@ COLUMNS = {
         "test return": "{mean:,.1f} ± {sd:,.1f}",
     },
     "baselines_sac_td3.csv": {
-        "baseline": "{baseline}",
-        "steps": "{steps:,.0f}",
-        "against": "{against}",
-        "standard errors": "{se:+.1f}",
-        "p (Welch)": "{p:.2g}",
+        "baseline": "{algorithm} on {environment}",
+        "steps": "{steps:,}",
+        "ours, v5": "{mean:,.0f} ± {sd:,.0f} ({n})",
+        "published (n)": "{theirs:,.0f} ± {their_sd:,.0f} ({their_n:.0f})",
+        "by": "{source}",
+        "SE": "{se:+.1f}",
+        "p": "{p:.2g}",
         "Holm": "{holm:.2g}",
     },
     "consistent_rows.csv": {

@@ -8,9 +8,10 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from results.study import __main__, claims, compare, returns
+from results.study import __main__, baselines, claims, compare, returns
 
 NOISE = "RandomNormalNoisyReward(1.0)"
+RESULT = {"train_return_mean_last_100": 0.0}
 
 
 def write_run(folder, test, noise="", rate=1.0, seed=1, env_id="Hopper-v5"):
@@ -20,7 +21,7 @@ def write_run(folder, test, noise="", rate=1.0, seed=1, env_id="Hopper-v5"):
     args = {"exp_name": "ppo_continuous_noisy", "env_id": env_id, "seed": seed}
     args |= {"noise": [noise] if noise else [], "noise_rate": [rate] if noise else []}
     (path / "config.json").write_text(json.dumps({"args": args | {"total_timesteps": 20}}))
-    (path / "result.json").write_text(json.dumps({"final_return_mean": test}))
+    (path / "result.json").write_text(json.dumps(RESULT | {"final_return_mean": test}))
     rows = f"10,0,-1\n10,1,1\n20,0,{test - 1}\n20,1,{test + 1}\n"
     (path / "eval.csv").write_text("step,episode,episodic_return\n" + rows)
 
@@ -141,6 +142,25 @@ def test_reading_runs(data):
     assert list(returns.select(once, "PPO", "Hopper")) == [4, 5]
     assert list(returns.select(once, "PPO", "Hopper", NOISE, "0.01")) == [3]
     assert list(returns.read_returns("a", step=10)["test"]) == [0, 0]
+
+
+@pytest.mark.slow
+def test_the_study_agrees_with_the_finished_one():
+    """Another program computed the finished tables: its p, standard errors and percent are here."""
+    theirs = pd.read_csv(returns.RESULTS / "tables/baselines.csv")
+    sac = theirs[theirs["baseline"] == "SAC on HalfCheetah-v5"].iloc[0]
+    ours = baselines.sac_and_td3().query("algorithm == 'SAC' and steps == 1_000_000")
+    assert list(ours["p"]) == pytest.approx([sac["paper_p"], sac["cleanrl_p"]], rel=1e-4)
+    assert list(ours["se"]) == pytest.approx([sac["paper_se"], sac["cleanrl_se"]], rel=1e-4)
+    table = pd.read_csv(returns.RESULTS / "tables/early_termination.csv", index_col=0)
+    row = table.loc["terminated at 50, none: fresh seeds 11 to 30"]
+    runs = returns.read_returns("runs").query("11 <= seed <= 30")
+    noise = "RandomEarlyTermination(50)", "1.0"
+    samples = (returns.select(runs, "PPO", "Pusher", *config) for config in (noise, ()))
+    found = compare.compare(*samples, compare.mann_whitney_p)
+    assert f"{found['difference_percent']:+.1f} %" == row["change"]
+    assert "{difference:+.1f} [{low:.1f}, {high:.1f}]".format(**found) == row["difference [95 %]"]
+    assert f"{found['p']:.2g}" == f"{row['p']:.2g}"
 
 
 @pytest.mark.slow
