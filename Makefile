@@ -30,10 +30,10 @@ lint: $(BIN)/.dev
 # finished study were computed once, at the commit that results/tables/README.md names.
 results: $(BIN)/.dev
 	$(BIN)/python -m results.study
-	$(BIN)/cog -r -P -I . -p "from results.study.show import table" results/*.md results/data/*.md results/tables/*.md
+	$(BIN)/python -m cogapp -r -P -I . -p "from results.study.show import table" results/*.md results/*/README.md
 
 clean:
-	rm -rf .venv runs/demo results/report
+	rm -rf .venv runs/demo
 
 $(BIN)/python:
 	$(PYTHON) -m venv .venv
