@@ -1,6 +1,9 @@
 # `make demo` and `make test` need git and Python 3.11 or newer with venv; they make .venv first.
+# A .venv that exists is kept: pip installs what is missing in it or has another version.
 PYTHON ?= python3
 BIN := .venv/bin
+SHELL := bash
+.SHELLFLAGS := -o pipefail -c
 
 .PHONY: demo test lint results clean
 
@@ -23,32 +26,33 @@ lint: $(BIN)/.dev
 	for script in benchmark.sh sweep/executors.sh .ci/run; do bash -n $$script || exit; done
 	$(BIN)/shellcheck --external-sources --check-sourced benchmark.sh .ci/run
 
-# What one command can make again, from the runs in results/data. Only what the pages show is kept
-# in git; results/report has everything.
-results: $(BIN)/.run
-	$(BIN)/python analyze.py --runs-dir results/data/runs --out results/report --compare results/paper
-	cp results/report/*.csv results/tables
-	cp results/report/curves_PPO_RandomEarlyTermination_50.svg results/figures
-	$(BIN)/python results/pages/readme.py
-	$(BIN)/python results/pages/further_tables.py
-	$(BIN)/python results/pages/baselines.py
-	$(BIN)/python results/pages/ablation.py
-	$(BIN)/python results/pages/reconstruction.py
-	$(BIN)/python results/pages/data_readme.py
-	$(BIN)/python results/pages/future_work.py
-	$(BIN)/python results/pages/robustness.py
-	$(BIN)/python results/pages/precision.py
+# The tables that results/study computes from results/data, and the tables in the pages. Those of a
+# finished study were computed once, at the commit that results/tables/README.md names.
+results: $(BIN)/.dev
+	$(BIN)/python -m results.study
+	$(BIN)/python -m cogapp -r -P -I . -p "from results.study.show import table" results/*.md results/*/README.md
 
 clean:
-	rm -rf .venv runs/demo results/report
+	rm -rf .venv runs/demo
 
 $(BIN)/python:
 	$(PYTHON) -m venv .venv
 
-$(BIN)/.run: requirements.txt | $(BIN)/python
-	$(BIN)/pip install --quiet --requirement $<
-	touch $@
+# pip shows its own progress on a terminal; elsewhere one line tells each package.
+INSTALL = if [ -t 1 ]; then $(BIN)/python -m pip install --requirement $<; else \
+	$(BIN)/python -m pip install --progress-bar off --requirement $< \
+	| sed -nu -e 's/^Collecting \([^ ]*\).*/installing \1/p' -e '/^Successfully/p'; fi
 
-$(BIN)/.dev: requirements-dev.txt requirements.txt | $(BIN)/python
-	$(BIN)/pip install --quiet --requirement $<
-	touch $@ $(BIN)/.run
+$(BIN)/.size: | $(BIN)/python
+	@$(BIN)/python -c "import torch" 2>/dev/null || { \
+	echo "Installing into .venv: about 3 GB are fetched, most of them PyTorch's CUDA libraries."; \
+	echo "The CPU-only PyTorch makes it 0.4 GB: README.md, Install, says how. Ctrl-C stops here."; }
+	@touch $@
+
+$(BIN)/.run: requirements.txt | $(BIN)/.size
+	@$(INSTALL)
+	@touch $@
+
+$(BIN)/.dev: requirements-dev.txt requirements.txt | $(BIN)/.size
+	@$(INSTALL)
+	@touch $@ $(BIN)/.run
