@@ -416,16 +416,13 @@ def test_what_the_confirmation_can_show(tmp_path):
 
     def lines(words):
         args = arguments(words, tmp_path)
-        return [
-            line for line in choose.plan(choose.choices(args), args) if "fresh seeds conf" in line
-        ]
+        plan = choose.plan(choose.choices(args), args)
+        return [line for line in plan if "fresh seeds confirm" in line]
 
-    in_general = "25 fresh seeds confirm a true gain of 0.8 standard deviations over seeds with 80 "
-    assert lines(words) == [f"{in_general}% power"]
+    unit = "standard deviations over seeds with 80 % power"
+    assert lines(words) == [f"25 fresh seeds confirm a true gain of 0.8 {unit}"]
     [line] = lines(words.replace("ppo", "ppo | sac"))
-    assert line.endswith(
-        "0.9 standard deviations over seeds with 80 % power, corrected for 2 verdicts"
-    )
+    assert line.endswith(f" 0.9 {unit}, corrected for 2 verdicts")
     # Once there is a spread, in the return's own units
     two = f"{words} | RandomMixupObservation(0.5)@1 | --budget | 6 | --confirm | 5"
     [choice] = choose.choices(arguments(two, tmp_path))
