@@ -48,7 +48,8 @@ Options of choose
   --confirm N              fresh seeds for the final comparison (default: 25)
 
 Executor options
-  --dry-run             print the commands of the remaining runs and start nothing
+  --dry-run             print the commands of the remaining runs, and what they cost: for that, the
+                        environments are timed; start nothing
   --executor local      (default) runs side by side on this machine
   --executor parallel   GNU parallel, on this machine or over ssh
   --executor slurm      job arrays; submits and returns
