@@ -248,21 +248,17 @@ def speed_of(env_id, environment):
 # --------------------------------------------------------------------------------------- the memory
 
 
-def remembered(runs_dir, env_id):
-    """Return what was found when an environment was asked last, or None."""
-    try:
-        return Environment(**json.loads(file_of(runs_dir, env_id).read_text()))
-    except (OSError, ValueError, TypeError):  # it is asked again
-        return None
-
-
 def remember(runs_dir, env_id, environment):
-    """Keep what was found; an environment that cannot be written down is asked again."""
+    """Keep what was found, for a status."""
     path = file_of(runs_dir, env_id)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps(environment._asdict(), indent=2) + "\n")
-    temporary.replace(path)
+    path.write_text(json.dumps(environment))
+
+
+def remembered(runs_dir, env_id):
+    """Return what was found when an environment was asked last, or None."""
+    with contextlib.suppress(OSError, ValueError, TypeError):  # there is no file, or half of one
+        return Environment(*json.loads(file_of(runs_dir, env_id).read_text()))
 
 
 def file_of(runs_dir, env_id):
