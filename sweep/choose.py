@@ -16,6 +16,7 @@ from typing import NamedTuple
 from analysis.errors import fail
 from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED, read_run
 from analysis.statistics import detectable_shift, holm
+from noisy_wrappers import BASELINE, Configuration
 from sweep import halving
 from sweep.environment import ask_all, remember, remembered, run_seconds, time_left, wall_time
 from sweep.grid import NOISES, RATES, PlannedRun, cell, cells, make_run, of_the_paper, result
@@ -29,10 +30,9 @@ class Choice(NamedTuple):
     env_id: str
     schedule: list[tuple[int, int]]  # of its search
     confirm: int  # fresh seeds of the confirmation
-    cells: dict[tuple[str, str], tuple]  # (noise, rate) as text: (noises, rates), in order
     state: halving.State
-    runs: dict[tuple[str, str, int], PlannedRun]  # those that have been due so far
-    returns: dict[tuple[str, str, int], float]  # of those that are finished
+    runs: dict[tuple[Configuration, int], PlannedRun]  # those that have been due so far
+    returns: dict[tuple[Configuration, int], float]  # of those that are finished
     spread: float  # standard deviation over seeds of the search's last tests; NaN if unknown
     run_seconds: float | None  # about what a run takes, if anything tells
 
@@ -54,7 +54,7 @@ def choices(args, ask=False, keep=False):
     new = [(c.algorithm, c.env_id) for c in found if ask and not c.returns]
     if not new:
         return found
-    noises = {env_id: candidates(args, algorithm, env_id).values() for algorithm, env_id in new}
+    noises = {env_id: candidates(args, algorithm, env_id) for algorithm, env_id in new}
     for env_id, answer in ask_all(args, noises).items():
         leave_out(args, env_id, answer.unfit)
         known[env_id] = answer
@@ -91,19 +91,18 @@ def follow(args, algorithm, env_id, environment):
         fail(f"--budget {budget} is too large: the best noises would run with {last_seed} seeds")
     if not args.noises:
         check_others(args, algorithm, env_id)
-    all_cells = {halving.BASELINE: ([], [])} | noises
     runs, returns, last_tests = {}, {}, {}
     while True:
-        state = halving.advance(list(noises), budget, args.confirm, returns)
+        state = halving.advance(noises, budget, args.confirm, returns)
         finished = {}
-        for noise, rate, seed in state.due:
-            run = make_run(args, algorithm, env_id, *all_cells[noise, rate], seed)
-            runs[noise, rate, seed] = run
+        for noise, seed in state.due:
+            run = make_run(args, algorithm, env_id, noise, seed)
+            runs[noise, seed] = run
             if result(run)[0]:
                 row = read_finished(run)
-                finished[noise, rate, seed] = counted(row, seed)
+                finished[noise, seed] = counted(row, seed)
                 if seed < FIRST_CONFIRMATION_SEED:
-                    last_tests.setdefault((noise, rate), []).append(row["returns"][-1])
+                    last_tests.setdefault(noise, []).append(row["returns"][-1])
         if not finished:
             break
         returns |= finished
@@ -119,7 +118,6 @@ def follow(args, algorithm, env_id, environment):
         env_id=env_id,
         schedule=schedule,
         confirm=args.confirm,
-        cells=all_cells,
         state=state,
         runs=runs,
         returns=returns,
@@ -138,10 +136,10 @@ def check_others(args, algorithm, env_id):
         found = cell([(noise, rate)])
         if found in ours:
             continue
-        if result(make_run(args, algorithm, env_id, *found, seed=1))[0]:
+        if result(make_run(args, algorithm, env_id, found, seed=1))[0]:
             fail(
                 f"{args.runs_dir} holds a choice among other noises, one of them "
-                f"{halving.spelled(as_text(found))}: continue it (--noises paper tries all 90), "
+                f"{found}: continue it (--noises paper tries all 90), "
                 "or choose another --runs-dir"
             )
 
@@ -150,36 +148,25 @@ def runs_of(found):
     """Return the runs of all choices together, the first seed of everything first."""
     runs = []
     for choice in found:
-        runs += [(seed, run) for (_, _, seed), run in choice.runs.items()]
+        runs += [(seed, run) for (_, seed), run in choice.runs.items()]
     return [run for _, run in sorted(runs, key=lambda pair: pair[0])]
 
 
 def candidates(args, algorithm, env_id, unfit=()):
-    """Return the noises to choose from, each once: {(noise, rate) as text: (noises, rates)}.
-
-    unfit: the noises that cannot act in the environment.
-    """
-    noises = {}
-    for found in cells(args, algorithm, env_id):
-        if found != ([], []):  # at rate 0 a noise is none
-            noises[as_text(found)] = found
+    """Return the noises to choose from, each once, but for those that cannot act there."""
+    noises = dict.fromkeys(cells(args, algorithm, env_id))
+    noises.pop(BASELINE, None)  # at rate 0 a noise is none
     for pairs in args.exclude:
         if any(rate is None for _, rate in pairs):
             fail('--exclude needs a rate with each noise, as in "NOISE@0.1"')
-        excluded = as_text(cell(pairs))
+        excluded = cell(pairs)
         if excluded not in noises:
-            fail(f"--exclude: {' at '.join(excluded)} is not among the noises")
+            fail(f"--exclude: {excluded} is not among the noises")
         del noises[excluded]
-    noises = {key: found for key, found in noises.items() if key[0] not in unfit}
+    noises = [noise for noise in noises if noise.noise not in unfit]
     if not noises:
         fail("there is no noise to choose from")
     return noises
-
-
-def as_text(found):
-    """Spell a cell's noises and rates, as in config.json and tables: "A + B", "0.1 + 0.2"."""
-    noises, rates = found
-    return " + ".join(noises), " + ".join(map(str, rates))
 
 
 def read_finished(run):
@@ -295,7 +282,7 @@ def describe(choice):
     if number <= rounds:
         noises = f"{len(state.noises)} of {choice.schedule[0][0]} noises"
         return f"{choice.name}, round {number} of {rounds}: {noises}, {due}"
-    winner = halving.spelled(*state.noises)
+    [winner] = state.noises
     return f"{choice.name}, confirmation: {winner} against no noise, {due}"
 
 
@@ -313,7 +300,7 @@ def standing(found, args):
             yield f"  mean return after round {len(choice.state.rounds)}:"
             scores = choice.state.rounds[-1].scores
             for noise in sorted(choice.state.noises, key=scores.get, reverse=True):
-                yield f"  {scores[noise]:10.2f}  {halving.spelled(noise)}"
+                yield f"  {scores[noise]:10.2f}  {noise}"
     yield total(found, args)
 
 
@@ -361,11 +348,11 @@ def verdicts(found, judgements):
 def obstacle(choice):
     """Say that a choice cannot continue, and what to do."""
     text = f"{describe(choice)}. These did not finish; run the same command again to retry them."
-    for noise, rate, _ in choice.state.due:
-        pairs = zip(*choice.cells[noise, rate], strict=True)
-        excluded = "+".join(f"{one}@{own}" for one, own in pairs)
+    for configuration, _ in choice.state.due:
+        pairs = zip(*configuration.texts, strict=True)
+        excluded = "+".join(f"{noise}@{rate}" for noise, rate in pairs)
         advice = f'\n  If it fails every time, leave it out: --exclude "{excluded}"'
-        if noise and advice not in text:
+        if excluded and advice not in text:
             text += advice
     return text
 

@@ -39,7 +39,7 @@ class Environment(NamedTuple):
     episode_steps: int  # of a test: the time limit; without one, what the timed episodes had
     observed: int  # numbers in an observation
     bounded: bool  # are its actions? SAC and TD3 need that
-    unfit: dict[str, str]  # noises that cannot act here, joined by " + " -> why
+    unfit: dict[str, str]  # noises that cannot act here, as Configuration.noise -> why
 
 
 class Refused(Exception):
@@ -52,7 +52,7 @@ class Refused(Exception):
 def ask(env_id, configurations=(), max_episode_steps=None, clock=time.perf_counter):
     """Make an environment as the scripts do, time it, and try configurations of noise on it.
 
-    configurations: [(noises, rates)]. clock: what times the environment. Raises Refused if it
+    clock: what times the environment. Raises Refused if it
     cannot be made or played.
     """
     deadline = time.perf_counter() + PATIENCE
@@ -64,10 +64,10 @@ def ask(env_id, configurations=(), max_episode_steps=None, clock=time.perf_count
             seconds, steps, length = time_steps(env, declared or TIME_LIMIT, deadline, clock)
             env.reset()  # a failure after this one is the noise's
             unfit = {}
-            for noises, rates in configurations:
-                reason = why_unfit(env, noises, rates, declared or TIME_LIMIT, deadline)
+            for configuration in configurations:
+                reason = why_unfit(env, configuration, declared or TIME_LIMIT, deadline)
                 if reason:
-                    unfit[" + ".join(noises)] = reason
+                    unfit[configuration.noise] = reason
             return Environment(
                 step_seconds=seconds,
                 timed_steps=steps,
@@ -110,10 +110,10 @@ def time_steps(env, time_limit, deadline, clock):
     return stepping / steps + resetting / resets / length, steps, math.ceil(length)
 
 
-def why_unfit(env, noises, rates, time_limit, deadline):
+def why_unfit(env, configuration, time_limit, deadline):
     """Return why noises cannot act in an environment, or ""; after the deadline none is played."""
     try:
-        noisy_env = noisy.make_noisy(env, noises, rates)
+        noisy_env = configuration.wrap(env)
     except ValueError as error:
         return " ".join(str(error).split())
     for wrapper in noisy.noise_wrappers(noisy_env).values():
@@ -146,14 +146,14 @@ def in_a_line(error, env_id=""):
 def ask_all(args, configurations):
     """Ask environments, and say how fast they are; returns {env_id: Environment}.
 
-    configurations: {env_id: [(noises, rates)]}. Exits with a line for each environment that cannot
+    configurations: {env_id: [Configuration]}. Exits with a line for each environment that cannot
     be trained in, and for each algorithm that cannot act there.
     """
     options = script_options(script_of(args.algos[0]), tuple(args.extra))
     answers, reasons = {}, []
-    for env_id, noisy_cells in configurations.items():
+    for env_id, noises in configurations.items():
         try:
-            answer = ask(env_id, noisy_cells, options["max-episode-steps"])
+            answer = ask(env_id, noises, options["max-episode-steps"])
         except Refused as error:  # others may be wrong, too
             reasons.append(f"no algorithm can be trained in {env_id}: {error}")
             continue

@@ -25,7 +25,7 @@ import analysis.runs
 import analysis.statistics
 import analysis.tables
 import analyze
-from analysis.configurations import BASELINE, Configuration
+from noisy_wrappers import BASELINE, Configuration
 
 RESULTS = Path(analyze.__file__).parent / "results"
 NAN = float("nan")

@@ -6,6 +6,7 @@ import re
 import pytest
 from views import view
 
+from noisy_wrappers import BASELINE, Configuration
 from sweep import environment
 from sweep.environment import Environment, ask, remember, remembered, run_seconds, time_left
 from sweep.grid import make_run
@@ -23,7 +24,7 @@ def choose(env, *words, view_name="dry-run", algos=("ppo",)):
 def planned(algorithm, env_id, *words):
     """Return the baseline of a grid with these options."""
     args = parse_args("list", "/", ["custom", *words])
-    return make_run(args, algorithm, env_id, [], [], 1)
+    return make_run(args, algorithm, env_id, BASELINE, 1)
 
 
 @pytest.fixture(autouse=True)
@@ -50,7 +51,7 @@ def test_an_environment_that_is_too_slow_is_timed_by_fewer_steps(monkeypatch, tm
     line = re.search(r"toy_envs:Slow-v0: [\d.]+ ms a step \(only (\d+) steps were timed", shown.err)
     assert shown.code == 0 and 1 <= int(line[1]) <= 20
     monkeypatch.setattr(environment, "PATIENCE", -1)  # one that takes half a minute to be made
-    assert ask("toy_envs:Slow-v0", [([SCALE], [1.0])]).timed_steps == 1
+    assert ask("toy_envs:Slow-v0", [Configuration.read([SCALE], [1.0])]).timed_steps == 1
 
 
 def test_resets_count_in_proportion(monkeypatch):
