@@ -48,7 +48,8 @@ Options of choose
   --confirm N              fresh seeds for the final comparison (default: 25)
 
 Executor options
-  --dry-run             print the commands of the remaining runs and start nothing
+  --dry-run             print the commands of the remaining runs, and what they cost: for that, the
+                        environments are timed; start nothing
   --executor local      (default) runs side by side on this machine
   --executor parallel   GNU parallel, on this machine or over ssh
   --executor slurm      job arrays; submits and returns
@@ -104,7 +105,7 @@ while [ $# -gt 0 ]; do
       option=${1#--}
       printf -v "${option//-/_}" %s "$2"
       shift 2 ;;
-    --dry-run) dry_run=1 && shift ;;
+    --dry-run) dry_run=dry-run && shift ;;
     --wait) wait=1 && shift ;;
     -h | --help) usage || true; exit ;;
     --) grid+=("$@") && break ;;
@@ -133,14 +134,17 @@ print(*[name for name in sys.argv[1:] if not u.find_spec(name)], sep=', ')" \
 [ -z "$lacking" ] ||
   fail "'$PYTHON' lacks $lacking: set PYTHON, or install requirements.txt into .venv"
 
-show() { "$PYTHON" -m sweep "$1" "$caller" ${grid[@]+"${grid[@]}"}; }
+show() {
+  SWEEP_EXECUTOR=$executor SWEEP_JOBS=$jobs SWEEP_HOSTS=$sshlogin OMP_NUM_THREADS=1 \
+    "$PYTHON" -m sweep "$1" "$caller" ${grid[@]+"${grid[@]}"}
+}
 if [ $view = status ]; then
   show status
   exit
 fi
 
 list_todo() { # sets `lines`, all runs; and `todo`, those that are to do and were not yet tried
-  lines=$(show list) || exit $?
+  lines=$(show "${dry_run:-list}") || exit $?
   todo=$(awk -F'\t' -v OFS='\t' '$2 == "todo" {print $1, $3}' <<<"$lines" |
     grep -vxFf <(printf '%s\n' "$tried") || true)
   count=$(grep -c . <<<"$todo" || true)

@@ -24,7 +24,7 @@ import sys
 import tempfile
 import traceback
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import closing
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -51,6 +51,8 @@ from noisy_wrappers import (
     canonical_env_id,
     make_noisy,
     noise_slug,
+    seed_globals,
+    seeded_globals,
     split_noises,
 )
 
@@ -147,8 +149,9 @@ def read_conditions(args):
     return conditions
 
 
+@contextmanager
 def load(run, render_mode=None):
-    """Return a run's clean environment and its policy, NumPy to NumPy."""
+    """Yield a run's clean environment, closed at the end, and its policy, NumPy to NumPy."""
     name = f"{run.algorithm}_continuous_noisy".lower()
     try:
         script = importlib.import_module(name)
@@ -160,28 +163,30 @@ def load(run, render_mode=None):
         fail(error)
     steps = json.loads(run.arguments).get("max_episode_steps")
     drawn = {"render_mode": render_mode} if render_mode else {}  # not every class takes it
-    env = script.make_env(run.environment, max_episode_steps=steps, **drawn)
-    try:
-        return env, script.load_policy(run.folder, env)
-    except Exception as error:  # a damaged file may raise anything
-        fail(f"{run.folder / 'policy.pt'} is not a policy for {run.environment}: {reason(error)}")
+    seed_globals(Args.seed)  # as every episode does: the constructor may draw, too
+    with script.make_env(run.environment, max_episode_steps=steps, **drawn) as env:
+        try:
+            policy = script.load_policy(run.folder, env)
+        except Exception as error:  # a damaged file may raise anything
+            where = run.folder / "policy.pt"
+            fail(f"{where} is not a policy for {run.environment}: {reason(error)}")
+        yield env, policy
 
 
 def check_environment(run, conditions):
     """Exit unless the policy fits its environment and every noise can act on it."""
-    env, _ = load(run)
-    for noises, rates in conditions.values():
-        try:
-            make_noisy(env, noises, rates)
-        except ValueError as error:
-            fail(f"{run.folder}: {error}")
-    env.close()
+    with load(run) as (env, _):
+        for noises, rates in conditions.values():
+            try:
+                make_noisy(env, noises, rates)
+            except ValueError as error:
+                fail(f"{run.folder}: {error}")
 
 
 def play(run, noises, rates, args):
     """Play episodes; return their true returns and lengths, [(return, length), ...]."""
-    env, policy = load(run)
-    return play_episodes(make_noisy(env, noises, rates), policy, args.episodes, args.seed)
+    with load(run) as (env, policy):
+        return play_episodes(make_noisy(env, noises, rates), policy, args.episodes, args.seed)
 
 
 def draw(run, noises, rates, args):
@@ -189,9 +194,9 @@ def draw(run, noises, rates, args):
     try:
         if args.video:
             return record(run, noises, rates, args)
-        env, policy = load(run, "human")
-        [result] = play_episodes(make_noisy(env, noises, rates), policy, 1, args.seed)
-        return result
+        with load(run, "human") as (env, policy):
+            [result] = play_episodes(make_noisy(env, noises, rates), policy, 1, args.seed)
+            return result
     except Exception as error:  # of any library that draws, or of the environment
         place = traceback.extract_tb(error.__traceback__)[-1]
         return f"{type(error).__name__}: {reason(error)} ({place.filename}, line {place.lineno})"
@@ -202,24 +207,28 @@ def record(run, noises, rates, args):
     name = f"{run.folder.name}__{noise_slug(noises, rates) or 'clean'}.mp4"
     with tempfile.TemporaryDirectory(dir=args.video, prefix=".") as temporary:
         folder = Path(temporary, "video")  # a new one: RecordVideo warns of one that exists
-        env, policy = load(run, "rgb_array")
-        env = RecordVideo(env, str(folder), episode_trigger=lambda episode: True)
-        [result] = play_episodes(make_noisy(env, noises, rates), policy, 1, args.seed)
+        with load(run, "rgb_array") as (env, policy):
+            video = RecordVideo(env, str(folder), episode_trigger=lambda episode: True)
+            try:
+                [result] = play_episodes(make_noisy(video, noises, rates), policy, 1, args.seed)
+            finally:
+                if video.recording:
+                    video.stop_recording()
         (folder / "rl-video-episode-0.mp4").replace(args.video / name)
     return result
 
 
 def play_episodes(env, policy, number, seed):
-    """Play episodes and close the environment; return [(true return, length), ...]."""
+    """Play episodes; return [(true return, length), ...]."""
     results = []
-    with closing(env):
-        for episode in range(number):
+    for episode in range(number):
+        with seeded_globals(seed + episode):
             observation, _ = env.reset(seed=seed + episode)
             terminated = truncated = False
             while not (terminated or truncated):
                 observation, _, terminated, truncated, info = env.step(policy(observation))
-            record = info["episode"]  # the return is a sum of numbers or of arrays
-            results.append((np.asarray(record["r"]).item(), int(record["l"])))
+        record = info["episode"]  # the return is a sum of numbers or of arrays
+        results.append((np.asarray(record["r"]).item(), int(record["l"])))
     return results
 
 

@@ -34,8 +34,11 @@ import math
 import numbers
 import operator
 import os
+import random
 import re
+import signal
 import sys
+import traceback
 import zlib
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -45,7 +48,12 @@ from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import find_highest_version, get_env_id, parse_env_id
+from gymnasium.envs.registration import (
+    find_highest_version,
+    get_env_id,
+    load_env_creator,
+    parse_env_id,
+)
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
@@ -79,6 +87,7 @@ __all__ = [
     "SpaceError",
     "canonical_env_id",
     "canonical_noises",
+    "into_space",
     "make_flat",
     "make_noisy",
     "noise_slug",
@@ -87,8 +96,11 @@ __all__ = [
     "parse_noise",
     "rate_order",
     "refusals",
+    "reset_worker_signals",
     "run_folder",
     "run_name",
+    "seed_globals",
+    "seeded_globals",
     "set_progress",
     "signatures",
     "split_noises",
@@ -682,7 +694,12 @@ class RandomEarlyTermination(NoiseWrapper):
         each_step: bool = False,
         truncate: bool = False,
     ):
-        """Raise ValueError unless 1 <= low <= high are integers, or absent with each_step."""
+        """Raise ValueError unless 1 <= low <= high are integers, or absent with each_step.
+
+        Nor may ``env`` record its episodes: the record would miss those that this one ends.
+        """
+        if any(env.has_wrapper_attr(name) for name in _OF_RECORDERS):
+            raise ValueError(_RECORDED_BENEATH_EARLY_TERMINATION)
         self.each_step = _flag("each_step", each_step)
         self.truncate = _flag("truncate", truncate)
         if not each_step:
@@ -1022,16 +1039,19 @@ class NotFiniteError(FloatingPointError):
 
 
 class SpaceError(ValueError):
-    """Observations or actions that are not vectors of numbers."""
+    """Observations or actions that are not vectors of numbers, or not what the API asks for."""
 
 
 class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Stops at NaN and infinity, makes rewards floats and observations arrays of their own.
+    """Stops at NaN and infinity, and makes what an environment returns what the API asks for.
 
     A learner that receives NaN does not recover, and may never show it. So this raises
-    NotFiniteError, which says whether the action was already NaN, as after a divergence. The
-    reward may be an array of one number but not a string. Observations are copied, because an
-    environment may write the next one into the same array.
+    NotFiniteError, which says whether the action was already NaN, as after a divergence. Rewards
+    become floats and the two ends bools; they may be arrays of one element, but not strings.
+    Observations are copied, because an environment may write the next one into the same array, and
+    actions, because it may write into those. An observation that has not the shape of its space,
+    and a step of four values, raise SpaceError. The spaces are looked up once, because an
+    environment may make new ones, with new generators, at every access.
 
     >>> env = FiniteNumbers(gym.make("Pendulum-v1", disable_env_checker=True))
     >>> _ = env.reset(seed=0)
@@ -1044,19 +1064,30 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """Wrap an environment with Box observations."""
         gym.Wrapper.__init__(self, env)
         RecordConstructorArgs.__init__(self)
+        self.action_space, self.observation_space = env.action_space, env.observation_space
+        self._shape = self.observation_space.shape
         self._steps = 0
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and check the first observation."""
         self._steps = 0
-        observation, info = self.env.reset(seed=seed, options=options)
+        try:
+            observation, info = self.env.reset(seed=seed, options=options)
+        except (TypeError, ValueError) as error:
+            self._refuse_old_api("reset() must return (observation, info)", error)
+            raise
         self._check("returned the observation", observation)
-        return np.array(observation), info
+        return self._of_right_shape(observation), info
 
     def step(self, action: Any) -> Step:
         """Step the environment and check the observation and the reward."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
         self._steps += 1
+        try:
+            observation, reward, terminated, truncated, info = self.env.step(copy.copy(action))
+        except (TypeError, ValueError) as error:
+            values = "(observation, reward, terminated, truncated, info)"
+            self._refuse_old_api(f"step() must return {values}", error)
+            raise
         if isinstance(reward, str):
             self._stop("returned the reward", reward)
         number = float(reward.item() if isinstance(reward, np.ndarray) else reward)
@@ -1065,7 +1096,24 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
                 self._check("was given the action", action)
             self._check("returned the reward", number)
             self._check("returned the observation", observation)
-        return np.array(observation), number, terminated, truncated, info
+        return self._of_right_shape(observation), number, bool(terminated), bool(truncated), info
+
+    def _of_right_shape(self, observation: Any) -> NDArray[Any]:
+        array = np.array(observation)
+        if array.shape != self._shape:
+            raise SpaceError(
+                f"step {self._steps} of an episode: the environment returned an observation of "
+                f"shape {array.shape}, and its observation_space has shape {self._shape}"
+            )
+        return array
+
+    def _refuse_old_api(self, wanted: str, error: Exception) -> None:
+        """Raise SpaceError if a wrapper, and not the environment's own code, could not unpack."""
+        *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+        place = frame.f_globals.get("__name__", "")
+        if "unpack" in str(error) and place.startswith(("gymnasium.wrappers.", __name__)):
+            at = f"step {self._steps} of an episode"
+            raise SpaceError(f"{at}: the environment's {wanted}: {error}") from error
 
     def _check(self, what: str, value: Any) -> None:
         if not np.isfinite(value).all():
@@ -1306,11 +1354,8 @@ class Configuration:
         if not isinstance(env, gym.Env):
             raise TypeError(f"make_noisy takes a single gymnasium.Env, not a {type(env).__name__}")
         pairs = [(parse_noise(noise), rate) for noise, rate in zip(*self.texts, strict=True)]
-        recorded = any(env.has_wrapper_attr(name) for name in _OF_RECORDERS)
-        if recorded and record_statistics:
+        if record_statistics and any(env.has_wrapper_attr(name) for name in _OF_RECORDERS):
             raise ValueError(_RECORDED)
-        if recorded and any(noise.wrapper is RandomEarlyTermination for noise, _ in pairs):
-            raise ValueError(_RECORDED_BENEATH_EARLY_TERMINATION)
         for noise, rate in pairs:
             if noise.wrapper.kind in _BEFORE_STATISTICS:
                 env = noise(env, rate)
@@ -1405,12 +1450,13 @@ def make_noisy(
     return Configuration.read(noises, rates).wrap(env, record_statistics=record_statistics)
 
 
-def make_flat(env: Env) -> Env:
+def make_flat(env: Env, step_limit: int | None = None) -> Env:
     """Prepare an environment for networks, whose inputs and outputs are vectors.
 
     Non-vector observations (dictionaries, tuples, arrays, categories) are flattened by
     ``gymnasium.wrappers.FlattenObservation``; :class:`FiniteNumbers` makes rewards floats and stops
-    at NaN and infinity. Apply noise to the result: ``make_noisy(make_flat(env), ...)``.
+    at NaN and infinity. An environment whose spec has no time limit is cut after ``step_limit``
+    steps, if that is given. Apply noise to the result: ``make_noisy(make_flat(env), ...)``.
 
     >>> make_flat(gym.make("Pendulum-v1").unwrapped)
     <FiniteNumbers<PendulumEnv<Pendulum-v1>>>
@@ -1419,23 +1465,84 @@ def make_flat(env: Env) -> Env:
     noisy_wrappers.SpaceError: needs Box actions of floats in one dimension; CartPole-v1 has ...
 
     Raises:
-        SpaceError: actions are not a vector of floats, or observations cannot become a vector.
+        SpaceError: actions are not a vector of floats, or observations cannot become a vector; the
+            environment has been closed.
     """
     name = env.spec.id if env.spec else str(env)
+    if step_limit and env.spec and env.spec.max_episode_steps is None:
+        env = gym.wrappers.TimeLimit(env, step_limit)
     space = env.observation_space
     is_vector = isinstance(space, gym.spaces.Box) and len(space.shape) == 1
     if space.is_np_flattenable and not is_vector:
         env = gym.wrappers.FlattenObservation(env)
     observations, actions = env.observation_space, env.action_space
     if not isinstance(observations, gym.spaces.Box) or observations.dtype.kind not in "fiu":
+        env.close()
         raise SpaceError(f"needs Box observations of numbers; {name} has {observations}")
     if (
         not isinstance(actions, gym.spaces.Box)
         or actions.dtype.kind != "f"
         or len(actions.shape) != 1
     ):
+        env.close()
         raise SpaceError(f"needs Box actions of floats in one dimension; {name} has {actions}")
     return FiniteNumbers(env)
+
+
+def into_space(action: NDArray[Any], space: gym.spaces.Box) -> NDArray[Any]:
+    """Return an action in its space's dtype and, to the last bit, within its bounds.
+
+    >>> into_space(np.float64([0.1, 2]), gym.spaces.Box(-1, 1, (2,)))
+    array([0.1, 1. ], dtype=float32)
+    """
+    # in this order, because the cast may round a bound up
+    return action.astype(space.dtype).clip(space.low, space.high)
+
+
+def seed_globals(seed: int) -> None:
+    """Seed the generators that an environment shares with everybody: Python's, NumPy's, PyTorch's.
+
+    PyTorch's is seeded only where PyTorch is loaded.
+    """
+    random.seed(seed)
+    np.random.seed(seed % 2**32)
+    if torch := sys.modules.get("torch"):
+        torch.manual_seed(seed)
+
+
+@contextlib.contextmanager
+def seeded_globals(seed: int) -> Iterator[None]:
+    """Seed them as :func:`seed_globals` does for some lines of code, and restore them after it.
+
+    >>> with seeded_globals(1):
+    ...     first = random.random()
+    >>> with seeded_globals(1):
+    ...     random.random() == first
+    True
+    """
+    torch: Any = sys.modules.get("torch")
+    python, numpy = random.getstate(), np.random.get_state()
+    pytorch = torch.get_rng_state() if torch else None
+    seed_globals(seed)
+    try:
+        yield
+    finally:
+        random.setstate(python)
+        np.random.set_state(numpy)
+        if torch:
+            torch.set_rng_state(pytorch)
+
+
+def reset_worker_signals() -> None:
+    """Undo a script's signal handlers in a worker process that an environment forked.
+
+    SIGTERM and SIGHUP end it again, as ``terminate()`` asks; SIGINT is ignored: Ctrl-C is the
+    script's. A script calls ``os.register_at_fork(after_in_child=reset_worker_signals)``.
+    """
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if callable(signal.getsignal(number)):
+            signal.signal(number, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def set_progress(env: Any, fraction: float) -> None:
@@ -1527,10 +1634,10 @@ class EnvState:
     """What an environment carries from one episode to the next, to resume training.
 
     That is the random generators of the environment and of its action space, the random streams and
-    the counters of its noise wrappers, and the returns that RecordEpisodeStatistics remembers.
-    Further ``generators`` are kept with them. After loading, call :func:`set_progress` again. An
-    environment that carries more than its generator ``np_random`` from one episode to the next does
-    not resume exactly.
+    the counters of its noise wrappers, the returns that RecordEpisodeStatistics remembers, and the
+    global generators of ``random`` and NumPy, from which an environment may draw. Further
+    ``generators`` are kept with them. After loading, call :func:`set_progress` again. An
+    environment that carries anything else from one episode to the next does not resume exactly.
 
     >>> env = make_noisy(gym.make("Pendulum-v1"), ["RandomNormalNoisyObservation(1)"], [0.5])
     >>> _ = env.reset(seed=1)
@@ -1557,6 +1664,8 @@ class EnvState:
     def state_dict(self) -> dict[str, Any]:
         """Return the state in Python's own types, to be taken between two episodes."""
         return {
+            "python": random.getstate(),
+            "numpy": _without_arrays(np.random.get_state(legacy=False)),
             "generators": [_stream(generator) for generator in self._generators()],
             "noise": [wrapper.state_dict() for wrapper in noise_wrappers(self.env).values()],
             "returns": [float(value) for value in self._returns()],
@@ -1568,6 +1677,9 @@ class EnvState:
         Raises:
             ValueError: a state of another number of generators or noise wrappers.
         """
+        version, words, normal = state["python"]
+        random.setstate((version, tuple(words), normal))
+        np.random.set_state(state["numpy"])
         for generator, stream in zip(self._generators(), state["generators"], strict=True):
             if isinstance(generator, np.random.RandomState):
                 generator.set_state(stream)
@@ -1683,8 +1795,9 @@ def canonical_env_id(env_id: str) -> str:
     'Hopper-v5'
 
     Raises:
-        ValueError: an environment that is not registered or a module that does not exist; what a
-            module raises while it is imported passes through.
+        ValueError: an environment that is not registered, a module that does not exist, or a
+            renderer that MUJOCO_GL names and MuJoCo lacks; what else a module raises while it is
+            imported passes through.
     """
     module, colon, name = env_id.rpartition(":")
     if module:
@@ -1696,7 +1809,24 @@ def canonical_env_id(env_id: str) -> str:
         spec = gym.spec(get_env_id(namespace, base_name, version))
     except gym.error.Error as error:
         raise ValueError(f"there is no environment {env_id!r}: {error}") from error
+    if os.environ.get("MUJOCO_GL") and isinstance(spec.entry_point, str):
+        try:
+            load_env_creator(spec.entry_point)
+        except Exception as error:  # gymnasium.make() will raise it again
+            _raise_if_of_mujoco(error, env_id)
     return f"{module}{colon}{spec.id}"
+
+
+def _raise_if_of_mujoco(error: Exception, name: str) -> None:
+    """Raise ValueError if MuJoCo could not be imported with the renderer that MUJOCO_GL names."""
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    packages = {frame.f_globals.get("__name__", "").partition(".")[0] for frame in frames}
+    renderer = os.environ.get("MUJOCO_GL")
+    if renderer and packages & {"mujoco", "dm_control"}:
+        raise ValueError(
+            f"{name} imports MuJoCo, which fails with MUJOCO_GL={renderer} ({error}): training "
+            "draws nothing, so unset it; drawing needs the library that it names"
+        ) from error
 
 
 def _import_module(module: str, problem: str) -> None:
@@ -1722,6 +1852,9 @@ def _import_module(module: str, problem: str) -> None:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
             raise  # it exists, and imports another one that does not
         raise ValueError(f"{problem}: {error}") from error
+    except Exception as error:
+        _raise_if_of_mujoco(error, module)
+        raise
     finally:
         sys.path[:] = path
 

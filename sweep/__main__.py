@@ -1,8 +1,9 @@
-"""How far a sweep has come, in five views.
+"""How far a sweep has come, in six views.
 
 benchmark.sh calls this file from the project's folder:
 
     python -m sweep list FOLDER PRESET ...     one run per line: folder, state, command
+    python -m sweep dry-run FOLDER PRESET ...  the same, after their cost is said on stderr
     python -m sweep status FOLDER PRESET ...   a summary, the failed runs, the slowest running ones
     python -m sweep stopped FOLDER PRESET ...  a summary and the failed runs of a stopped sweep
     python -m sweep report FOLDER PRESET ...   a summary, and what did not finish: exit status 1
@@ -16,6 +17,7 @@ and is at most two minutes old. That holds on every executor, and on machines th
 see.
 """
 
+import contextlib
 import os
 import re
 import shutil
@@ -25,6 +27,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import NamedTuple
 
+from sweep.environment import cost
 from sweep.grid import check_extra, check_rollouts, command_line, grid, result, runs_in
 from sweep.options import check_arguments, parse_args
 
@@ -128,8 +131,9 @@ def summary(runs, progresses):
 
 
 def show_list(args, runs):
-    """Print the runs for benchmark.sh: folder, state and command; returns how many are to do."""
+    """Print the runs for benchmark.sh: folder, state and command; returns those in each state."""
     states = []
+    of = {"done": [], "damaged": [], "todo": []}
     for run in runs:
         done, damage = result(run)
         if done:
@@ -146,7 +150,8 @@ def show_list(args, runs):
     for run, state in zip(runs, states, strict=True):
         folder = f"{run.folder.parent}/{run.folder.name}"  # with a slash, for --runs-dir . too
         print(folder, state, command_line(run), sep="\t")
-    return states.count("todo")
+        of[state].append(run)
+    return of
 
 
 def watch(runs):
@@ -191,17 +196,23 @@ def main(view, caller, argv):
     if view == "status" and args.preset in (None, "custom") and args.given <= {"--runs-dir"}:
         runs = runs_in(args.runs_dir)
     else:
-        check_arguments(args)
+        with contextlib.redirect_stdout(sys.stderr):  # what a user's module prints is no run
+            check_arguments(args)
         if args.preset == "choose":
             from sweep import choose  # and with it pandas: no other preset should wait for that
 
-            choices = choose.choices(args)
+            ask = view in ("list", "dry-run")
+            choices = choose.choices(args, ask, keep=view == "list")
             runs = choose.runs_of(choices)
         else:
             runs = grid(args)
-    if view == "list":
-        todo = show_list(args, runs)
-        plan = choose.plan(choices) if choices else [f"{len(runs)} runs, {todo} to do"]
+    if view in ("list", "dry-run"):
+        of = show_list(args, runs)
+        plan = [f"{len(runs)} runs, {len(of['todo'])} to do"]
+        if choices:
+            plan = choose.plan(choices, args)
+        elif view == "dry-run" and of["todo"]:
+            plan[0] += "; " + cost(args, of["done"], of["todo"])
         for line in plan:
             print(line, file=sys.stderr)
         return 0
@@ -223,7 +234,7 @@ def main(view, caller, argv):
             choose.write_choice(Path(args.runs_dir, "choice.csv"), rows)
         print(*choose.conclusion(choices), sep="\n")
     elif choices:
-        print(*choose.standing(choices), sep="\n")
+        print(*choose.standing(choices, args), sep="\n")
     if over and any(p.state == "done" for p in progresses):
         print(f"See the curves with: tensorboard --logdir {args.runs_dir}")
         print(f"Make tables and figures with: python analyze.py --runs-dir {args.runs_dir}")

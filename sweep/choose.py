@@ -9,6 +9,7 @@ import fcntl
 import itertools
 import json
 import os
+import sys
 from statistics import fmean
 from typing import NamedTuple
 
@@ -17,12 +18,8 @@ from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED, read_run
 from analysis.statistics import detectable_shift, holm
 from noisy_wrappers import BASELINE, Configuration
 from sweep import halving
-from sweep.grid import NOISES, RATES, PlannedRun, cell, cells, make_run, result
-
-# What a run takes on one core until the finished ones tell: docs/sweeps.md
-STEPS_PER_SECOND = {"sac": 150, "td3": 265, "ppo": 5700}  # in small MuJoCo environments
-IN_HUMANOID = {"sac": 90, "td3": 130, "ppo": 2900}
-START_UP = 10  # seconds, with compilation
+from sweep.environment import ask_all, remember, remembered, run_seconds, time_left, wall_time
+from sweep.grid import NOISES, RATES, PlannedRun, cell, cells, make_run, of_the_paper, result
 
 
 class Choice(NamedTuple):
@@ -36,11 +33,15 @@ class Choice(NamedTuple):
     state: halving.State
     runs: dict[tuple[Configuration, int], PlannedRun]  # those that have been due so far
     returns: dict[tuple[Configuration, int], float]  # of those that are finished
-    core_hours: float  # about what is left
+    spread: float  # standard deviation over seeds of the search's last tests; NaN if unknown
+    run_seconds: float | None  # about what a run takes, if anything tells
 
 
-def choices(args):
-    """Return the choices of one command, or exit if its numbers make no choice."""
+def choices(args, ask=False, keep=False):
+    """Return the choices of one command, or exit if its numbers make no choice.
+
+    ask: make and time the environments of choices that have not begun. keep: what they answer.
+    """
     pairs = list(itertools.product(dict.fromkeys(args.algos), args.envs))
     fewest = halving.fewest_seeds(len(pairs))
     if args.confirm < fewest:
@@ -48,12 +49,39 @@ def choices(args):
             f"--confirm must be at least {fewest}, not {args.confirm}: with fewer seeds no "
             f"difference could be significant (number of verdicts: {len(pairs)})"
         )
-    return [follow(args, algorithm, env_id) for algorithm, env_id in pairs]
+    known = {env_id: remembered(args.runs_dir, env_id) for env_id in args.envs}
+    found = [follow(args, *pair, known[pair[1]]) for pair in pairs]
+    new = [(c.algorithm, c.env_id) for c in found if ask and not c.returns]
+    if not new:
+        return found
+    noises = {env_id: candidates(args, algorithm, env_id) for algorithm, env_id in new}
+    for env_id, answer in ask_all(args, noises).items():
+        leave_out(args, env_id, answer.unfit)
+        known[env_id] = answer
+        if keep:
+            remember(args.runs_dir, env_id, answer)
+    return [follow(args, *pair, known[pair[1]]) for pair in pairs]
 
 
-def follow(args, algorithm, env_id):
-    """Return one choice: where the finished runs have brought it."""
-    noises = candidates(args, algorithm, env_id)
+def leave_out(args, env_id, unfit):
+    """Say which noises cannot act in an environment; exit if the user has named them."""
+    reasons = {}
+    for noise, reason in unfit.items():
+        reason = reason.removeprefix(noise.partition("(")[0]).strip()  # of several noises, often
+        reasons.setdefault(reason, []).append(noise)
+    told = "; ".join(f"{', '.join(noises)} ({reason})" for reason, noises in reasons.items())
+    if told and args.noises and not of_the_paper(args):
+        fail(f"--noises: these cannot act in {env_id}: {told}")
+    if told:
+        print(f"{env_id}: left out, because they cannot act there: {told}", file=sys.stderr)
+
+
+def follow(args, algorithm, env_id, environment):
+    """Return one choice: where the finished runs have brought it.
+
+    environment: what is known of it, or None.
+    """
+    noises = candidates(args, algorithm, env_id, environment.unfit if environment else {})
     budget = 3 * len(noises) if args.budget is None else args.budget
     if budget < len(noises):
         fail(f"--budget must be at least {len(noises)}, a run for each noise, not {budget}")
@@ -63,7 +91,7 @@ def follow(args, algorithm, env_id):
         fail(f"--budget {budget} is too large: the best noises would run with {last_seed} seeds")
     if not args.noises:
         check_others(args, algorithm, env_id)
-    runs, returns = {}, {}
+    runs, returns, last_tests = {}, {}, {}
     while True:
         state = halving.advance(noises, budget, args.confirm, returns)
         finished = {}
@@ -71,16 +99,19 @@ def follow(args, algorithm, env_id):
             run = make_run(args, algorithm, env_id, noise, seed)
             runs[noise, seed] = run
             if result(run)[0]:
-                finished[noise, seed] = read_return(run, seed)
+                row = read_finished(run)
+                finished[noise, seed] = counted(row, seed)
+                if seed < FIRST_CONFIRMATION_SEED:
+                    last_tests.setdefault(noise, []).append(row["returns"][-1])
         if not finished:
             break
         returns |= finished
     check_frequencies(runs[key] for key in returns)
-    left = halving.number_of_runs(len(noises), budget, args.confirm) - len(returns)
-    speeds = IN_HUMANOID if "Humanoid" in env_id else STEPS_PER_SECOND
-    seconds = START_UP + args.total_timesteps / speeds[algorithm]
+    seconds = None
     if returns:
         seconds = fmean(wall_time(runs[key]) for key in returns)
+    elif environment:
+        seconds = run_seconds(next(iter(runs.values())), environment)
     return Choice(
         name=f"{algorithm.upper()} on {env_id}",
         algorithm=algorithm,
@@ -90,7 +121,8 @@ def follow(args, algorithm, env_id):
         state=state,
         runs=runs,
         returns=returns,
-        core_hours=left * seconds / 3600,
+        spread=halving.spread(last_tests.values()),
+        run_seconds=seconds,
     )
 
 
@@ -120,8 +152,8 @@ def runs_of(found):
     return [run for _, run in sorted(runs, key=lambda pair: pair[0])]
 
 
-def candidates(args, algorithm, env_id):
-    """Return the noises to choose from, each once."""
+def candidates(args, algorithm, env_id, unfit=()):
+    """Return the noises to choose from, each once, but for those that cannot act there."""
     noises = dict.fromkeys(cells(args, algorithm, env_id))
     noises.pop(BASELINE, None)  # at rate 0 a noise is none
     for pairs in args.exclude:
@@ -131,19 +163,25 @@ def candidates(args, algorithm, env_id):
         if excluded not in noises:
             fail(f"--exclude: {excluded} is not among the noises")
         del noises[excluded]
+    noises = [noise for noise in noises if noise.noise not in unfit]
     if not noises:
         fail("there is no noise to choose from")
-    return list(noises)
+    return noises
 
 
-def read_return(run, seed):
+def read_finished(run):
+    """Return a finished run's row, or exit if its files do not hold what it should."""
+    row = read_run(run.folder)
+    if row["status"] != "finished":
+        fail(f"{run.folder} cannot be used ({row['reason']}); delete it to run it again")
+    return row
+
+
+def counted(row, seed):
     """Return what a finished run counts for.
 
     That is halving.score in the search, and its last test in the confirmation.
     """
-    row = read_run(run.folder)
-    if row["status"] != "finished":
-        fail(f"{run.folder} cannot be used ({row['reason']}); delete it to run it again")
     if seed >= FIRST_CONFIRMATION_SEED:
         return row["returns"][-1]
     return halving.score(row["steps"], row["returns"])
@@ -163,46 +201,73 @@ def check_frequencies(runs):
         )
 
 
-def wall_time(run):
-    """Return how many seconds a finished run has taken."""
-    return json.loads((run.folder / "result.json").read_text())["wall_time_seconds"]
-
-
 # ---------------------------------------------------------------------------------------- in words
 
 
-def plan(found):
-    """Return lines that say, before a batch starts, what is due and what all of it will take.
+def plan(found, args):
+    """Return lines that say, before a batch starts, what it is for and what all of it will take.
 
-    Before the first batch, also what gain can be confirmed.
+    They also say what gain can be confirmed; before any run only in standard deviations.
     """
     if not any(choice.state.due for choice in found):
         return []
-    begun = any(choice.returns for choice in found)
-    return [*map(describe, found), total(found), *([] if begun else [reach(found)])]
+    lines = list(map(describe, found))
+    if not any(choice.returns for choice in found):
+        lines = [*map(question, found), *lines]
+    lines.append(total(found, args))
+    lines += filter(None, (reach(choice, len(found)) for choice in found))
+    return [*dict.fromkeys(lines), f"runs, logs and the verdict are stored in {args.runs_dir}"]
 
 
-def total(found):
+def question(choice):
+    """Say what a choice will decide."""
+    noises = choice.schedule[0][0] if choice.schedule else 1
+    which = f"the best of {noises} noises" if noises > 1 else "the noise"
+    return (
+        f"{choice.name}: is {which} better than no noise? "
+        f"{choice.confirm} fresh seeds of each will decide"
+    )
+
+
+def total(found, args):
     """Say how many runs all choices take, and what is left of them."""
     search = sum(noises * seeds for choice in found for noises, seeds in choice.schedule)
     confirm = sum(2 * choice.confirm for choice in found)
     finished = sum(len(choice.returns) for choice in found)
-    hours = sum(choice.core_hours for choice in found)
-    hours = f"{hours:.1f}" if hours >= 0.1 else f"{hours:.2g}"
-    return (
+    text = (
         f"{search + confirm} runs in all, {search} to search and {confirm} to confirm; "
-        f"{finished} are done, about {hours} core-hours are left"
+        f"{finished} are done"
     )
+    if any(choice.run_seconds is None for choice in found):
+        return text
+    batches = []
+    for numbers in itertools.zip_longest(*map(left, found), fillvalue=0):  # side by side
+        batches.append([])
+        for choice, runs in zip(found, numbers, strict=True):
+            batches[-1] += runs * [choice.run_seconds]
+    elsewhere = args.elsewhere and not finished
+    return f"{text}, {time_left(batches, args.jobs, elsewhere)}"
 
 
-def reach(found):
-    """Say what gain the confirmations of all choices can show."""
-    seeds = found[0].confirm
-    gain = detectable_shift(seeds, seeds, halving.LEVEL / len(found))
-    together = f", corrected for {len(found)} verdicts" if len(found) > 1 else ""
+def left(choice):
+    """Return the numbers of runs in the batches that are left."""
+    numbers = [noises * seeds for noises, seeds in choice.schedule] + [2 * choice.confirm]
+    return [len(choice.state.due), *numbers[len(choice.state.rounds) + 1 :]]
+
+
+def reach(choice, verdicts):
+    """Say what gain the confirmation can show, or nothing once runs are done without a spread."""
+    gain = detectable_shift(choice.confirm, choice.confirm, halving.LEVEL / verdicts)
+    seeds = f"{choice.confirm} fresh seeds confirm a true gain of"
+    power = "with 80 % power" + (f", corrected for {verdicts} verdicts" if verdicts > 1 else "")
+    if not choice.returns:
+        return f"{seeds} {gain:.1f} standard deviations over seeds {power}"
+    if not choice.spread > 0:
+        return ""
+    shift = float(f"{gain * choice.spread:.2g}")
     return (
-        f"{seeds} fresh seeds confirm a true gain of {gain:.1f} standard deviations over seeds "
-        f"with 80 % power{together}"
+        f"{choice.name}: {seeds} about {shift:,g} ({gain:.1f} standard deviations of the last "
+        f"tests in the search) {power}"
     )
 
 
@@ -221,7 +286,7 @@ def describe(choice):
     return f"{choice.name}, confirmation: {winner} against no noise, {due}"
 
 
-def standing(found):
+def standing(found, args):
     """Yield lines that say where each choice stands, which noises survive, and what is left.
 
     When all choices are finished, these are the verdicts.
@@ -236,7 +301,7 @@ def standing(found):
             scores = choice.state.rounds[-1].scores
             for noise in sorted(choice.state.noises, key=scores.get, reverse=True):
                 yield f"  {scores[noise]:10.2f}  {noise}"
-    yield total(found)
+    yield total(found, args)
 
 
 def conclusion(found):

@@ -185,11 +185,15 @@ def best_pairs():
     return pairs
 
 
+def of_the_paper(args):
+    """Return whether the noises are given as --noises paper; options.entry reads it so."""
+    return args.noises == [[("paper", None)]]
+
+
 def cells(args, algorithm, env_id):
     """Return the configuration of every noisy cell of the grid, in the order given."""
-    of_the_paper = args.noises == [[("paper", None)]]  # --noises paper, as options.entry reads it
-    given = [] if of_the_paper else args.noises
-    pairs = preset_pairs("paper" if of_the_paper else args.preset, algorithm, env_id)
+    given = [] if of_the_paper(args) else args.noises
+    pairs = preset_pairs("paper" if of_the_paper(args) else args.preset, algorithm, env_id)
     entries, rates = [[pair] for pair in pairs], []
     if given or args.noise_rates:
         names = dict.fromkeys(noise for noise, _ in pairs)

@@ -14,7 +14,7 @@ baseline on fresh seeds, in one comparison that is fixed beforehand.
 """
 
 import math
-from statistics import fmean
+from statistics import fmean, variance
 from typing import NamedTuple
 
 import numpy as np
@@ -120,6 +120,17 @@ def score(steps, returns):
     """
     steps, returns = np.asarray(steps), np.asarray(returns)
     return float(returns[steps[-1] - steps < SCORED * steps[-1]].mean())
+
+
+def spread(groups):
+    """Return the standard deviation of returns over the seeds of a noise, pooled over noises.
+
+    groups: for each noise its returns. NaN if none has two.
+    """
+    groups = [values for values in groups if len(values) > 1]
+    freedom = sum(len(values) - 1 for values in groups)
+    squares = sum((len(values) - 1) * variance(values) for values in groups)
+    return math.sqrt(squares / freedom) if freedom else math.nan
 
 
 def missing(noises, seeds, returns):

@@ -44,8 +44,21 @@ def parse_args(view, caller, argv):
     parser.set_defaults(**PRESETS.get(preset, {}))
     args = parser.parse_args(words)
     args.given, args.extra = given, extra
+    args.jobs, args.elsewhere = machines()
     args.runs_dir = from_project(caller, args.runs_dir)
     return args
+
+
+def machines():
+    """Return how many runs go on at a time, None if unknown, and whether on other machines.
+
+    benchmark.sh, which reads the executor's options, tells it by environment variables.
+    """
+    jobs, hosts = os.environ.get("SWEEP_JOBS"), os.environ.get("SWEEP_HOSTS")
+    elsewhere = bool(hosts) or os.environ.get("SWEEP_EXECUTOR") == "slurm"
+    if jobs:
+        return int(jobs) * (hosts.count(",") + 1 if hosts else 1), elsewhere
+    return None if elsewhere else len(os.sched_getaffinity(0)), elsewhere
 
 
 def unknown_option(name):

@@ -1,5 +1,7 @@
 """Environments of the tests, for `--env-id toy_envs:Tiny-v0` and the like."""
 
+import time
+
 import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
@@ -160,6 +162,34 @@ class Endless(Count):
         return observation, reward, self.steps >= self.length, False, info
 
 
+class Slow(Count):
+    """A step takes 5 ms."""
+
+    def step(self, action):
+        time.sleep(0.005)
+        return super().step(action)
+
+
+class OneReset(Count):
+    """Its author forgot something when an episode begins anew."""
+
+    resets = 0
+
+    def reset(self, **kwargs):
+        self.resets += 1
+        if self.resets == 2:
+            raise RuntimeError("the window is open already")
+        return super().reset(**kwargs)
+
+
+class Talks(Count):
+    """Its author left a print in it."""
+
+    def reset(self, **kwargs):
+        print("reset!")
+        return super().reset(**kwargs)
+
+
 def register(name, entry_point, steps, **kwargs):
     gym.register(f"{name}-v0", entry_point, max_episode_steps=steps, kwargs=kwargs)
 
@@ -190,3 +220,6 @@ register("BuggyStep", Buggy, 8, where="step")
 register("BadValue", BadValue, 8)
 register("Overflow", Overflow, 8)
 register("TextReward", TextReward, 8)
+register("Slow", Slow, 100)
+register("OneReset", OneReset, 8)
+register("Talks", Talks, 8)

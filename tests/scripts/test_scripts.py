@@ -433,10 +433,10 @@ def run_block(script):
 
 
 def test_repeated_helpers_are_word_for_word_identical():
-    everywhere = "make_env fail fail_on say read_args check_numbers make_envs evaluate can_compile "
-    everywhere += "use_matmul_precision Run"
+    everywhere = "make_env fail fail_on say read_args check_numbers make_envs train evaluate "
+    everywhere += "use_matmul_precision prepare_compiler start_again Run"
     off_policy = "mlp in_numpy TwinLinear Critic ReplayBuffer updater"
-    by_design = {"Args", "Actor", "load_policy", "critic_loss", "actor_loss", "train"}
+    by_design = {"Args", "Actor", "load_policy", "critic_loss", "actor_loss", "learn"}
     found = [definitions(script) for script in (sac, td3, ppo)]
     for name in everywhere.split():
         assert len({source[name] for source in found}) == 1, name
@@ -524,14 +524,12 @@ def test_compiled_and_plain_updates_agree(algorithm, tmp_path, capsys, monkeypat
     compiled = run(
         algorithm, tmp_path / "compiled", matmul_precision="highest", compile=True, **short
     )
-    if "not compiled" in (output := capsys.readouterr().out):
-        pytest.skip(re.search(r"not compiled: .*", output)[0])
     losses = {
         "SAC": {"critic_loss", "actor_loss", "temperature_loss"},
         "TD3": {"critic_loss", "actor_loss"},
         "PPO": {"clipped_gradient"},
     }
-    assert set(graphs) == losses[algorithm] | {"neg"}
+    assert set(graphs) == losses[algorithm]
     torch.testing.assert_close(policy(compiled), policy(plain), rtol=1e-4, atol=1e-5)
 
     if algorithm == "PPO":
@@ -541,19 +539,6 @@ def test_compiled_and_plain_updates_agree(algorithm, tmp_path, capsys, monkeypat
     assert json.loads((rough / "config.json").read_text())["matmul_precision"] == "bf16"
     exact, rough = (torch.cat([x.flatten() for x in policy(r).values()]) for r in (plain, rough))
     assert 1e-5 < (rough - exact).abs().max() < 0.05
-
-
-@pytest.mark.parametrize("algorithm", ["TD3", "PPO"])  # SAC has TD3's updater
-def test_no_compiler_means_plain_updates(algorithm, tmp_path, capsys, monkeypatch):
-    def no_compiler(*_, **__):
-        raise RuntimeError("no compiler\nand more")
-
-    plain = run(algorithm, tmp_path / "plain")
-    monkeypatch.setattr(torch, "compile", no_compiler)
-    fallback = run(algorithm, tmp_path / "fallback", compile=True)
-    output = capsys.readouterr().out
-    assert "not compiled: no compiler\n" in output and output.count("not compiled") == 1
-    torch.testing.assert_close(policy(fallback), policy(plain), rtol=0, atol=0)
 
 
 # ENVIRONMENTS THAT ARE UNUSUAL
@@ -701,10 +686,10 @@ BAD = [  # arguments, what the message names, of which scripts
     ({"target_kl": math.nan}, "--target-kl", ("PPO",)),
     ({"env_id": "toy_envs:MatrixAction-v0"}, "in one dimension", SCRIPTS),
     ({"seed": -1}, "--seed must be at least 0, not -1\n", SCRIPTS),
-    ({"seed": 2**64}, "--seed must be a smaller number", SCRIPTS),
-    ({"gamma": 1.1}, "--gamma must be from 0 to 1, not 1.1\n", SCRIPTS),
+    ({"seed": 2**64}, "--seed must be at most 9223372036854775807", SCRIPTS),
+    ({"gamma": 1.1}, "--gamma must be at most 1, not 1.1\n", SCRIPTS),
     ({"gamma": -0.1}, "--gamma", SCRIPTS),
-    ({"gamma": math.nan}, "--gamma must be a finite number, not nan\n", SCRIPTS),
+    ({"gamma": math.nan}, "--gamma must be at least 0, not nan\n", SCRIPTS),
     ({"total_timesteps": 0}, "--total-timesteps must be at least 1, not 0\n", SCRIPTS),
     ({"total_timesteps": -5}, "--total-timesteps", SCRIPTS),
     ({"eval_episodes": 0}, "--eval-episodes", SCRIPTS),

@@ -17,6 +17,7 @@ from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED
 from analysis.statistics import holm
 from noisy_wrappers import BASELINE, Configuration
 from sweep import choose
+from sweep.environment import Environment, remember
 from sweep.halving import (
     Comparison,
     advance,
@@ -352,32 +353,17 @@ def test_two_algorithms_and_environments_at_once(tmp_path):
         assert float(line["score"]) == pytest.approx(fmean(wanted))
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "env", "seconds"),
-    [  # eight runs of 1,000 steps, each with ten seconds to start
-        ("sac", "Hopper-v5", 8 * (10 + 1000 / 150)),
-        ("sac", "Humanoid-v5", 8 * (10 + 1000 / 90)),
-        ("td3", "HumanoidStandup-v5", 8 * (10 + 1000 / 130)),
-        ("ppo", "Humanoid-v5", 8 * (10 + 1000 / 2900)),
-    ],
-)
-def test_the_core_hours_announced(algorithm, env, seconds, tmp_path):
-    args = arguments(
-        f"--algos | {algorithm} | --envs | {env} | --noises | {A}@1 | --confirm | 4", tmp_path
-    )
-    [choice] = choose.choices(args)
-    assert choice.core_hours == pytest.approx(seconds / 3600)
-
-
-def test_the_readme_says_what_it_takes_by_default():
+def test_the_readme_says_what_it_takes_by_default(tmp_path):
     text = " ".join((Path(__file__).parents[2] / "README.md").read_text().split())
     pattern = r"takes (\d+) runs of a .*: about (\d+) core-hours with PPO and (\d+) with SAC in a"
     runs, *hours = map(int, re.search(pattern, text).groups())
     for algorithm, announced in zip(("ppo", "sac"), hours, strict=True):
-        args = parse_args("list", "/", ["choose", "--algos", algorithm, "--envs", "Hopper-v5"])
+        args = parse_args("list", str(tmp_path), ["choose", "--algos", algorithm])
+        args.envs, known = ["Hopper-v5"], Environment(0.05e-3, 200, 1000, 11, True, {})
+        remember(args.runs_dir, "Hopper-v5", known)
         choices = choose.choices(args)
-        assert choose.total(choices).startswith(f"{runs} runs in all")
-        assert choices[0].core_hours == pytest.approx(announced, rel=0.03)
+        assert choose.total(choices, args).startswith(f"{runs} runs in all")
+        assert runs * choices[0].run_seconds / 3600 == pytest.approx(announced, rel=0.1)
 
 
 def test_the_default_noises_and_those_of_the_paper(tmp_path):
@@ -429,15 +415,32 @@ def test_an_excluded_noise_is_no_other_choice(tmp_path):
 
 def test_what_the_confirmation_can_show(tmp_path):
     words = f"--algos | ppo | --envs | Pendulum-v1 | --noises | {A}@1"
-    [line] = choose.plan(choose.choices(arguments(words, tmp_path)))[2:]
-    assert line == (
-        "25 fresh seeds confirm a true gain of 0.8 standard deviations over seeds with 80 % power"
-    )
-    two = arguments(words.replace("ppo", "ppo | sac"), tmp_path)
-    assert choose.plan(choose.choices(two))[3] == (
-        "25 fresh seeds confirm a true gain of 0.9 standard deviations over seeds with 80 % power, "
-        "corrected for 2 verdicts"
-    )
+
+    def lines(words):
+        args = arguments(words, tmp_path)
+        plan = choose.plan(choose.choices(args), args)
+        return [line for line in plan if "fresh seeds confirm" in line]
+
+    unit = "standard deviations over seeds with 80 % power"
+    assert lines(words) == [f"25 fresh seeds confirm a true gain of 0.8 {unit}"]
+    [line] = lines(words.replace("ppo", "ppo | sac"))
+    assert line.endswith(f" 0.9 {unit}, corrected for 2 verdicts")
+    # Once there is a spread, in the return's own units
+    two = f"{words} | RandomMixupObservation(0.5)@1 | --budget | 6 | --confirm | 5"
+    [choice] = choose.choices(arguments(two, tmp_path))
+    for run in map(choice.runs.get, choice.state.due):
+        stub_run.train([run.script, *run.arguments])
+    tests = [
+        [stub_run.tests_of("ppo", "Pendulum-v1", [noise], [1.0], seed)[-1] for seed in (1, 2, 3)]
+        for noise in (A, "RandomMixupObservation(0.5)")
+    ]
+    spread = math.sqrt(fmean(np.var(tests, axis=1, ddof=1)))
+    [line] = lines(two)
+    gain, units = re.search(
+        r"of about ([\d.]+) \(([\d.]+) standard deviations of the", line
+    ).groups()
+    assert line.startswith("PPO on Pendulum-v1: 5 fresh seeds confirm a true gain of about ")
+    assert float(gain) == pytest.approx(spread * float(units), rel=0.06)
 
 
 def test_a_second_choice_takes_the_same_fresh_seeds(tmp_path):
@@ -490,7 +493,8 @@ def test_two_commands_that_end_side_by_side_keep_each_others_lines(tmp_path, mon
     assert [found["algorithm"] for found in read(path)] == ["first", "x"]
 
 
-def test_status_says_who_survives(tmp_path):
+def test_status_says_who_survives(tmp_path, monkeypatch):
+    monkeypatch.setenv("SWEEP_JOBS", "2")
     scores = {}
     for noise in (A, "RandomMixupObservation(0.5)", "RandomDropoutObservation(0.9)"):
         tests = stub_run.tests_of("ppo", "Pendulum-v1", [noise], [1.0], 1)
@@ -502,23 +506,24 @@ def test_status_says_who_survives(tmp_path):
         f"--budget | 7 | --noises | {' | '.join(noises)}",
         tmp_path,
     )
-    line, total = choose.standing(choose.choices(args))
-    assert total.startswith("15 runs in all, 7 to search and 8 to confirm; 0 are done, about ")
+    line, total = choose.standing(choose.choices(args), args)
+    assert total == "15 runs in all, 7 to search and 8 to confirm; 0 are done"
     assert line == "PPO on Pendulum-v1, round 1 of 2: 3 of 3 noises, seed 1; runs to do: 3"
     for choice in choose.choices(args):
         for run in choice.state.due:
             stub_run.train([choice.runs[run].script, *choice.runs[run].arguments])
-    assert list(choose.standing(choose.choices(args))) == [
+    assert list(choose.standing(choose.choices(args), args)) == [
         "PPO on Pendulum-v1, round 2 of 2: 2 of 3 noises, seeds 1 to 3; runs to do: 4",
         "  mean return after round 1:",
         f"  {scores[best]:10.2f}  {best} at 1.0",
         f"  {scores[second]:10.2f}  {second} at 1.0",
         # Twelve runs are left; each of the three has taken 36 seconds
-        "15 runs in all, 7 to search and 8 to confirm; 3 are done, about 0.1 core-hours are left",
+        "15 runs in all, 7 to search and 8 to confirm; 3 are done, about 0.1 core-hours are left, "
+        "0.06 hours on the clock with 2 runs at a time",
     ]
     batches(args)
     finished = choose.choices(args)
-    [verdict] = choose.standing(finished)
+    [verdict] = choose.standing(finished, args)
     assert verdict.startswith("PPO on Pendulum-v1: ") and "4 fresh seeds" in verdict
     assert not (tmp_path / "choice.csv").exists()  # the status only looks
     assert [verdict] == list(choose.conclusion(finished))

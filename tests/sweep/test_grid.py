@@ -114,7 +114,7 @@ def test_other_presets():
     assert {(x.script[:3], x.env_id, x.runs_dir) for x in dry_run("demo")} == {
         ("ppo", "InvertedPendulum-v5", "runs/demo")
     }
-    chosen = view("list", *C.split())
+    chosen = view("dry-run", *C.split())
     assert all(line.endswith("--runs-dir runs/choose") for line in chosen.out.splitlines())
     assert view("status", *C.split()).out.startswith("runs/choose: ")
     assert [(x.seed, x.noise, x.total_timesteps) for x in dry_run("demo")] == [
