@@ -1048,10 +1048,10 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     A learner that receives NaN does not recover, and may never show it. So this raises
     NotFiniteError, which says whether the action was already NaN, as after a divergence. Rewards
     become floats and the two ends bools; they may be arrays of one element, but not strings.
-    Observations are copied, because an environment may write the next one into the same array, and
-    actions, because it may write into those. An observation that has not the shape of its space,
-    and a step of four values, raise SpaceError. The spaces are looked up once, because an
-    environment may make new ones, with new generators, at every access.
+    Observations, also in dictionaries and tuples, are copied, because an environment may write the
+    next one into the same array, and actions, because it may write into those. An observation that
+    has not the shape of its space, and a step of four values, raise SpaceError. The spaces are
+    looked up once, because an environment may make new ones, with new generators, at every access.
 
     >>> env = FiniteNumbers(gym.make("Pendulum-v1", disable_env_checker=True))
     >>> _ = env.reset(seed=0)
@@ -1061,11 +1061,15 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """
 
     def __init__(self, env: Env):
-        """Wrap an environment with Box observations."""
+        """Wrap an environment; what is checked of observations are the Boxes, also in parts."""
         gym.Wrapper.__init__(self, env)
         RecordConstructorArgs.__init__(self)
         self.action_space, self.observation_space = env.action_space, env.observation_space
-        self._shape = self.observation_space.shape
+        self._boxes = {
+            path: part
+            for path, part in _entries(self.observation_space)
+            if isinstance(part, gym.spaces.Box)
+        }
         self._steps = 0
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
@@ -1076,8 +1080,7 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         except (TypeError, ValueError) as error:
             self._refuse_old_api("reset() must return (observation, info)", error)
             raise
-        self._check("returned the observation", observation)
-        return self._of_right_shape(observation), info
+        return self._checked(observation), info
 
     def step(self, action: Any) -> Step:
         """Step the environment and check the observation and the reward."""
@@ -1091,21 +1094,25 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if isinstance(reward, str):
             self._stop("returned the reward", reward)
         number = float(reward.item() if isinstance(reward, np.ndarray) else reward)
-        if not (math.isfinite(number) and np.isfinite(observation).all()):
-            if isinstance(action, np.ndarray):
-                self._check("was given the action", action)
-            self._check("returned the reward", number)
-            self._check("returned the observation", observation)
-        return self._of_right_shape(observation), number, bool(terminated), bool(truncated), info
+        if not math.isfinite(number):
+            self._blame("returned the reward", number, action)
+        return self._checked(observation, action), number, bool(terminated), bool(truncated), info
 
-    def _of_right_shape(self, observation: Any) -> NDArray[Any]:
-        array = np.array(observation)
-        if array.shape != self._shape:
-            raise SpaceError(
-                f"step {self._steps} of an episode: the environment returned an observation of "
-                f"shape {array.shape}, and its observation_space has shape {self._shape}"
-            )
-        return array
+    def _checked(self, observation: Any, action: Any = None) -> Any:
+        """Return a copy of an observation."""
+        parts = {}
+        for path, box in self._boxes.items():
+            part = np.array(functools.reduce(operator.getitem, path, observation))
+            if not np.isfinite(part).all():
+                self._blame(f"returned the observation{_subscript(path)}", part, action)
+            if part.shape != box.shape:
+                raise SpaceError(
+                    f"step {self._steps} of an episode: the environment returned an "
+                    f"observation{_subscript(path)} of shape {part.shape}, and its "
+                    f"observation_space has shape {box.shape}"
+                )
+            parts[path] = part
+        return _replaced(observation, parts) if parts else observation
 
     def _refuse_old_api(self, wanted: str, error: Exception) -> None:
         """Raise SpaceError if a wrapper, and not the environment's own code, could not unpack."""
@@ -1115,9 +1122,11 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             at = f"step {self._steps} of an episode"
             raise SpaceError(f"{at}: the environment's {wanted}: {error}") from error
 
-    def _check(self, what: str, value: Any) -> None:
-        if not np.isfinite(value).all():
-            self._stop(what, np.asarray(value).tolist())
+    def _blame(self, what: str, value: Any, action: Any) -> None:
+        """Stop at a value that is not finite, or rather at an action that was not, either."""
+        if isinstance(action, np.ndarray) and not np.isfinite(action).all():
+            self._stop("was given the action", action.tolist())
+        self._stop(what, np.asarray(value).tolist())
 
     def _stop(self, what: str, value: Any) -> None:
         raise NotFiniteError(f"step {self._steps} of an episode: the environment {what} {value!r}")
@@ -1353,6 +1362,11 @@ class Configuration:
         """Stack the noises on an environment, as :func:`make_noisy` says."""
         if not isinstance(env, gym.Env):
             raise TypeError(f"make_noisy takes a single gymnasium.Env, not a {type(env).__name__}")
+        if isinstance(env, gym.wrappers.FlattenObservation) and not isinstance(
+            env.env.observation_space, gym.spaces.Box
+        ):
+            noisy = self.wrap(env.env, record_statistics=record_statistics)
+            return gym.wrappers.FlattenObservation(noisy)
         pairs = [(parse_noise(noise), rate) for noise, rate in zip(*self.texts, strict=True)]
         if record_statistics and any(env.has_wrapper_attr(name) for name in _OF_RECORDERS):
             raise ValueError(_RECORDED)
@@ -1408,8 +1422,8 @@ def canonical_noises(
 ) -> tuple[list[str], list[float | str]]:
     """Return noises in canonical notation and one rate for each.
 
-    Noises of rate 0 are dropped (they are the baseline). Early termination and action noise come
-    first, where :func:`make_noisy` applies them. One rate serves all noises. A rate is a number in
+    Noises of rate 0 are dropped (they are the baseline). Dynamics and action noise come first,
+    where :func:`make_noisy` applies them. One rate serves all noises. A rate is a number in
     [0, 1], or "start:end" of two such numbers, which is a number if they are equal.
 
     >>> canonical_noises(["RandomNormalNoisyReward(1)", "RandomEarlyTermination(50, 50)"], [0.1])
@@ -1432,11 +1446,13 @@ def make_noisy(
 ) -> Env:
     """Stack noises on an environment, around a record of the true returns.
 
-    Early termination is innermost, then action noise, then
+    Dynamics noise is innermost (:class:`RandomDynamics`, then early termination), then action noise
+    (:class:`RandomActionDelay` first), then
     ``gymnasium.wrappers.RecordEpisodeStatistics``, then the other noises in the order given, so
     ``info["episode"]`` has the return before reward noise. ``record_statistics=False`` leaves the
     record out, for an environment that keeps one itself, such as Stable-Baselines3's Monitor.
     Early termination must then be inside that record, which would miss the episodes that it ends.
+    Where dictionaries or tuples are flattened by the outermost wrapper, all goes inside that one.
 
     >>> make_noisy(gym.make("CartPole-v1").unwrapped, ["RandomNormalNoisyReward(1)"], [0.1])
     <RandomNormalNoisyReward<RecordEpisodeStatistics<CartPoleEnv<CartPole-v1>>>>
@@ -1453,10 +1469,11 @@ def make_noisy(
 def make_flat(env: Env, step_limit: int | None = None) -> Env:
     """Prepare an environment for networks, whose inputs and outputs are vectors.
 
-    Non-vector observations (dictionaries, tuples, arrays, categories) are flattened by
-    ``gymnasium.wrappers.FlattenObservation``; :class:`FiniteNumbers` makes rewards floats and stops
-    at NaN and infinity. An environment whose spec has no time limit is cut after ``step_limit``
-    steps, if that is given. Apply noise to the result: ``make_noisy(make_flat(env), ...)``.
+    :class:`FiniteNumbers` makes rewards floats and stops at NaN and infinity; non-vector
+    observations (dictionaries, tuples, arrays, categories) are then flattened by
+    ``gymnasium.wrappers.FlattenObservation``. An environment whose spec has no time limit is cut
+    after ``step_limit`` steps, if that is given. Apply noise to the result,
+    ``make_noisy(make_flat(env), ...)``: it goes in between, so it knows the parts.
 
     >>> make_flat(gym.make("Pendulum-v1").unwrapped)
     <FiniteNumbers<PendulumEnv<Pendulum-v1>>>
@@ -1471,6 +1488,7 @@ def make_flat(env: Env, step_limit: int | None = None) -> Env:
     name = env.spec.id if env.spec else str(env)
     if step_limit and env.spec and env.spec.max_episode_steps is None:
         env = gym.wrappers.TimeLimit(env, step_limit)
+    env = FiniteNumbers(env)
     space = env.observation_space
     is_vector = isinstance(space, gym.spaces.Box) and len(space.shape) == 1
     if space.is_np_flattenable and not is_vector:
@@ -1486,7 +1504,7 @@ def make_flat(env: Env, step_limit: int | None = None) -> Env:
     ):
         env.close()
         raise SpaceError(f"needs Box actions of floats in one dimension; {name} has {actions}")
-    return FiniteNumbers(env)
+    return env
 
 
 def into_space(action: NDArray[Any], space: gym.spaces.Box) -> NDArray[Any]:
@@ -1906,6 +1924,10 @@ def _entries(space: gym.Space[Any], path: EntryPath = ()) -> Iterator[tuple[Entr
         return
     for key, part in parts:
         yield from _entries(part, (*path, key))
+
+
+def _subscript(path: EntryPath) -> str:
+    return "".join(f"[{key!r}]" for key in path)
 
 
 def _replaced(nested: Any, entries: dict[EntryPath, Any]) -> Any:
