@@ -208,9 +208,10 @@ def record(run, noises, rates, args):
     with tempfile.TemporaryDirectory(dir=args.video, prefix=".") as temporary:
         folder = Path(temporary, "video")  # a new one: RecordVideo warns of one that exists
         with load(run, "rgb_array") as (env, policy):
+            env = make_noisy(env, noises, rates)
             video = RecordVideo(env, str(folder), episode_trigger=lambda episode: True)
             try:
-                [result] = play_episodes(make_noisy(video, noises, rates), policy, 1, args.seed)
+                [result] = play_episodes(video, policy, 1, args.seed)
             finally:
                 if video.recording:
                     video.stop_recording()
