@@ -57,6 +57,10 @@ for _name in ("mean", "average improvement %"):
     MERGED[f"paper: {_name}"] = tuple(f"paper_{column}" for column in MERGED[_name])
 
 
+# Numbers that are shown as precisely as others are
+PRECISE_AS = {"detectable": "difference", "luck_95": "baseline_std", "luck_median": "baseline_std"}
+
+
 def spreads(frame):
     """Return what each number of a table may be off by: column -> Series, where that is known."""
     found = {}
@@ -69,7 +73,7 @@ def spreads(frame):
             if name == "difference" and "pooled_std" in frame:
                 spread = spread.fillna(frame["pooled_std"])
             found |= dict.fromkeys(parts, spread)
-    return found
+    return found | {name: found[like] for name, like in PRECISE_AS.items() if like in found}
 
 
 def text_of(name, value, form, spread=None):
@@ -122,11 +126,12 @@ def shown(table):
     for name in ("settings", "phase", "without_percent"):
         if name in frame and (frame[name].isna() | frame[name].eq("")).all():
             frame = frame.drop(columns=name)
-    text, known = pd.DataFrame(index=frame.index, dtype=object), spreads(frame)
+    known, cells = spreads(frame), {}
     for name in frame:
         pairs = zip(frame[name], known.get(name, [None] * len(frame)), strict=True)
         form = table.formats.get(name)
-        text[name] = [text_of(name, value, form, spread) for value, spread in pairs]
+        cells[name] = [text_of(name, value, form, spread) for value, spread in pairs]
+    text = pd.DataFrame(cells, dtype=object)
     if "n_baseline_most" in text:  # over several environments: "10 to 50"
         most = text.pop("n_baseline_most")
         text["n_baseline"] += (" to " + most).where(most != text["n_baseline"], "")

@@ -5,7 +5,7 @@ not exist. IQM and probability of improvement are those of Agarwal et al. (2021)
 https://arxiv.org/abs/2108.13264.
 """
 
-from functools import cache, lru_cache
+from functools import cache, lru_cache, reduce
 from itertools import combinations
 from math import ceil, comb, copysign, inf, isnan, nan, prod, sqrt
 from statistics import NormalDist
@@ -198,6 +198,7 @@ def welch_t(values, chosen):
         return np.nan_to_num(difference / error, nan=0, posinf=inf, neginf=-inf)
 
 
+@np.errstate(invalid="ignore")  # inf - inf
 def permutation_t(x, y):
     """Two-sided permutation test with Welch's t, over environments with the mean of their t.
 
@@ -213,21 +214,28 @@ def permutation_t(x, y):
     if min(map(min, sizes)) < 2:
         return nan, nan, 1.0
     ways = prod(comb(n + m, n) for n, m in sizes)
-    rng, null = np.random.default_rng(0), np.zeros(1)
-    for pair, size in zip(pairs, sizes, strict=True):
-        t = welch_t(np.concatenate(pair)[:, None], partitions(*size))[:, 0]
-        if ways <= MOST_PARTITIONS:
-            null = np.add.outer(null, t).ravel()
-        elif len(pairs) == 1:
-            null = t
-        elif len(t) <= RANDOM_PARTITIONS:  # all of them
-            null = null + np.append(t[0], rng.choice(t, RANDOM_PARTITIONS))
-        else:  # in another order than in the other environments
-            null = null + np.append(t[0], rng.permutation(t[1:]))
-    null = np.nan_to_num(null, nan=0, posinf=inf, neginf=-inf)  # inf - inf
+    ts = [
+        welch_t(np.concatenate(pair)[:, None], partitions(*size))[:, 0]
+        for pair, size in zip(pairs, sizes, strict=True)
+    ]
+    if ways <= MOST_PARTITIONS:
+        null = reduce(lambda a, b: np.add.outer(a, b).ravel(), ts)
+    elif len(ts) == 1:
+        [null] = ts
+    else:
+        rng = np.random.default_rng(0)
+        null = sum(np.append(t[0], drawn(t, rng)) for t in ts)
+    null = np.nan_to_num(null, nan=0, posinf=inf, neginf=-inf)
     above, below = tails(null)
     smallest = 2 / min(ways, 1 + RANDOM_PARTITIONS)
     return null[0] / len(pairs), min(1.0, 2 * min(above, below)), min(1.0, smallest)
+
+
+def drawn(t, rng):
+    """Draw RANDOM_PARTITIONS of one environment's t, in another order than in the others."""
+    if len(t) > RANDOM_PARTITIONS:  # they are random, after the actual one
+        return rng.permutation(t[1:])
+    return rng.choice(t, RANDOM_PARTITIONS)
 
 
 def tails(null):

@@ -331,13 +331,12 @@ def family_notes(statistics):
             places = same["environment"].mask(same["scope"] == "all", "all")
             where = f"{study_name(*study)}, {', '.join(places)}"
             seeds = counted(min(same["n"].min(), same["n_baseline"].min()), "seed")
-            needed = ceil(round(size * smallest / LEVEL, 9))
             if smallest > LEVEL:
                 notes.append(
                     f"{where}: with {seeds} no difference can be significant (smallest possible p: "
                     f"{smallest:.2g})."
                 )
-            elif needed > 1:
+            elif (needed := ceil(round(size * smallest / LEVEL, 9))) > 1:
                 notes.append(
                     f"{where}: with {seeds} and {size:.0f} comparisons, differences can be "
                     f"significant after the correction only if at least {needed} of them are "
