@@ -7,7 +7,6 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from analysis.configurations import rate_order
 from analysis.style import (
     COLORS,
     DIVERGING,
@@ -19,6 +18,7 @@ from analysis.style import (
     ink_on,
 )
 from analysis.verdicts import seeds_of
+from noisy_wrappers import rate_order
 
 FOREST_ROWS = 25  # configurations of a forest plot; more of them are a heatmap
 ACROSS = 5  # panels of effects side by side

@@ -9,7 +9,6 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from analysis.configurations import BASELINE, rate_order
 from analysis.effects import effects_caption, effects_figure
 from analysis.formatting import slug
 from analysis.runs import STUDY, rows_of, study_name
@@ -28,7 +27,7 @@ from analysis.style import (
     line_style,
 )
 from analysis.verdicts import percent, seeds_of
-from noisy_wrappers import rounded
+from noisy_wrappers import BASELINE, rate_order, rounded
 
 matplotlib.rcParams.update(STYLE)
 

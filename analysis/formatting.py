@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 import pandas as pd
 from tabulate import tabulate
 
-from analysis.configurations import rate_order
 from analysis.verdicts import percent
-from noisy_wrappers import rounded
+from noisy_wrappers import rate_order, rounded
 
 # Formats of numbers that have no spread. z: no "-0"
 TENTH, WHOLE, PLAIN, SHARE, P_VALUE = "z,.1f", "z,.0f", "g", "z.2f", ".2g"

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.configurations import BASELINE
 from analysis.runs import STUDY, rows_of
 from analysis.statistics import LEVEL, percent_of
+from noisy_wrappers import BASELINE
 
 DRAWS = 10_000
 SEEDS_TO_RESAMPLE = 20  # with fewer seeds of the baseline, returns are taken as normal

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from analysis.configurations import BASELINE, Configuration
 from analysis.formatting import P_VALUE, SHARE, WHOLE, Table
 from analysis.runs import KEYS, ROBUSTNESS_COLUMNS, STUDY, study_name
 from analysis.statistics import compare, holm, mean_std, percent_of
@@ -28,7 +27,7 @@ from analysis.verdicts import (
     significant,
     spread_of,
 )
-from noisy_wrappers import rounded
+from noisy_wrappers import BASELINE, Configuration, rounded
 
 FILES = ("robustness.csv", "robustness.csv.gz")
 CONDITION = ["test_noise", "test_rate"]

@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from analysis.configurations import BASELINE, Configuration
-from noisy_wrappers import MAY_DIFFER_IN_A_TABLE
+from noisy_wrappers import BASELINE, MAY_DIFFER_IN_A_TABLE, Configuration
 
 STUDY = ["algorithm", "settings", "phase"]  # the columns that name a study: see study_name
 KEYS = [*STUDY, "environment", "noise", "noise_rate"]
@@ -55,7 +54,7 @@ def read_config(folder):
         if not isinstance(value, str):
             raise ValueError(f"config.json: {name} is {value!r}")
     settings = {name: value for name, value in args.items() if name not in NOT_SETTINGS}
-    configuration = Configuration.read(args["noise"], args["noise_rate"])
+    configuration = Configuration.stored(args["noise"], args["noise_rate"])
     return {
         "algorithm": config["algorithm"],
         "environment": args["env_id"],

@@ -7,7 +7,6 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from analysis.configurations import BASELINE
 from analysis.formatting import P_VALUE, PLAIN, SHARE, TENTH, WHOLE, Table
 from analysis.luck import (
     CONSISTENT_PERCENT,
@@ -32,6 +31,7 @@ from analysis.statistics import (
     steps_to_reach,
 )
 from analysis.verdicts import counted, difference, listed, seeds_of, verdict
+from noisy_wrappers import BASELINE
 
 SEEDS_FOR_INTERACTION = 3  # of each of the four configurations
 # After those that name a study

@@ -24,7 +24,7 @@ import analysis.statistics
 import analysis.style
 import analysis.tables
 import analyze
-from analysis.configurations import BASELINE, Configuration
+from noisy_wrappers import BASELINE, Configuration
 
 RESULTS = Path(analyze.__file__).parent / "results"
 NAN = float("nan")

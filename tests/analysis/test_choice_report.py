@@ -50,8 +50,8 @@ def test_search_and_confirmation_are_never_mixed(tmp_path, capsys):
         assert set(tables[name]["phase"]) == {fresh}
     assert row(tables["statistics"], noise=SCALE)["p"] == pytest.approx(2 / 252)
     printed = capsys.readouterr().out
-    found = f"PPO [confirmation] on Hopper-v5 with {SCALE} at rate 1.00 is better than no noise: +30.0 [27.7, 32.3]"
-    assert found in printed
+    found = f"PPO [confirmation] on Hopper-v5 with {SCALE} at rate 1.00 is better than no noise: "
+    assert f"{found}+30.0 [27.7, 32.3] (+29 %), p = 0.0079" in printed
     assert "no finished baseline" not in printed and tables["missing"].empty
     choice = tables["choice"]
     assert choice["survives"].fillna("").tolist() == ["yes", "no", "", "yes"]
