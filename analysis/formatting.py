@@ -5,6 +5,7 @@ import textwrap
 import zlib
 from dataclasses import dataclass, field
 
+import numpy as np
 import pandas as pd
 from tabulate import tabulate
 
@@ -56,10 +57,6 @@ for _name in ("mean", "average improvement %"):
     MERGED[f"paper: {_name}"] = tuple(f"paper_{column}" for column in MERGED[_name])
 
 
-# Numbers that are shown as precisely as others are
-PRECISE_AS = {"detectable": "difference", "luck_95": "baseline_std", "luck_median": "baseline_std"}
-
-
 def spreads(frame):
     """Return what each number of a table may be off by: column -> Series, where that is known."""
     found = {}
@@ -72,7 +69,11 @@ def spreads(frame):
             if name == "difference" and "pooled_std" in frame:
                 spread = spread.fillna(frame["pooled_std"])
             found |= dict.fromkeys(parts, spread)
-    return found | {name: found[like] for name, like in PRECISE_AS.items() if like in found}
+    if "difference" in found:
+        found["detectable"] = found["difference"]
+    if "baseline_std" in found and "noisy_std" in found:
+        found["luck_95"] = np.fmax(found["baseline_std"], found["noisy_std"])
+    return found
 
 
 def text_of(name, value, form, spread=None):

@@ -37,7 +37,7 @@ SEEDS_FOR_INTERACTION = 3  # of each of the four configurations
 # After those that name a study
 _COLUMNS = {
     "summary": """environment noise noise_rate n mean std n_baseline baseline_mean
-        baseline_std difference improvement_percent p std_change_percent steps_to_baseline""",
+        baseline_std difference improvement_percent p steps_to_baseline""",
     "best": """environment noise noise_rate baseline_mean baseline_std noisy_mean
         noisy_std difference improvement_percent p p_adjusted luck_median luck_95 p_luck
         leave_one_seed_out_percent n n_baseline chosen_from leave_one_seed_out_mean""",
@@ -102,7 +102,6 @@ def summary_rows(study):
         if config != BASELINE:
             row["difference"] = mean - base_mean
             row["improvement_percent"] = percent_of(mean - base_mean, baseline)
-            row["std_change_percent"] = 100 * (std / base_std - 1) if base_std else np.nan
         curves = study.returns[config][..., e]
         row["steps_to_baseline"] = steps_to_reach(curves, study.steps, base_mean)
         yield row
