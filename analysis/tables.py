@@ -70,8 +70,8 @@ _COLUMNS_WITH = {
     PLAIN: "steps_millions",
 }
 FORMATS = {name: form for form, names in _COLUMNS_WITH.items() for name in names.split()}
-STATISTICS_ONLY_CSV = ("t", "pooled_std", "environments", "comparisons")
-STATISTICS_ONLY_CSV += ("smallest_p", "smallest_p_adjusted")
+STATISTICS_ONLY_CSV = ("iqm", "iqm_low", "iqm_high", "t", "pooled_std", "environments")
+STATISTICS_ONLY_CSV += ("comparisons", "smallest_p", "smallest_p_adjusted")
 LUCK_ONLY_CSV = ("consistent_by_luck_95", "consistently_worse_by_luck_95")
 
 # --------------------------------------------------------------------------------------------- rows

@@ -278,7 +278,7 @@ def verdicts(found, judgements):
     for choice, (comparison, p) in zip(found, judgements, strict=True):
         noises = choice.schedule[0][0] if choice.schedule else 1
         [winner] = choice.state.noises
-        yield halving.verdict(choice.name, winner, noises, comparison, p, len(found))
+        yield halving.sentence(choice.name, winner, noises, comparison, p, len(found))
 
 
 def obstacle(choice):

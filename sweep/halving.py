@@ -140,7 +140,7 @@ def helps(comparison, p_corrected):
     return significant(p_corrected) and comparison.t > 0
 
 
-def verdict(name, winner, noises, comparison, p_corrected, verdicts):
+def sentence(name, winner, noises, comparison, p_corrected, verdicts):
     """Say in one plain sentence what came out.
 
     name: the algorithm and the environment. noises: how many were searched. verdicts: for how many
