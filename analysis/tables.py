@@ -71,7 +71,7 @@ _COLUMNS_WITH = {
 }
 FORMATS = {name: form for form, names in _COLUMNS_WITH.items() for name in names.split()}
 STATISTICS_ONLY_CSV = ("iqm", "iqm_low", "iqm_high", "t", "pooled_std", "environments")
-STATISTICS_ONLY_CSV += ("comparisons", "smallest_p", "smallest_p_adjusted")
+STATISTICS_ONLY_CSV += ("seeds_needed", "comparisons", "smallest_p", "smallest_p_adjusted")
 LUCK_ONLY_CSV = ("consistent_by_luck_95", "consistently_worse_by_luck_95")
 
 # --------------------------------------------------------------------------------------------- rows
