@@ -22,9 +22,8 @@ from pathlib import Path
 
 import tyro
 
-from analysis.effects import ENDS
 from analysis.errors import fail
-from analysis.figures import NARROW, figures, write_figure
+from analysis.figures import figures, write_figure
 from analysis.formatting import text_table, wrapped, write_table
 from analysis.paper import read_paper
 from analysis.report import write_report
@@ -34,8 +33,8 @@ from analysis.tables import family_notes, make_tables, table_of
 from analysis.verdicts import clear_first, headlines, sentences, tally
 
 # Columns that a terminal may have room for, the most important ones first
-BEST_IN_SHORT = ["algorithm, environment", "noise", "noise_rate", *ENDS, "p_adjusted", "n"]
-BEST_IN_SHORT += ["luck_95_percent", "p_luck_of_best", "baseline_mean", "baseline_std"]
+BEST_IN_SHORT = ["algorithm, environment", "noise", "noise_rate", "difference", "p_adjusted", "n"]
+BEST_IN_SHORT += ["luck_95", "p_luck_of_best", "baseline_mean", "baseline_std"]
 BEST_IN_SHORT += ["noisy_mean", "noisy_std"]
 MISSING_IN_SHORT = ["status", "reason", "seeds", "environment", "noise", "noise_rate", "run"]
 
@@ -112,11 +111,9 @@ def write_results(out, verdicts, tables, studies, overview, problems, notes):
     out.mkdir(parents=True, exist_ok=True)
     for table in tables.values():
         write_table(out, table)
-    drawn = []
-    for name, figure, caption in figures(studies, tables):
-        write_figure(out, name, figure)
-        if not name.endswith(NARROW):
-            drawn.append((name, caption))
+    drawn = list(figures(studies, tables))
+    for drawing in drawn:
+        write_figure(out, drawing)
     write_report(out, verdicts, tables, drawn, overview, problems, notes)
 
 
@@ -180,7 +177,7 @@ def main(args):
     tables["missing"] = table_of("missing", missing)
     if choice is not None:
         tables["choice"] = table_of("choice", choice)
-    verdicts = sentences(studies, tables["statistics"].frame)
+    verdicts = sentences(tables["statistics"].frame)
     notes = family_notes(tables["statistics"].frame) + notes
     overview = overview_of(runs, studies)
     try:

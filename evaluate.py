@@ -51,6 +51,7 @@ from noisy_wrappers import (
     canonical_env_id,
     make_noisy,
     noise_slug,
+    rounded,
     seed_globals,
     seeded_globals,
     split_noises,
@@ -326,8 +327,10 @@ def print_table(runs, conditions, stored, episodes):
 def mean_return(seeds, key, episodes):
     """Spell the mean return under a condition, and its standard deviation if there are seeds."""
     means = [np.mean(seed[key][:episodes], axis=0)[0] for seed in seeds]
-    spread = f" ± {np.std(means, ddof=1):.1f}" if len(means) > 1 else ""
-    return f"{np.mean(means):.1f}{spread}"
+    if len(means) == 1:
+        return rounded(means[0])
+    spread = np.std(means, ddof=1)
+    return f"{rounded(np.mean(means), spread)} ± {rounded(spread, spread)}"
 
 
 def works(code):
@@ -371,7 +374,7 @@ def show(runs, conditions, args):
             failures.append(f"{name}: {result}")
             continue
         episodic_return, length = result
-        print(f"{name}: return {episodic_return:.1f}, {length} steps")
+        print(f"{name}: return {rounded(episodic_return)}, {length} steps")
     for failure in failures:
         print(f"error: cannot draw {failure}", file=sys.stderr)
     if failures:

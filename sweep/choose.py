@@ -342,7 +342,8 @@ def verdicts(found, judgements):
     """Yield what came out, one line for each choice."""
     for choice, (comparison, p) in zip(found, judgements, strict=True):
         noises = choice.schedule[0][0] if choice.schedule else 1
-        yield halving.verdict(choice.name, noises, comparison, p, len(found))
+        [winner] = choice.state.noises
+        yield halving.sentence(choice.name, winner, noises, comparison, p, len(found))
 
 
 def obstacle(choice):
