@@ -28,6 +28,8 @@ from analysis.verdicts import seeds_of
 
 STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
 STYLE["svg.hashsalt"] = "noisy"  # equal figures are equal files
+STYLE["pdf.fonttype"] = 42  # TrueType: ICML and GECCO refuse a paper with Type 3 fonts
+STYLE["text.parse_math"] = False  # names of experiments are no formulas
 STYLE["axes.titley"] = 1.0  # above the axes, without a search for labels that are in the way
 matplotlib.rcParams.update(STYLE)
 HEIGHT = 3.6  # inches, at least

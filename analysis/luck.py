@@ -148,7 +148,7 @@ def add_luck_of_best(best, lucks):
     """
     best = best.assign(luck_median_percent=np.nan, luck_95_percent=np.nan, p_luck=np.nan)
     for row in best.itertuples():
-        draws = lucks[row.algorithm, row.settings, row.phase].best.get(row.environment)
+        draws = lucks[row.algorithm, row.exp_name, row.phase].best.get(row.environment)
         if draws is not None:
             best.loc[row.Index, "luck_median_percent"] = np.median(draws)
             best.loc[row.Index, "luck_95_percent"] = np.quantile(draws, 0.95)

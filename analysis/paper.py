@@ -45,7 +45,7 @@ def read_paper(folder):
         table["noise"] = table["noise_as_run"]
         rates = table["noise_rate"].astype(float)
         table["noise_rate"] = [rate_text((rate, rate)) for rate in rates]
-        tables[name] = table.assign(settings="", phase="")
+        tables[name] = table.assign(exp_name="", phase="")
     return tables
 
 
@@ -122,13 +122,13 @@ def compare_table(ours, listed, paper, mean, std, number):
     difference is in standard errors: (ours - paper) / sqrt(std^2 / n + paper_std^2 / paper_n).
     """
     keys = [name for name in (*KEYS, "steps_millions") if name in paper]
-    names = [name for name in keys if name not in ("settings", "phase")]
+    names = [name for name in keys if name not in ("exp_name", "phase")]
     ours = ours.assign(key=matching_keys(ours, names))
     paper = paper.assign(key=matching_keys(paper, names))
     shared = ours["key"].isin(paper["key"])
     if listed is None:
         ours["listed"] = shared
-    else:  # a key unites settings and versions, only one of which may be listed
+    else:  # a key unites studies and versions, only one of which may be listed
         listed_rows = pd.MultiIndex.from_frame(listed[keys])
         ours["listed"] = pd.MultiIndex.from_frame(ours[keys]).isin(listed_rows)
     ours = ours[ours["listed"] | shared]

@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 
 from analysis.configurations import BASELINE, Configuration
+from analysis.errors import in_words
 from analysis.formatting import P_VALUE, SHARE, WHOLE, Table
 from analysis.runs import KEYS, ROBUSTNESS_COLUMNS, STUDY, study_name
 from analysis.statistics import (
@@ -90,7 +91,7 @@ def read_robustness(runs_dir, runs):
         try:
             episodes = read_episodes(paths[0])
         except (OSError, ValueError, EOFError) as error:
-            notes.append(f"{run.run}: {paths[0].name} is left out: {' '.join(str(error).split())}")
+            notes.append(f"{run.run}: {paths[0].name} is left out: {in_words(error)}")
             continue
         keys = [getattr(run, name) for name in (*KEYS, "configuration", "seed")]
         for condition, returns in episodes.items():
@@ -303,7 +304,7 @@ def robustness_sentences(scores):
     """Yield one plain sentence for each training configuration: is it more robust?"""
     for row in scores[primary(scores)].itertuples():
         where = row.environment or "all environments together"
-        study = study_name(row.algorithm, row.settings, row.phase)
+        study = study_name(row.algorithm, row.exp_name, row.phase)
         verdict = "no clear difference in robustness to new noise"
         if row.p <= LEVEL:
             more = "more" if row.win_rate > 0.5 else "less"

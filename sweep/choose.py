@@ -7,16 +7,16 @@ command computes from the finished runs where each choice stands.
 import csv
 import fcntl
 import itertools
-import json
 import os
 from statistics import fmean
 from typing import NamedTuple
 
 from analysis.errors import fail
+from analysis.folders import CONFIRMATION, SEARCH, flat_choice, read_config, read_json
 from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED, read_run
 from analysis.statistics import detectable_shift, holm
 from sweep import halving
-from sweep.grid import NOISES, RATES, PlannedRun, cell, cells, make_run, result
+from sweep.grid import PlannedRun, cell, cells, make_run, result
 
 # What a run takes on one core until the finished ones tell: docs/sweeps.md
 STEPS_PER_SECOND = {"sac": 150, "td3": 265, "ppo": 5700}  # in small MuJoCo environments
@@ -61,18 +61,21 @@ def follow(args, algorithm, env_id):
     last_seed = sum(seeds for _, seeds in schedule)
     if last_seed >= FIRST_CONFIRMATION_SEED:
         fail(f"--budget {budget} is too large: the best noises would run with {last_seed} seeds")
-    if not args.noises:
-        check_others(args, algorithm, env_id)
     all_cells = {halving.BASELINE: ([], [])} | noises
     runs, returns = {}, {}
     while True:
         state = halving.advance(list(noises), budget, args.confirm, returns)
+        phase = SEARCH if len(state.rounds) < len(schedule) else CONFIRMATION
         finished = {}
-        for noise, rate, seed in state.due:
-            run = make_run(args, algorithm, env_id, *all_cells[noise, rate], seed)
-            runs[noise, rate, seed] = run
+        for key in state.due:
+            noise, rate, seed = key
+            run = make_run(args, algorithm, env_id, *all_cells[noise, rate], seed, phase)
+            check_place(run)
             if result(run)[0]:
-                finished[noise, rate, seed] = read_return(run, seed)
+                run, value = with_return(run, phase)
+                if not run.damage:
+                    finished[key] = value
+            runs[key] = run
         if not finished:
             break
         returns |= finished
@@ -80,8 +83,8 @@ def follow(args, algorithm, env_id):
     left = halving.number_of_runs(len(noises), budget, args.confirm) - len(returns)
     speeds = IN_HUMANOID if "Humanoid" in env_id else STEPS_PER_SECOND
     seconds = START_UP + args.total_timesteps / speeds[algorithm]
-    if returns:
-        seconds = fmean(wall_time(runs[key]) for key in returns)
+    taken = [taken for taken in map(wall_time, map(runs.get, returns)) if taken]
+    seconds = fmean(taken) if taken else seconds
     return Choice(
         name=f"{algorithm.upper()} on {env_id}",
         algorithm=algorithm,
@@ -94,24 +97,6 @@ def follow(args, algorithm, env_id):
         returns=returns,
         core_hours=left * seconds / 3600,
     )
-
-
-def check_others(args, algorithm, env_id):
-    """Exit if the folder holds a search among all of the paper's noises.
-
-    They were the default once. With today's list a search would mix with theirs.
-    """
-    ours = cells(args, algorithm, env_id)
-    for noise, rate in itertools.product(NOISES, args.noise_rates or RATES):
-        found = cell([(noise, rate)])
-        if found in ours:
-            continue
-        if result(make_run(args, algorithm, env_id, *found, seed=1))[0]:
-            fail(
-                f"{args.runs_dir} holds a choice among other noises, one of them "
-                f"{halving.spelled(as_text(found))}: continue it (--noises paper tries all 90), "
-                "or choose another --runs-dir"
-            )
 
 
 def runs_of(found):
@@ -146,36 +131,46 @@ def as_text(found):
     return " + ".join(noises), " + ".join(map(str, rates))
 
 
-def read_return(run, seed):
-    """Return what a finished run counts for.
+def check_place(run):
+    """Exit if the runs of an earlier version are side by side, not in the folders of the phases."""
+    phase = run.folder.parent
+    if not phase.exists() and (phase.parent / run.folder.name).exists():
+        fail(f"{flat_choice(phase.parent)} (or choose another --runs-dir, if it is another sweep)")
+
+
+def with_return(run, phase):
+    """Return a finished run, with what is damaged in it, and what it counts for.
 
     That is halving.score in the search, and its last test in the confirmation.
     """
     row = read_run(run.folder)
     if row["status"] != "finished":
-        fail(f"{run.folder} cannot be used ({row['reason']}); delete it to run it again")
-    if seed >= FIRST_CONFIRMATION_SEED:
-        return row["returns"][-1]
-    return halving.score(row["steps"], row["returns"])
+        damage = f"{run.folder}/{row['reason']}; move its folder away to run it again"
+        return run._replace(damage=damage), None
+    if phase == CONFIRMATION:
+        return run, row["returns"][-1]
+    return run, halving.score(row["steps"], row["returns"])
 
 
 def check_frequencies(runs):
     """Exit if finished runs were not all tested equally often: their scores do not compare."""
     found = {}
     for run in runs:
-        made_with = json.loads((run.folder / "config.json").read_text())["args"]
-        found.setdefault(made_with.get("eval_frequency"), run.folder)
+        made_with = read_config(run.folder)["args"]
+        if "eval_frequency" in made_with:
+            found.setdefault(made_with["eval_frequency"], run.folder)
     if len(found) > 1:
         (every, one), (other, another), *_ = found.items()
         fail(
             f"{one} was tested every {every} steps and {another} every {other}: choose another "
-            f"--runs-dir, or delete the runs of one kind"
+            f"--runs-dir, or move the runs of one kind away"
         )
 
 
 def wall_time(run):
-    """Return how many seconds a finished run has taken."""
-    return json.loads((run.folder / "result.json").read_text())["wall_time_seconds"]
+    """Return how many seconds a finished run has taken, or None where it does not say."""
+    seconds = read_json(run.folder / "result.json").get("wall_time_seconds")
+    return seconds if isinstance(seconds, int | float) and seconds > 0 else None
 
 
 # ---------------------------------------------------------------------------------------- in words
@@ -249,6 +244,14 @@ def standing(found):
     yield total(found)
 
 
+def report(found, path):
+    """Print the verdicts, and write choice.csv; or, where runs are left, what to do about them."""
+    finished = rows(found)
+    if finished:
+        write_choice(path, finished)
+    print(*conclusion(found), sep="\n")
+
+
 def conclusion(found):
     """Yield the verdicts, one line for each choice.
 
@@ -305,7 +308,7 @@ def obstacle(choice):
 def write_choice(path, rows):
     """Write choice.csv whole or not at all; it keeps what other commands have chosen."""
     try:
-        with open(path.with_name(".choice.lock"), "w") as lock:
+        with open(path.with_name(".choice.lock"), "w", encoding="utf-8") as lock:
             fcntl.lockf(lock, fcntl.LOCK_EX)  # until it is closed: commands may end side by side
             replace_choice(path, rows)
     except (OSError, KeyError, ValueError) as error:
@@ -316,11 +319,11 @@ def replace_choice(path, rows):
     """Replace the lines of what was chosen now, and keep the others."""
     ours = {(row["algorithm"], row["environment"]) for row in rows}
     if path.exists():
-        with open(path, newline="") as file:
+        with open(path, newline="", encoding="utf-8") as file:
             old = list(csv.DictReader(file))
         rows = [r for r in old if (r["algorithm"], r["environment"]) not in ours] + rows
     temporary = path.with_suffix(".tmp")
-    with open(temporary, "w", newline="") as file:
+    with open(temporary, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, CHOICE_COLUMNS, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
