@@ -115,7 +115,7 @@ def luck_of_study(study):
 
 
 def luck_of_paper(best, seeds, configurations):
-    """Draw the paper's sweep from its table of best noises: a dict of (algorithm, "", "") -> Luck.
+    """Draw the paper's sweep from its table of best noises: a dict of what STUDY has -> Luck.
 
     The standard deviation is the baseline's. That of the best noise is known, too, but belongs to a
     winner, which had luck with its seeds.

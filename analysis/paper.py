@@ -10,7 +10,7 @@ import pandas as pd
 
 from analysis.configurations import BASELINE, rate_text
 from analysis.luck import add_luck_of_best, add_luck_of_consistent, luck_of_paper, luck_rows
-from analysis.runs import KEYS, rows_of, split_version
+from analysis.runs import KEYS, rows_of, script_name, split_version
 
 PAPER_SEEDS = {"SAC": 5, "TD3": 5, "PPO": 10}
 PAPER_ENVIRONMENTS = 5
@@ -45,7 +45,8 @@ def read_paper(folder):
         table["noise"] = table["noise_as_run"]
         rates = table["noise_rate"].astype(float)
         table["noise_rate"] = [rate_text((rate, rate)) for rate in rates]
-        tables[name] = table.assign(exp_name="", phase="")
+        names = [script_name(algorithm) for algorithm in table["algorithm"]]
+        tables[name] = table.assign(exp_name=names, phase="")
     return tables
 
 
