@@ -96,23 +96,23 @@ class FinishedRun:
 
 
 class UnusableError(Exception):
-    """A run cannot be tested; the text says why, and begins with its folder."""
+    """A run cannot be tested; the text says why."""
 
 
 def find_runs(paths):
     """Return the finished runs that the paths name, each once; a folder stands for its runs.
 
-    Print how many are not finished, and add a list of those that are damaged, in words.
+    Also return {run folder: what is damaged in it}, and print how many runs are not finished.
     """
     if not paths:
         fail("name the runs to test, for example: python evaluate.py runs/*Hopper-v5*")
     folders = {}
     for path in map(Path.expanduser, paths):
         found = [path] if is_run(path) else runs_of(path)
-        if not path.exists() or (len(paths) == 1 and not found):
+        if not os.path.lexists(path) or (len(paths) == 1 and not found):
             fail(f"{path} is neither a run nor a folder of runs")
         folders |= dict.fromkeys(map(Path.absolute, found))
-    runs, damaged = [], []
+    runs, damaged = [], {}
     for folder in folders:
         try:
             config = read_config(folder) if has_begun(folder) else None
@@ -120,7 +120,7 @@ def find_runs(paths):
                 names = [field.name for field in fields(FinishedRun)][1:]
                 runs.append(FinishedRun(folder, *(config[name] for name in names)))
         except DamageError as error:
-            damaged.append(f"{folder}/{error}")
+            damaged[folder] = str(error)
     unfinished = len(folders) - len(runs) - len(damaged)
     if unfinished:
         print(f"unfinished runs are left out: {unfinished}")
@@ -154,15 +154,15 @@ def load(run, render_mode=None):
     try:
         canonical_env_id(run.environment)  # imports its module
     except ValueError as error:
-        raise UnusableError(f"{run.folder}: {error}") from None
+        raise UnusableError(error) from None
     steps = run.settings.get("max_episode_steps")
     drawn = {"render_mode": render_mode} if render_mode else {}  # not every class takes it
     env = script.make_env(run.environment, max_episode_steps=steps, **drawn)
     try:
         return env, script.load_policy(run.folder, env)
     except Exception as error:  # a damaged file may raise anything
-        said = f"is not a policy for {run.environment}: {in_words(error)}"
-        raise UnusableError(f"{run.folder / 'policy.pt'} {said}") from None
+        reason = f"policy.pt is not a policy for {run.environment}: {in_words(error)}"
+        raise UnusableError(reason) from None
 
 
 def folders_of_runs(run):
@@ -189,13 +189,15 @@ def refuse_foreign_module(run):
             beside = place.is_relative_to(runs_dir) and not is_own
             if beside or place.is_relative_to(folder) or folder.is_relative_to(top):
                 raise UnusableError(
-                    f"{run.folder}: {run.environment} would be imported from {place}, in a folder "
+                    f"{run.environment} would be imported from {place}, in a folder "
                     "of runs; if you trust that module, move it to where your own ones are"
                 )
 
 
 def check_runs(runs, conditions, bad, storing):
-    """Return {run: what is stored of it} of the runs that can be tested; add the others to `bad`.
+    """Return {run: what is stored of it} of the runs that can be tested.
+
+    Add the others to `bad`, {run folder: why}.
 
     The policy must fit its environment, and every noise must be able to act on it.
     """
@@ -207,13 +209,21 @@ def check_runs(runs, conditions, bad, storing):
                 for noises, rates in conditions.values():
                     make_noisy(env, noises, rates)
             stored[run] = read_stored(run) if storing else {}
-        except UnusableError as error:
-            bad.append(str(error))
-        except ValueError as error:
-            bad.append(f"{run.folder}: {error}")
+        except (UnusableError, ValueError) as error:
+            bad[run.folder] = str(error)
         except Exception as error:  # of the user's environment
-            bad.append(f"{run.folder}: {with_place(error)}")
+            bad[run.folder] = with_place(error)
     return stored
+
+
+def tell(bad):
+    """Print each reason why runs cannot be tested, with the first of them; bad: see check_runs."""
+    folders = {}
+    for folder, reason in bad.items():
+        folders.setdefault(reason, []).append(folder)
+    for reason, (first, *others) in folders.items():
+        more = f" and {len(others)} more" if others else ""
+        print(f"error: {first}{more}: {reason}", file=sys.stderr)
 
 
 def with_place(error):
@@ -294,7 +304,7 @@ def read_stored(run):
             result = float(row["episodic_return"]), int(row["episodic_length"])
             stored.setdefault((row["noise"], row["noise_rate"]), []).append(result)
     except (OSError, ValueError, KeyError, TypeError, OverflowError, csv.Error) as error:
-        text = f"cannot read {path} ({in_words(error)}); delete it to play everything again"
+        text = f"robustness.csv: {in_words(error)}; delete that file to play everything again"
         raise UnusableError(text) from None
     return stored
 
@@ -438,8 +448,9 @@ def main(args):
         draw_without_display()
     stored = check_runs(runs, conditions, bad, storing)
     runs = list(stored)
-    for text in bad:
-        print(f"error: {text}", file=sys.stderr)
+    tell(bad)
+    if not runs and bad:
+        return 2
     if not runs:
         fail(f"there is no finished run in {', '.join(map(str, args.runs))}")
     if args.video:

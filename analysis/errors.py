@@ -1,6 +1,5 @@
 """How analyze.py, evaluate.py and the sweep write to a terminal, and end on bad input."""
 
-import io
 import os
 import re
 import sys
@@ -20,22 +19,26 @@ def in_words(error):
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
-class Terminal(io.TextIOWrapper):
-    """Standard output that takes any text and outlives its reader, as in `... | head`.
+class Terminal:
+    """A stream of sys that takes any text and outlives its reader, as in `... | head`.
 
     Logs, config.json and names of folders are other people's: a control character, which could
     be part of an escape sequence, and a character that the terminal lacks are replaced.
     """
 
     def __init__(self, stream):
-        """Take over a stream of sys."""
-        options = {"encoding": stream.encoding, "line_buffering": stream.line_buffering}
-        super().__init__(stream.detach(), errors="replace", **options)
+        """Take over a stream."""
+        stream.reconfigure(errors="replace")
+        self._stream = stream
+
+    def __getattr__(self, name):
+        """Be the stream in everything else."""
+        return getattr(self._stream, name)
 
     def write(self, text):
         """Write text; once the reader has left, into nothing."""
         try:
-            super().write(CONTROL.sub("?", text))
+            self._stream.write(CONTROL.sub("?", text))
         except BrokenPipeError:
             self._turn_off()
         return len(text)
@@ -43,12 +46,12 @@ class Terminal(io.TextIOWrapper):
     def flush(self):
         """Pass on what is buffered."""
         try:
-            super().flush()
+            self._stream.flush()
         except BrokenPipeError:
             self._turn_off()
 
     def _turn_off(self):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
 
 
 def take_over_terminal():

@@ -18,7 +18,6 @@ import numpy as np
 import pandas as pd
 
 from analysis.configurations import BASELINE, Configuration
-from analysis.errors import in_words
 from analysis.formatting import P_VALUE, SHARE, WHOLE, Table
 from analysis.runs import KEYS, ROBUSTNESS_COLUMNS, STUDY, study_name
 from analysis.statistics import (
@@ -32,6 +31,7 @@ from analysis.statistics import (
     probability_of_improvement,
 )
 from analysis.verdicts import counted, p_value
+from noisy_wrappers import WRAPPERS
 
 FILES = ("robustness.csv", "robustness.csv.gz")
 CONDITION = ["test_noise", "test_rate"]
@@ -91,7 +91,7 @@ def read_robustness(runs_dir, runs):
         try:
             episodes = read_episodes(paths[0])
         except (OSError, ValueError, EOFError) as error:
-            notes.append(f"{run.run}: {paths[0].name} is left out: {in_words(error)}")
+            notes.append(f"{run.run}: {paths[0].name} is left out: {' '.join(str(error).split())}")
             continue
         keys = [getattr(run, name) for name in (*KEYS, "configuration", "seed")]
         for condition, returns in episodes.items():
@@ -110,7 +110,10 @@ def read_episodes(path):
     if not np.isfinite(returns).all() or not len(returns):
         raise ValueError("no episodes, or a return that is not finite")
     groups = returns.groupby([table["noise"], table["noise_rate"]], sort=False)
-    return {Configuration.parse(*key): group.to_numpy(float) for key, group in groups}
+    found = {Configuration.parse(*key): group.to_numpy(float) for key, group in groups}
+    for name in set().union(*(condition.wrappers for condition in found)) - WRAPPERS.keys():
+        raise ValueError(f"unknown noise {name!r}")
+    return found
 
 
 def cvar(returns):

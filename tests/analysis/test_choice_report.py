@@ -1,6 +1,7 @@
 """What analyze.py says of noise that was chosen, that changes during training, or that combines."""
 
-from pathlib import Path
+import json
+import subprocess
 
 import numpy as np
 import pandas as pd
@@ -22,17 +23,18 @@ def write_choice(root, env="Hopper-v5", seeds=range(1001, 1006), gain=30.0):
     """Runs of a search in two rounds, which flatters its winner, and of a confirmation."""
     for noise, n, final in ((SCALE, 3, 900.0), (ENDING, 1, 100.0)):
         for seed in range(1, n + 1):
-            write_run(root, [final + seed], "PPO", env, noise, 1.0, seed)
+            write_run(root / "search", [final + seed], "PPO", env, noise, 1.0, seed)
+    fresh = root / "confirmation"
     for seed in seeds:
-        write_run(root, [100.0 + seed - 1000], "PPO", env, seed=seed)
-        write_run(root, [100.0 + gain + seed - 1000], "PPO", env, SCALE, 1.0, seed)
+        write_run(fresh, [100.0 + seed - 1000], "PPO", env, seed=seed)
+        write_run(fresh, [100.0 + gain + seed - 1000], "PPO", env, SCALE, 1.0, seed)
     lines = [
         f'PPO,{env},search,1,"{SCALE}",1.0,1,901.0,yes\n',
         f'PPO,{env},search,1,"{ENDING}",1.0,1,101.0,no\n',
         f"PPO,{env},confirmation,,,0.0,5,103.0,\n",
         f'PPO,{env},confirmation,,"{SCALE}",1.0,5,133.0,yes\n',
     ]
-    path = Path(root) / "choice.csv"
+    path = root / "choice.csv"
     path.write_text((path.read_text() if path.exists() else HEADER) + "".join(lines))
 
 
@@ -75,12 +77,39 @@ def test_confirmations_are_one_family_of_holms(tmp_path):
     assert set(table["comparisons"]) == {3}
 
 
-def test_without_choice_csv_high_seeds_are_seeds(tmp_path):
+def test_the_phases_are_folders_and_high_seeds_are_seeds(tmp_path):
+    """A choice that is not finished has no choice.csv."""
     write_choice(tmp_path / "runs")
     (tmp_path / "runs/choice.csv").unlink()
+    for seed in (1, 1001):
+        write_run(tmp_path / "runs", [5.0], "PPO", "Pusher-v5", seed=seed)
     tables = run(tmp_path)
-    assert set(tables["summary_PPO"]["phase"]) == {""} and "choice" not in tables
-    assert row(tables["summary_PPO"], noise=SCALE)["n"] == 8
+    summary = tables["summary_PPO"].groupby("phase")["n"].agg(list).to_dict()
+    assert summary == {"": [2], "search": [1, 3], "confirmation": [5, 5]}
+    assert "choice" not in tables
+
+
+def test_the_flat_folder_of_an_earlier_version_is_refused_with_the_commands(tmp_path, capsys):
+    """After them, the tables are those of a choice that was never flat."""
+    for style in ("p1.0_s{}_A__Hopper-v5__ppo", "Hopper-v5__ppo__A_p1.0__{}"):
+        root = tmp_path / style[0] / "my runs"
+        write_choice(root)
+        expected = run(tmp_path / style[0], "my runs")
+        for phase in ("search", "confirmation"):
+            for i, folder in enumerate(sorted((root / phase).iterdir())):
+                seed = json.loads((folder / "config.json").read_text())["args"]["seed"]
+                folder.rename(root / (style.format(seed).replace("A", f"A{phase[0]}{i}")))
+            (root / phase).rmdir()
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as error:
+            run(tmp_path / style[0], "my runs")
+        printed = capsys.readouterr().err
+        assert error.value.code == 2 and printed.count("\n") == 1 and printed.count("mv ") == 2
+        command = printed.partition("now: ")[2]
+        subprocess.run(command, shell=True, check=True, executable="/bin/bash")
+        for name, table in run(tmp_path / style[0], "my runs", "again").items():
+            if name != "missing":
+                pd.testing.assert_frame_equal(table, expected[name])
 
 
 def test_other_sweeps_in_the_folder_of_a_choice_stay_as_they_are(tmp_path):
@@ -102,10 +131,10 @@ def test_a_choice_in_a_folder_of_its_own_disturbs_no_other_sweep(tmp_path):
     for seed in (1, 2, 3):
         write_run(tmp_path / "runs", [100.0 + seed], "PPO", seed=seed)
         write_run(tmp_path / "runs", [110.0 + seed], "PPO", noise=SCALE, rate=1.0, seed=seed)
-    before = [run.folder.name for run in evaluate.find_runs([tmp_path / "runs"])]
+    before = [run.folder for run in evaluate.find_runs([tmp_path / "runs"])[0]]
     tables = run(tmp_path)
     write_choice(tmp_path / "runs/choose")
-    assert [run.folder.name for run in evaluate.find_runs([tmp_path / "runs"])] == before
+    assert [run.folder for run in evaluate.find_runs([tmp_path / "runs"])[0]] == before
     again = run(tmp_path, out="again")
     assert tables.keys() == again.keys() and "choice" not in again
     for name, table in tables.items():
