@@ -1,6 +1,9 @@
 # `make demo` and `make test` need git and Python 3.11 or newer with venv; they make .venv first.
+# A .venv that exists is kept: pip installs what is missing in it or has another version.
 PYTHON ?= python3
 BIN := .venv/bin
+SHELL := bash
+.SHELLFLAGS := -o pipefail -c
 
 .PHONY: demo test lint results clean
 
@@ -45,10 +48,21 @@ clean:
 $(BIN)/python:
 	$(PYTHON) -m venv .venv
 
-$(BIN)/.run: requirements.txt | $(BIN)/python
-	$(BIN)/pip install --quiet --requirement $<
-	touch $@
+# pip shows its own progress on a terminal; elsewhere one line tells each package.
+INSTALL = if [ -t 1 ]; then $(BIN)/python -m pip install --requirement $<; else \
+	$(BIN)/python -m pip install --progress-bar off --requirement $< \
+	| sed -nu -e 's/^Collecting \([^ ]*\).*/installing \1/p' -e '/^Successfully/p'; fi
 
-$(BIN)/.dev: requirements-dev.txt requirements.txt | $(BIN)/python
-	$(BIN)/pip install --quiet --requirement $<
-	touch $@ $(BIN)/.run
+$(BIN)/.size: | $(BIN)/python
+	@$(BIN)/python -c "import torch" 2>/dev/null || { \
+	echo "Installing into .venv: about 3 GB are fetched, most of them PyTorch's CUDA libraries."; \
+	echo "The CPU-only PyTorch makes it 0.4 GB: README.md, Install, says how. Ctrl-C stops here."; }
+	@touch $@
+
+$(BIN)/.run: requirements.txt | $(BIN)/.size
+	@$(INSTALL)
+	@touch $@
+
+$(BIN)/.dev: requirements-dev.txt requirements.txt | $(BIN)/.size
+	@$(INSTALL)
+	@touch $@ $(BIN)/.run

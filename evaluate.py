@@ -20,7 +20,6 @@ import importlib
 import itertools
 import multiprocessing
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -37,7 +36,6 @@ from gymnasium.wrappers import RecordVideo
 from tabulate import tabulate
 from tqdm import tqdm
 
-from analysis.configurations import Configuration
 from analysis.errors import fail, in_words, take_over_terminal
 from analysis.folders import (
     PHASES,
@@ -51,11 +49,13 @@ from analysis.folders import (
 )
 from analysis.runs import ROBUSTNESS_COLUMNS, script_name, study_name, usual_settings
 from noisy_wrappers import (
+    BASELINE,
+    Configuration,
     NotFiniteError,
     canonical_env_id,
-    canonical_noises,
     make_noisy,
     noise_slug,
+    split_noises,
 )
 
 DISPLAY = "import glfw; assert glfw.init() and glfw.get_primary_monitor()"
@@ -134,16 +134,15 @@ def read_conditions(args):
     """
     if bool(args.noise) != bool(args.noise_rate):
         fail("--noise and --noise-rate go together: every noise is tested at every rate")
-    conditions = {("", "0.0"): ([], [])}
+    conditions = {BASELINE.columns: BASELINE.texts}
     for noise, rate in itertools.product(args.noise, args.noise_rate):
         try:
-            noises, rates = canonical_noises(re.split(r"(?<=\))\s*\+\s*", noise), [rate])
+            configuration = Configuration.read(split_noises(noise), [rate])
         except ValueError as error:
             fail(error)
-        if any(isinstance(rate, str) for rate in rates):
+        if any(start != end for start, end in configuration.rates):
             fail(f"--noise-rate {rate}: policies are tested at constant rates")
-        if noises:  # a rate of 0 is clean
-            conditions[" + ".join(noises), " + ".join(map(str, rates))] = (noises, rates)
+        conditions.setdefault(configuration.columns, configuration.texts)  # a rate of 0 is clean
     return conditions
 
 

@@ -50,9 +50,11 @@ from numpy.typing import NDArray
 __version__ = "0.2.0"
 
 __all__ = [
+    "BASELINE",
     "MAY_DIFFER_IN_A_RUN",
     "MAY_DIFFER_IN_A_TABLE",
     "WRAPPERS",
+    "Configuration",
     "EnvState",
     "FiniteNumbers",
     "Noise",
@@ -79,11 +81,13 @@ __all__ = [
     "noise_statistics",
     "noise_wrappers",
     "parse_noise",
+    "rate_order",
     "refusals",
     "run_folder",
     "run_name",
     "set_progress",
     "signatures",
+    "split_noises",
 ]
 
 Env = gym.Env[Any, Any]
@@ -837,25 +841,153 @@ def _bad_noise(text: str, reason: str) -> ValueError:
     return ValueError("\n  ".join([f"bad noise {text!r}: {reason}; valid are", *signatures()]))
 
 
-def _pair(noises: Sequence[str], rates: Sequence[float | str]) -> list[tuple[Noise, float | str]]:
-    """Parse noises with their rates: without those of rate 0, dynamics noise first."""
-    noises = _listed("noises", noises, '["RandomNormalNoisyReward(0.1)"]')
-    rates = _listed("rates", rates, "[0.5]")
-    if noises and not rates:
-        raise ValueError("noise without a noise rate: give one for all noises, or one for each")
-    if rates and not noises:
-        raise ValueError("a noise rate without noise: name a noise, or leave the rate out")
-    if len(rates) not in (1, len(noises)):
-        raise ValueError(
-            "give one noise rate for all noises, or one for each "
-            f"(noises: {len(noises)}, noise rates: {len(rates)})"
-        )
-    canonical = [_spelled(_schedule(rate)) for rate in rates]
-    if len(canonical) == 1:
-        canonical = canonical * len(noises)
-    parsed = [parse_noise(noise) for noise in noises]
-    pairs = [(noise, rate) for noise, rate in zip(parsed, canonical, strict=True) if rate != 0]
-    return sorted(pairs, key=_place)
+@dataclass(frozen=True)
+class Configuration:
+    """The noises of a run or of a test, each with its rate; without any it is the baseline.
+
+    It is made once, from what a user writes (:meth:`read`) or from what a program has stored
+    (:meth:`stored`, :meth:`parse`), and then asked: no other code takes such text apart. Equal
+    configurations are equal objects. They are ordered by noise, then by rate, the baseline first.
+
+    >>> ending = Configuration.read(["RandomEarlyTermination(50, 50)"], ["1:0"])
+    >>> str(ending), ending.noise, ending.noise_rate
+    ('RandomEarlyTermination(50) at 1.0 to 0.0', 'RandomEarlyTermination(50)', '1.00 to 0.00')
+    """
+
+    noises: tuple[str, ...] = ()  # in canonical notation, in the order in which they wrap
+    rates: tuple[tuple[float, float], ...] = ()  # of each, at the start and the end of training
+
+    @classmethod
+    def read(cls, noises: Sequence[str], rates: Sequence[float | str]) -> "Configuration":
+        """Check noises and rates and make them canonical, as :func:`canonical_noises` says."""
+        noises = _listed("noises", noises, '["RandomNormalNoisyReward(0.1)"]')
+        rates = _listed("rates", rates, "[0.5]")
+        if noises and not rates:
+            raise ValueError("noise without a noise rate: give one for all noises, or one for each")
+        if rates and not noises:
+            raise ValueError("a noise rate without noise: name a noise, or leave the rate out")
+        if len(rates) not in (1, len(noises)):
+            raise ValueError(
+                "give one noise rate for all noises, or one for each "
+                f"(noises: {len(noises)}, noise rates: {len(rates)})"
+            )
+        schedules = [_schedule(rate) for rate in rates]
+        if len(schedules) == 1:
+            schedules = schedules * len(noises)
+        parsed = [parse_noise(noise) for noise in noises]
+        pairs = [pair for pair in zip(parsed, schedules, strict=True) if pair[1] != (0.0, 0.0)]
+        pairs.sort(key=lambda pair: _place(pair[0].wrapper))
+        return cls(tuple(str(noise) for noise, _ in pairs), tuple(rate for _, rate in pairs))
+
+    @classmethod
+    def stored(cls, noises: Sequence[str], rates: Sequence[float | str]) -> "Configuration":
+        """Return what :attr:`texts` describe, as config.json holds them; names are not checked."""
+        ends = [[float(end) for end in re.split(":| to ", str(rate))] for rate in rates]
+        return cls(tuple(noises), tuple((rate[0], rate[-1]) for rate in ends))
+
+    @classmethod
+    def parse(cls, noise: str, noise_rate: float | str) -> "Configuration":
+        """Read two cells of a csv file, :attr:`columns` or :attr:`noise` and :attr:`noise_rate`."""
+        return cls.stored(noise.split(" + "), str(noise_rate).split(" + ")) if noise else cls()
+
+    @property
+    def texts(self) -> tuple[list[str], list[float | str]]:
+        """The noises and the rates as config.json holds them and the scripts read them."""
+        return list(self.noises), [_spelled(rate) for rate in self.rates]
+
+    @property
+    def columns(self) -> tuple[str, str]:
+        """The cells of robustness.csv and choice.csv: "A(1.0) + B()", "0.05 + 1.0:0.0"."""
+        noises, rates = self.texts
+        return " + ".join(noises), " + ".join(map(str, rates or [0.0]))
+
+    @property
+    def noise(self) -> str:
+        """The noises as tables have them; the baseline's is empty."""
+        return self.columns[0]
+
+    @property
+    def noise_rate(self) -> str:
+        """The rates as tables and the paper have them: "0.05"; the baseline's is "0.00"."""
+        spelled = []
+        for rate in self.rates or [(0.0, 0.0)]:
+            start, end = (f"{r:.2f}" if round(r, 2) == r else f"{r:g}" for r in rate)
+            spelled.append(start if rate[0] == rate[1] else f"{start} to {end}")
+        return " + ".join(spelled)
+
+    @property
+    def is_baseline(self) -> bool:
+        """Whether there is no noise."""
+        return not self.noises
+
+    @property
+    def wrappers(self) -> list[str]:
+        """The names of the wrappers, in order."""
+        return [noise.partition("(")[0] for noise in self.noises]
+
+    @property
+    def kinds(self) -> set[str]:
+        """What the noises perturb: "observation", "reward", "action" or "dynamics"."""
+        return {WRAPPERS[name].kind for name in self.wrappers}
+
+    @property
+    def parts(self) -> list["Configuration"]:
+        """The configurations with one of the noises each."""
+        pairs = zip(self.noises, self.rates, strict=True)
+        return [Configuration((noise,), (rate,)) for noise, rate in pairs]
+
+    @property
+    def slug(self) -> str:
+        """Part of a file's name: "p0.05_NormalNoisyReward_1.0", or "" for the baseline."""
+        return "_".join(self._rates_and_names())
+
+    def _rates_and_names(self) -> list[str]:
+        if self.is_baseline:
+            return []
+        names = [_words(noise).removeprefix("Random") for noise in self.noises]
+        return ["p" + "+".join(map(_rate_word, self.rates)), "+".join(names)]
+
+    def wrap(self, env: Env, *, record_statistics: bool = True) -> Env:
+        """Stack the noises on an environment, as :func:`make_noisy` says."""
+        if not isinstance(env, gym.Env):
+            raise TypeError(f"make_noisy takes a single gymnasium.Env, not a {type(env).__name__}")
+        pairs = [(parse_noise(noise), rate) for noise, rate in zip(*self.texts, strict=True)]
+        recorded = any(env.has_wrapper_attr(name) for name in _OF_RECORDERS)
+        if recorded and record_statistics:
+            raise ValueError(_RECORDED)
+        if recorded and any(noise.wrapper is RandomEarlyTermination for noise, _ in pairs):
+            raise ValueError(_RECORDED_BENEATH_EARLY_TERMINATION)
+        for noise, rate in pairs:
+            if noise.wrapper.kind in _BEFORE_STATISTICS:
+                env = noise(env, rate)
+        if record_statistics:
+            env = RecordEpisodeStatistics(env)
+        for noise, rate in pairs:
+            if noise.wrapper.kind not in _BEFORE_STATISTICS:
+                env = noise(env, rate)
+        return env
+
+    def __str__(self) -> str:
+        """Return the configuration as a sentence has it: "A(1.0) + B() at 0.05 + 1.0 to 0.0"."""
+        noise, rate = self.columns
+        return f"{noise} at {rate.replace(':', ' to ')}" if noise else "no noise"
+
+    def __lt__(self, other: "Configuration") -> bool:
+        """Order by noise, then by rates as numbers; the baseline comes first."""
+        return (self.noise, self.rates) < (other.noise, other.rates)
+
+
+BASELINE = Configuration()
+
+
+def rate_order(noise_rate: str) -> tuple[tuple[float, float], ...]:
+    """Return the key that sorts rates of tables (:attr:`Configuration.noise_rate`) as numbers."""
+    return Configuration.parse("any", noise_rate).rates
+
+
+def split_noises(text: str) -> list[str]:
+    """Split "A(..) + B(..)", as one entry of an option combines noises; each may end in "@rate"."""
+    return re.split(r"\s*\+\s*(?=[A-Za-z_])", text.strip())
 
 
 def _listed(name: str, values: Any, example: str) -> list[Any]:
@@ -865,11 +997,10 @@ def _listed(name: str, values: Any, example: str) -> list[Any]:
     return list(values)
 
 
-def _place(pair: tuple[Noise, float | str]) -> int:
+def _place(wrapper: type[NoiseWrapper]) -> int:
     """Return where make_noisy puts a noise: what changes the dynamics comes first."""
-    kind = pair[0].wrapper.kind
-    before = kind in _BEFORE_STATISTICS
-    return _BEFORE_STATISTICS.index(kind) if before else len(_BEFORE_STATISTICS)
+    before = wrapper.kind in _BEFORE_STATISTICS
+    return _BEFORE_STATISTICS.index(wrapper.kind) if before else len(_BEFORE_STATISTICS)
 
 
 def canonical_noises(
@@ -889,8 +1020,7 @@ def canonical_noises(
     Raises:
         ValueError: a bad noise or rate, or neither one rate nor one for each noise.
     """
-    pairs = _pair(noises, rates)
-    return [str(noise) for noise, _ in pairs], [rate for _, rate in pairs]
+    return Configuration.read(noises, rates).texts
 
 
 def make_noisy(
@@ -917,23 +1047,7 @@ def make_noisy(
             ends, by an "episode" in its info, the error comes then.
         TypeError: not a single environment (a vector environment, for example).
     """
-    if not isinstance(env, gym.Env):
-        raise TypeError(f"make_noisy takes a single gymnasium.Env, not a {type(env).__name__}")
-    pairs = _pair(noises, rates)
-    recorded = any(env.has_wrapper_attr(name) for name in _OF_RECORDERS)
-    if recorded and record_statistics:
-        raise ValueError(_RECORDED)
-    if recorded and any(noise.wrapper is RandomEarlyTermination for noise, _ in pairs):
-        raise ValueError(_RECORDED_BENEATH_EARLY_TERMINATION)
-    for noise, rate in pairs:
-        if noise.wrapper.kind in _BEFORE_STATISTICS:
-            env = noise(env, rate)
-    if record_statistics:
-        env = RecordEpisodeStatistics(env)
-    for noise, rate in pairs:
-        if noise.wrapper.kind not in _BEFORE_STATISTICS:
-            env = noise(env, rate)
-    return env
+    return Configuration.read(noises, rates).wrap(env, record_statistics=record_statistics)
 
 
 def make_flat(env: Env) -> Env:
@@ -1141,24 +1255,15 @@ def noise_slug(noises: Sequence[str], rates: Sequence[float | str]) -> str:
     >>> noise_slug(["RandomUniformScaleReward(.5, 1.5)"], [0.05])
     'p0.05_UniformScaleReward_0.5_1.5'
     """
-    return "_".join(_rates_and_names(noises, rates)) if noises else ""
+    return Configuration.read(noises, rates).slug
 
 
-def _rates_and_names(noises: Sequence[str], rates: Sequence[float | str]) -> list[str]:
-    """Return rates and noises as two parts of a file's name, or nothing if all rates are 0."""
-    pairs = _pair(noises, rates)
-    if not pairs:
-        return []
-    names = [_words(noise).removeprefix("Random") for noise, _ in pairs]
-    return ["p" + "+".join(_rate_word(rate) for _, rate in pairs), "+".join(names)]
+def _words(noise: str) -> str:
+    return "_".join(re.findall(r"[^(), ]+", noise))
 
 
-def _words(noise: Noise) -> str:
-    return "_".join(re.findall(r"[^(), ]+", str(noise)))
-
-
-def _rate_word(rate: float | str) -> str:
-    return str(rate).replace(":", "to")
+def _rate_word(rate: tuple[float, float]) -> str:
+    return str(_spelled(rate)).replace(":", "to")
 
 
 def run_name(
@@ -1176,7 +1281,8 @@ def run_name(
     >>> run_name("ALE/Pong-v5", "ppo", [], [], seed=1)
     'baseline_s1__ALE-Pong-v5__ppo'
     """
-    rate, *names = _rates_and_names(noises, rates) or ["baseline"]
+    configuration = Configuration.read(noises, rates)
+    rate, *names = configuration._rates_and_names() or ["baseline"]
     first = "_".join([rate, f"s{seed}", *names])
     end = f"__{_safe(env_id)}__{_safe(exp_name)}"
     if len(first + end) > 240:  # a file's name has at most 255 bytes
@@ -1193,7 +1299,8 @@ def run_folder(
     seed: int,
 ) -> Path:
     """Return a run's folder: :func:`run_name` in runs_dir, or the folder that version 0.1 made."""
-    pairs = _pair(noises, rates)
+    configuration = Configuration.read(noises, rates)
+    pairs = zip(configuration.noises, configuration.rates, strict=True)
     slug = "+".join(f"{_words(noise)}_p{_rate_word(rate)}" for noise, rate in pairs) or "baseline"
     old_name = f"{_safe(env_id)}__{_safe(exp_name)}__{slug}__{seed}"
     if len(old_name) <= 240 and Path(runs_dir, old_name).is_dir():

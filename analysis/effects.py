@@ -7,8 +7,8 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from analysis.configurations import rate_order
 from analysis.verdicts import seeds_of
+from noisy_wrappers import rate_order
 
 WIDTH = 10  # inches of most figures
 WIDTHS = (5.2, 8, WIDTH, 12, 12)  # with one to five panels in a row

@@ -8,7 +8,6 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from analysis.configurations import BASELINE, rate_order
 from analysis.effects import (
     COLORS,
     DIVERGING,
@@ -25,6 +24,7 @@ from analysis.effects import (
 from analysis.formatting import slug
 from analysis.runs import STUDY, rows_of, study_name
 from analysis.verdicts import seeds_of
+from noisy_wrappers import BASELINE, rate_order
 
 STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
 STYLE["svg.hashsalt"] = "noisy"  # equal figures are equal files

@@ -14,8 +14,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from analysis.configurations import Configuration
-from noisy_wrappers import MAY_DIFFER_IN_A_TABLE, canonical_noises
+from noisy_wrappers import MAY_DIFFER_IN_A_TABLE, Configuration
 
 ALGORITHMS = ("SAC", "TD3", "PPO")
 SEARCH, CONFIRMATION = PHASES = ("search", "confirmation")  # the folders of a choice
@@ -119,7 +118,6 @@ def read_config(folder):
         number("max_episode_steps", 1)
     noises, rates = args.get("noise"), args.get("noise_rate")
     try:
-        canonical_noises(noises, rates)
         configuration = Configuration.read(noises, rates)
     except (ValueError, TypeError, KeyError) as error:
         reason = str(error).partition("\n")[0]

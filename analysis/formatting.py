@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import pandas as pd
 from tabulate import tabulate
 
-from analysis.configurations import rate_order
 from analysis.runs import script_name
+from noisy_wrappers import rate_order
 
 # Formats of numbers. z: no "-0"
 TENTH, WHOLE, PLAIN, SHARE, P_VALUE = "z,.1f", "z,.0f", "g", ".2f", ".2g"

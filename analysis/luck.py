@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.configurations import BASELINE
 from analysis.runs import STUDY, rows_of
+from noisy_wrappers import BASELINE
 
 DRAWS = 10_000
 SEEDS_TO_RESAMPLE = 20  # with fewer seeds of the baseline, returns are taken as normal

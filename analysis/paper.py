@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from analysis.configurations import BASELINE, rate_text
 from analysis.luck import add_luck_of_best, add_luck_of_consistent, luck_of_paper, luck_rows
 from analysis.runs import KEYS, rows_of, script_name, split_version
+from noisy_wrappers import BASELINE, Configuration
 
 PAPER_SEEDS = {"SAC": 5, "TD3": 5, "PPO": 10}
 PAPER_ENVIRONMENTS = 5
@@ -43,8 +43,8 @@ def read_paper(folder):
         if "noise_as_run" not in table:
             raise ValueError(f"{folder} has no tables of the paper (results/paper has them)")
         table["noise"] = table["noise_as_run"]
-        rates = table["noise_rate"].astype(float)
-        table["noise_rate"] = [rate_text((rate, rate)) for rate in rates]
+        pairs = zip(table["noise"], table["noise_rate"], strict=True)
+        table["noise_rate"] = [Configuration.parse(*pair).noise_rate for pair in pairs]
         names = [script_name(algorithm) for algorithm in table["algorithm"]]
         tables[name] = table.assign(exp_name=names, phase="")
     return tables

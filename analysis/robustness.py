@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from analysis.configurations import BASELINE, Configuration
 from analysis.formatting import P_VALUE, SHARE, WHOLE, Table
 from analysis.runs import KEYS, ROBUSTNESS_COLUMNS, STUDY, study_name
 from analysis.statistics import (
@@ -31,7 +30,7 @@ from analysis.statistics import (
     probability_of_improvement,
 )
 from analysis.verdicts import counted, p_value
-from noisy_wrappers import WRAPPERS
+from noisy_wrappers import BASELINE, WRAPPERS, Configuration
 
 FILES = ("robustness.csv", "robustness.csv.gz")
 CONDITION = ["test_noise", "test_rate"]

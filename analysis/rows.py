@@ -4,7 +4,6 @@ from itertools import product
 
 import numpy as np
 
-from analysis.configurations import BASELINE
 from analysis.runs import KEYS, STUDY, rows_of
 from analysis.statistics import (
     MIN_SEEDS,
@@ -19,6 +18,7 @@ from analysis.statistics import (
     seeds_for,
     steps_to_reach,
 )
+from noisy_wrappers import BASELINE
 
 
 def row_keys(study, environment, config):

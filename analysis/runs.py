@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from analysis.configurations import BASELINE, Configuration
 from analysis.folders import (
     PHASES,
     SEARCH,
@@ -30,6 +29,7 @@ from analysis.folders import (
     read_result,
     runs_of,
 )
+from noisy_wrappers import BASELINE, Configuration
 
 STUDY = ["algorithm", "exp_name", "phase"]  # the columns that name a study: see study_name
 KEYS = [*STUDY, "environment", "noise", "noise_rate"]

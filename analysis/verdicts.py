@@ -11,9 +11,9 @@ from math import nan
 import numpy as np
 import pandas as pd
 
-from analysis.configurations import BASELINE
 from analysis.runs import STUDY, rows_of, study_name
 from analysis.statistics import LEVEL, improvement_percent
+from noisy_wrappers import BASELINE
 
 UNCLEAR = "no clear difference"
 CLEAR = ["better", "worse"]

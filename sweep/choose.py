@@ -15,6 +15,7 @@ from analysis.errors import fail
 from analysis.folders import CONFIRMATION, SEARCH, flat_choice, read_config, read_json
 from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED, read_run
 from analysis.statistics import detectable_shift, holm
+from noisy_wrappers import BASELINE, Configuration
 from sweep import halving
 from sweep.grid import PlannedRun, cell, cells, make_run, result
 
@@ -32,10 +33,9 @@ class Choice(NamedTuple):
     env_id: str
     schedule: list[tuple[int, int]]  # of its search
     confirm: int  # fresh seeds of the confirmation
-    cells: dict[tuple[str, str], tuple]  # (noise, rate) as text: (noises, rates), in order
     state: halving.State
-    runs: dict[tuple[str, str, int], PlannedRun]  # those that have been due so far
-    returns: dict[tuple[str, str, int], float]  # of those that are finished
+    runs: dict[tuple[Configuration, int], PlannedRun]  # those that have been due so far
+    returns: dict[tuple[Configuration, int], float]  # of those that are finished
     core_hours: float  # about what is left
 
 
@@ -61,21 +61,19 @@ def follow(args, algorithm, env_id):
     last_seed = sum(seeds for _, seeds in schedule)
     if last_seed >= FIRST_CONFIRMATION_SEED:
         fail(f"--budget {budget} is too large: the best noises would run with {last_seed} seeds")
-    all_cells = {halving.BASELINE: ([], [])} | noises
     runs, returns = {}, {}
     while True:
-        state = halving.advance(list(noises), budget, args.confirm, returns)
+        state = halving.advance(noises, budget, args.confirm, returns)
         phase = SEARCH if len(state.rounds) < len(schedule) else CONFIRMATION
         finished = {}
-        for key in state.due:
-            noise, rate, seed = key
-            run = make_run(args, algorithm, env_id, *all_cells[noise, rate], seed, phase)
+        for noise, seed in state.due:
+            run = make_run(args, algorithm, env_id, noise, seed, phase)
             check_place(run)
             if result(run)[0]:
                 run, value = with_return(run, phase)
                 if not run.damage:
-                    finished[key] = value
-            runs[key] = run
+                    finished[noise, seed] = value
+            runs[noise, seed] = run
         if not finished:
             break
         returns |= finished
@@ -91,7 +89,6 @@ def follow(args, algorithm, env_id):
         env_id=env_id,
         schedule=schedule,
         confirm=args.confirm,
-        cells=all_cells,
         state=state,
         runs=runs,
         returns=returns,
@@ -103,32 +100,24 @@ def runs_of(found):
     """Return the runs of all choices together, the first seed of everything first."""
     runs = []
     for choice in found:
-        runs += [(seed, run) for (_, _, seed), run in choice.runs.items()]
+        runs += [(seed, run) for (_, seed), run in choice.runs.items()]
     return [run for _, run in sorted(runs, key=lambda pair: pair[0])]
 
 
 def candidates(args, algorithm, env_id):
-    """Return the noises to choose from, each once: {(noise, rate) as text: (noises, rates)}."""
-    noises = {}
-    for found in cells(args, algorithm, env_id):
-        if found != ([], []):  # at rate 0 a noise is none
-            noises[as_text(found)] = found
+    """Return the noises to choose from, each once."""
+    noises = dict.fromkeys(cells(args, algorithm, env_id))
+    noises.pop(BASELINE, None)  # at rate 0 a noise is none
     for pairs in args.exclude:
         if any(rate is None for _, rate in pairs):
             fail('--exclude needs a rate with each noise, as in "NOISE@0.1"')
-        excluded = as_text(cell(pairs))
+        excluded = cell(pairs)
         if excluded not in noises:
-            fail(f"--exclude: {' at '.join(excluded)} is not among the noises")
+            fail(f"--exclude: {excluded} is not among the noises")
         del noises[excluded]
     if not noises:
         fail("there is no noise to choose from")
-    return noises
-
-
-def as_text(found):
-    """Spell a cell's noises and rates, as in config.json and tables: "A + B", "0.1 + 0.2"."""
-    noises, rates = found
-    return " + ".join(noises), " + ".join(map(str, rates))
+    return list(noises)
 
 
 def check_place(run):
@@ -222,7 +211,7 @@ def describe(choice):
     if number <= rounds:
         noises = f"{len(state.noises)} of {choice.schedule[0][0]} noises"
         return f"{choice.name}, round {number} of {rounds}: {noises}, {due}"
-    winner = halving.spelled(*state.noises)
+    [winner] = state.noises
     return f"{choice.name}, confirmation: {winner} against no noise, {due}"
 
 
@@ -240,7 +229,7 @@ def standing(found):
             yield f"  mean return after round {len(choice.state.rounds)}:"
             scores = choice.state.rounds[-1].scores
             for noise in sorted(choice.state.noises, key=scores.get, reverse=True):
-                yield f"  {scores[noise]:10.2f}  {halving.spelled(noise)}"
+                yield f"  {scores[noise]:10.2f}  {noise}"
     yield total(found)
 
 
@@ -296,11 +285,11 @@ def verdicts(found, judgements):
 def obstacle(choice):
     """Say that a choice cannot continue, and what to do."""
     text = f"{describe(choice)}. These did not finish; run the same command again to retry them."
-    for noise, rate, _ in choice.state.due:
-        pairs = zip(*choice.cells[noise, rate], strict=True)
-        excluded = "+".join(f"{one}@{own}" for one, own in pairs)
+    for configuration, _ in choice.state.due:
+        pairs = zip(*configuration.texts, strict=True)
+        excluded = "+".join(f"{noise}@{rate}" for noise, rate in pairs)
         advice = f'\n  If it fails every time, leave it out: --exclude "{excluded}"'
-        if noise and advice not in text:
+        if excluded and advice not in text:
             text += advice
     return text
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from analysis.errors import fail
 from analysis.folders import PHASES, DamageError, read_config, read_result, runs_of
-from noisy_wrappers import MAY_DIFFER_IN_A_RUN, canonical_noises, run_folder
+from noisy_wrappers import BASELINE, MAY_DIFFER_IN_A_RUN, Configuration, run_folder
 
 PROJECT = Path(__file__).resolve().parent.parent
 SEEDS = {"sac": range(1, 6), "td3": range(1, 6), "ppo": range(1, 11)}  # the paper's
@@ -186,17 +186,8 @@ def best_pairs():
     return pairs
 
 
-@functools.cache
-def canonical(noises, rates):
-    """Return noises and rates in canonical notation, with a rate for each noise."""
-    try:
-        return canonical_noises(noises, rates)
-    except ValueError as error:
-        fail(error)
-
-
 def cells(args, algorithm, env_id):
-    """Return the noises and the rates of every noisy cell of the grid, in the order given."""
+    """Return the configuration of every noisy cell of the grid, in the order given."""
     of_the_paper = args.noises == [[("paper", None)]]  # --noises paper, as options.entry reads it
     given = [] if of_the_paper else args.noises
     pairs = preset_pairs("paper" if of_the_paper else args.preset, algorithm, env_id)
@@ -220,16 +211,21 @@ def cells(args, algorithm, env_id):
 
 
 def cell(pairs, common=None):
-    """Return canonical noises and rates; `common` is the rate of those without one of their own."""
-    noises = tuple(noise for noise, _ in pairs)
-    rates = tuple(common if rate is None else rate for _, rate in pairs)
-    return canonical(noises, rates)
+    """Return a configuration; `common` is the rate of the noises without one of their own."""
+    try:
+        return Configuration.read(
+            [noise for noise, _ in pairs],
+            [common if rate is None else rate for _, rate in pairs],
+        )
+    except ValueError as error:
+        fail(error)
 
 
-def make_run(args, algorithm, env_id, noises, rates, seed, phase=""):
+def make_run(args, algorithm, env_id, configuration, seed, phase=""):
     """Return one run of the grid, or of a phase of a choice: that is a folder of its own."""
     runs_dir = f"{args.runs_dir}/{phase}" if phase else args.runs_dir
     script = script_of(algorithm)
+    noises, rates = configuration.texts
     arguments = ["--env-id", env_id, "--seed", str(seed)]
     if noises:
         arguments += ["--noise", *noises, "--noise-rate", *map(str, rates)]
@@ -251,8 +247,8 @@ def grid(args):
         for algorithm, env_id in itertools.product(seeds_of, args.envs):
             if seed not in seeds_of[algorithm]:
                 continue
-            for noises, rates in [([], []), *cells(args, algorithm, env_id)]:
-                run = make_run(args, algorithm, env_id, noises, rates, seed)
+            for configuration in [BASELINE, *cells(args, algorithm, env_id)]:
+                run = make_run(args, algorithm, env_id, configuration, seed)
                 runs.setdefault(run.folder, run)
     return list(runs.values())
 

@@ -1,6 +1,6 @@
 """Which noise helps here? A search that is cheap, then one comparison on fresh seeds.
 
-Pure functions of the returns of finished runs, {(noise, noise_rate, seed): return}. What comes next
+Pure functions of the returns of finished runs, {(configuration, seed): return}. What comes next
 is computed from them and from nothing else, so a choice can be interrupted anywhere. choose.py
 reads the returns from the run folders and names the runs that are due; benchmark.sh starts them.
 
@@ -27,34 +27,34 @@ from analysis.statistics import (
     probability_of_improvement,
 )
 from analysis.verdicts import UNCLEAR, disagrees, interval, p_value, percent
+from noisy_wrappers import BASELINE, Configuration
 
 LEVEL = 0.05  # of a verdict, two-sided, over all verdicts of one command
-BASELINE = ("", "0.0")
 SCORED = 0.15  # a run's score in the search is the mean of its tests in this last part of its steps
 
 
 class Round(NamedTuple):
     """A round of the search whose runs are all finished."""
 
-    noises: list[tuple[str, str]]
+    noises: list[Configuration]
     seeds: int  # each noise has run with the seeds from 1 to this one
-    scores: dict[tuple[str, str], float]
-    survivors: list[tuple[str, str]]
+    scores: dict[Configuration, float]
+    survivors: list[Configuration]
 
 
 class State(NamedTuple):
     """How far the choice for one algorithm and environment has come."""
 
     rounds: list[Round]  # those that are complete
-    noises: list[tuple[str, str]]  # still in the running, in the order given
+    noises: list[Configuration]  # still in the running, in the order given
     seeds: range  # of the runs that the present round or the confirmation needs
-    due: list[tuple[str, str, int]]  # (noise, noise_rate, seed) of those that are not finished
+    due: list[tuple[Configuration, int]]  # with their seeds, those that are not finished
 
 
 class Comparison(NamedTuple):
     """The winner against the baseline on fresh seeds."""
 
-    winner: tuple[str, str]
+    winner: Configuration
     seeds: int
     improvement: float  # of the interquartile mean, in percent of |baseline mean|
     low: float  # its 95 % interval
@@ -91,9 +91,9 @@ def number_of_runs(noises, budget, confirm):
 def advance(noises, budget, confirm, returns):
     """Return how far the choice has come, and which runs are due.
 
-    noises: [(noise, noise_rate)] in the order given, which decides between equal scores.
-    returns: {(noise, noise_rate, seed): return}, the score of a run for the seeds of the search,
-    the final test return for those of the confirmation; the baseline is ("", "0.0").
+    noises: configurations in the order given, which decides between equal scores.
+    returns: {(configuration, seed): return}, the score of a run for the seeds of the search, the
+    final test return for those of the confirmation.
     """
     rounds, last_seed = [], 0
     for _, further in schedule(len(noises), budget):
@@ -102,7 +102,7 @@ def advance(noises, budget, confirm, returns):
         due = missing(noises, seeds, returns)
         if due:
             return State(rounds, noises, seeds, due)
-        scores = {noise: fmean(returns[*noise, seed] for seed in seeds) for noise in noises}
+        scores = {noise: fmean(returns[noise, seed] for seed in seeds) for noise in noises}
         ranking = sorted(noises, key=scores.get, reverse=True)  # leaves equals in their order
         best = ranking[: math.ceil(len(noises) / 2)]
         survivors = [noise for noise in noises if noise in best]
@@ -124,7 +124,7 @@ def score(steps, returns):
 
 def missing(noises, seeds, returns):
     """Return the runs that have no return yet, the first seed of every noise first."""
-    wanted = [(*noise, seed) for seed in seeds for noise in noises]
+    wanted = [(noise, seed) for seed in seeds for noise in noises]
     return [run for run in wanted if run not in returns]
 
 
@@ -141,8 +141,8 @@ def fewest_seeds(verdicts):
 
 def compare(winner, seeds, returns):
     """Compare the winner with the baseline on the fresh seeds, all of which have a return."""
-    noisy = np.array([[returns[*winner, seed]] for seed in seeds])
-    baseline = np.array([[returns[*BASELINE, seed]] for seed in seeds])
+    noisy = np.array([[returns[winner, seed]] for seed in seeds])
+    baseline = np.array([[returns[BASELINE, seed]] for seed in seeds])
     improvement, low, high = bootstrap_iqm(noisy, baseline)
     probability, _, _ = probability_of_improvement(noisy, baseline)
     p, _ = mann_whitney(noisy, baseline)
@@ -155,19 +155,13 @@ def helps(comparison, p_corrected):
     return p_corrected <= LEVEL and comparison.probability > 0.5
 
 
-def spelled(noise):
-    """Spell a noise with its rate for a sentence."""
-    name, rate = noise
-    return f"{name} at {rate.replace(':', ' to ')}"
-
-
 def verdict(name, noises, comparison, p_corrected, verdicts):
     """Say in one plain sentence what came out.
 
     name: the algorithm and the environment. noises: how many were searched. verdicts: for how many
     verdicts p is corrected.
     """
-    named = spelled(comparison.winner)
+    named = comparison.winner
     seeds = f"{comparison.seeds} fresh seeds"
     evidence = f"p {p_value(comparison.p)}"
     if verdicts > 1:
@@ -202,7 +196,7 @@ def rows(algorithm, environment, state, returns, helped):
     lines = []
 
     def add(phase, number, noise, seeds, score, survives):
-        values = algorithm, environment, phase, number, *noise, seeds, score, survives
+        values = algorithm, environment, phase, number, *noise.columns, seeds, score, survives
         lines.append(dict(zip(CHOICE_COLUMNS, values, strict=True)))
 
     for number, done in enumerate(state.rounds, start=1):
@@ -210,7 +204,7 @@ def rows(algorithm, environment, state, returns, helped):
             survives = "yes" if noise in done.survivors else "no"
             add("search", number, noise, done.seeds, done.scores[noise], survives)
     for noise in (BASELINE, *state.noises):
-        score = fmean(returns[*noise, seed] for seed in state.seeds)
+        score = fmean(returns[noise, seed] for seed in state.seeds)
         survives = ("yes" if helped else "no") if noise != BASELINE else ""
         add("confirmation", "", noise, len(state.seeds), score, survives)
     return lines

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 from analysis.errors import fail
-from noisy_wrappers import canonical_env_id
+from noisy_wrappers import canonical_env_id, split_noises
 from sweep.grid import ENVS, GIVEN_BY_THE_GRID, PRESETS, PROJECT, SEEDS, defaults, script_of
 
 GRID_OPTIONS = ["--algos", "--envs", "--noises", "--noise-rates", "--seeds", "--total-timesteps"]
@@ -106,7 +106,7 @@ def seeds(text):
 def rate(text):
     """Read a noise rate: a number, or "start:end" for one that changes during training."""
     if ":" in text:
-        return text  # canonical_noises reads it
+        return text  # Configuration.read reads it
     try:
         return float(text)
     except ValueError:
@@ -120,7 +120,7 @@ def entry(text):
     Returns a list of (noise, rate); the rate is None where --noise-rates will give it.
     """
     pairs = []
-    for part in re.split(r"\s*\+\s*(?=[A-Za-z_])", text.strip()):
+    for part in split_noises(text):
         noise, at, own = part.partition("@")
         pairs.append((noise, rate(own) if at else None))
     if len({own is None for _, own in pairs}) > 1:

@@ -14,6 +14,7 @@ from helpful import ENDING
 
 from analysis.runs import FIRST_CONFIRMATION_SEED
 from analysis.statistics import DETECTABLE, contrast, detectable_percent, holm
+from noisy_wrappers import BASELINE, Configuration
 from sweep import halving
 
 SMALL = "RandomNormalNoisyObservation(0.001)"
@@ -86,15 +87,12 @@ def choice():
     [winner] = search[(search["round"] == last) & (search["survives"] == "yes")].itertuples()
     runs = read_returns(DATA / "choice")
     fresh = runs[runs["seed"] >= FIRST_CONFIRMATION_SEED]
-    named = winner.noise, winner.noise_rate
-    returns = {
-        (*(named if run.noise else halving.BASELINE), run.seed): run.test
-        for run in fresh.itertuples()
-    }
+    named = Configuration.parse(winner.noise, winner.noise_rate)
+    returns = {(named if run.noise else BASELINE, run.seed): run.test for run in fresh.itertuples()}
     noises, seeds = search["noise"].nunique(), sorted(fresh["seed"].unique())
     comparison = halving.compare(named, seeds, returns)
     verdict = halving.verdict("PPO on Pusher-v5", noises, comparison, comparison.p, 1)
-    x, y = ([returns[*config, seed] for seed in seeds] for config in (named, halving.BASELINE))
+    x, y = ([returns[config, seed] for seed in seeds] for config in (named, BASELINE))
     row, _ = compare_rows("the winner, none", x, y)
     return {
         "rounds": rounds(search),

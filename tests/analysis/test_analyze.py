@@ -25,7 +25,7 @@ import analysis.runs
 import analysis.statistics
 import analysis.tables
 import analyze
-from analysis.configurations import BASELINE, Configuration
+from noisy_wrappers import BASELINE, Configuration
 
 RESULTS = Path(analyze.__file__).parent / "results"
 NAN = float("nan")
@@ -362,9 +362,9 @@ def test_an_unfinished_run_renames_no_other(tmp_path):
 
 def test_several_noises_are_one_configuration(tmp_path):
     write_run(tmp_path / "runs", [10])
-    write_run(tmp_path / "runs", [20], noise=(SCALE, ENDING), rate=(0.05, 0.125))
+    write_run(tmp_path / "runs", [20], noise=(ENDING, SCALE), rate=(0.05, 0.125))
     best = run(tmp_path)["best"].iloc[0]
-    assert best["noise"] == f"{SCALE} + {ENDING}" and best["noise_rate"] == "0.05 + 0.125"
+    assert best["noise"] == f"{ENDING} + {SCALE}" and best["noise_rate"] == "0.05 + 0.125"
 
 
 def test_seeds_are_replicates_and_episodes_are_not(tmp_path):

@@ -156,22 +156,22 @@ def test_rates_that_change_are_read_sorted_and_shown(tmp_path):
         for seed in (1, 2, 3):
             write_run(tmp_path / "runs", [10 + seed], seed=seed, noise=SCALE, rate=rate)
             write_run(tmp_path / "runs", [12 + seed], seed=seed, noise=PUSH, rate=rate)
-    both = {"noise": (SCALE, PUSH), "rate": ("1.0:0.0", 0.5)}
+    both = {"noise": (PUSH, SCALE), "rate": (0.5, "1.0:0.0")}
     for seed in (1, 2, 3):
         write_run(tmp_path / "runs", [10], seed=seed)
         write_run(tmp_path / "runs", [20], seed=seed, **both)
     tables = run(tmp_path)
     rates = tables["summary_SAC"].query("noise == @PUSH")["noise_rate"].tolist()
     assert rates == ["0.00 to 1.00", "0.05", "1.00 to 0.00", "1.00"]
-    combined = row(tables["summary_SAC"], noise=f"{SCALE} + {PUSH}")
-    assert combined["noise_rate"] == "1.00 to 0.00 + 0.50"
+    combined = row(tables["summary_SAC"], noise=f"{PUSH} + {SCALE}")
+    assert combined["noise_rate"] == "0.50 + 1.00 to 0.00"
     studies, _ = analysis.runs.make_studies(analysis.runs.read_runs(tmp_path / "runs"))
     figures = analysis.figures.figures(studies, analysis.tables.make_tables(studies))
     drawn = {name: figure for name, figure, _ in figures}
     lines = [text.get_text() for text in drawn["effects_SAC"].axes[0].get_yticklabels()]
     lines = [line.replace("\n(", "(") for line in lines]  # broken where there is little room
     changing = [f"{PUSH}, {rate}" for rate in ("0.00 to 1.00", "0.05", "1.00 to 0.00", "1.00")]
-    assert lines[:4] == changing and f"{SCALE} +\n{PUSH}, 1.00 to 0.00 +\n0.50" in lines
+    assert lines[:4] == changing and f"{PUSH} +\n{SCALE}, 0.50 +\n1.00 to 0.00" in lines
     legend = drawn[f"curves_SAC_{analysis.formatting.slug(PUSH)}"].legends[0].get_texts()
     named = [text.get_text().partition(" (")[0] for text in legend]
     assert named == ["no noise", *(f"rate {rate}" for rate in rates)]
@@ -182,16 +182,16 @@ def test_interactions_by_hand(tmp_path):
         ((), ()): [100, 104, 108],  # mean 104, variance 16
         ((SCALE,), (0.5,)): [110, 120, 130],  # mean 120, variance 100
         ((PUSH,), (1.0,)): [90, 92, 94, 96],  # mean 93, variance 20 / 3
-        ((SCALE, PUSH), (0.5, 1.0)): [140, 150, 160],  # mean 150, variance 100
-        ((SCALE, PUSH), (0.2, 1.0)): [1, 2, 3],  # there is no 0.2 alone
-        ((SCALE, ENDING), (0.5, 1.0)): [1, 2, 3],
+        ((PUSH, SCALE), (1.0, 0.5)): [140, 150, 160],  # mean 150, variance 100
+        ((PUSH, SCALE), (1.0, 0.2)): [1, 2, 3],  # there is no 0.2 alone
+        ((ENDING, SCALE), (1.0, 0.5)): [1, 2, 3],
         ((ENDING,), (1.0,)): [1, 2],  # too few seeds
     }
     for (noise, rate), finals in cells.items():
         for seed, final in enumerate(finals):
             write_run(tmp_path / "runs", [final], noise=noise, rate=rate, seed=seed)
     [found] = run(tmp_path)["interactions"].to_dict("records")
-    assert found["noise"] == f"{SCALE} + {PUSH}" and found["noise_rate"] == "0.50 + 1.00"
+    assert found["noise"] == f"{PUSH} + {SCALE}" and found["noise_rate"] == "1.00 + 0.50"
     assert found["n"] == 3 and found["environment"] == "Hopper-v5"
     assert found["interaction"] == 150 - 120 - 93 + 104  # 41
     parts = np.array([16 / 3, 100 / 3, 20 / 3 / 4, 100 / 3])

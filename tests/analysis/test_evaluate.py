@@ -22,8 +22,8 @@ import evaluate
 import ppo_continuous_noisy as ppo
 import sac_continuous_noisy as sac
 import td3_continuous_noisy as td3
-from analysis.configurations import Configuration
 from evaluate import Args, main
+from noisy_wrappers import Configuration
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = {"SAC": sac, "TD3": td3, "PPO": ppo}

@@ -14,7 +14,7 @@ import analysis.paper
 import analysis.runs
 import analysis.tables
 import analyze
-from analysis.configurations import BASELINE, Configuration
+from noisy_wrappers import BASELINE, Configuration
 
 NAN = float("nan")
 PAPER = Path(analyze.__file__).parent / "results/paper"

@@ -11,7 +11,7 @@ import analysis.runs
 import analysis.statistics
 import analysis.tables
 import analysis.verdicts
-from analysis.configurations import BASELINE, Configuration
+from noisy_wrappers import BASELINE, Configuration
 
 NOISE = "RandomEarlyTermination(50)"
 

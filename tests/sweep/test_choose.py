@@ -15,9 +15,9 @@ import stub_run
 
 from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED
 from analysis.statistics import holm
+from noisy_wrappers import BASELINE, Configuration
 from sweep import choose
 from sweep.halving import (
-    BASELINE,
     Comparison,
     advance,
     compare,
@@ -36,7 +36,7 @@ A = "RandomNormalNoisyReward(1.0)"
 
 
 def named(count):
-    return [("noise", str(i)) for i in range(count)]
+    return [Configuration.parse("noise", i) for i in range(count)]
 
 
 def play(noises, budget, table, confirm=CONFIRM):
@@ -45,11 +45,11 @@ def play(noises, budget, table, confirm=CONFIRM):
     returns = {}
     state = advance(noises, budget, confirm, returns)
     while state.due:
-        for noise, rate, seed in state.due:
+        for noise, seed in state.due:
             column = seed - 1
             if seed >= FIRST_CONFIRMATION_SEED:
                 column = SEARCH_SEEDS + seed - FIRST_CONFIRMATION_SEED
-            returns[noise, rate, seed] = table[place[noise, rate], column]
+            returns[noise, seed] = table[place[noise], column]
         state = advance(noises, budget, confirm, returns)
     return state, returns
 
@@ -78,28 +78,28 @@ def test_schedule():
 
 
 def test_advance_by_hand():
-    a, b, c = noises = [("a", "1.0"), ("b", "1.0"), ("c", "0.5")]
+    a, b, c = noises = [Configuration.parse(name, 1.0) for name in "abc"]
     returns = {}
 
     def due():
         return advance(noises, 7, 4, returns).due
 
     # Rounds: 3 noises, 1 seed; 2 noises, 2 more
-    assert due() == [(*noise, 1) for noise in noises]
-    returns |= {(*a, 1): 0.0, (*b, 1): 5.0}
-    assert due() == [(*c, 1)]
-    returns[*c, 1] = 4.0
-    assert due() == [(*b, 2), (*c, 2), (*b, 3), (*c, 3)]
-    returns |= {(*b, 2): 1.0, (*b, 3): 3.0, (*c, 2): 2.0, (*c, 3): 2.0}
+    assert due() == [(noise, 1) for noise in noises]
+    returns |= {(a, 1): 0.0, (b, 1): 5.0}
+    assert due() == [(c, 1)]
+    returns[c, 1] = 4.0
+    assert due() == [(b, 2), (c, 2), (b, 3), (c, 3)]
+    returns |= {(b, 2): 1.0, (b, 3): 3.0, (c, 2): 2.0, (c, 3): 2.0}
     # Of seeds 2 and 3 alone, both means are 2; of all seeds, b has 3 and c has 2.67.
     state = advance(noises, 7, 4, returns)
     assert state.noises == [b]
     assert [done.survivors for done in state.rounds] == [[b, c], [b]]
     assert state.rounds[1].scores == {b: 3.0, c: pytest.approx(8 / 3)}
     assert state.seeds == range(1001, 1005)
-    assert state.due == [(*noise, seed) for seed in range(1001, 1005) for noise in (b, BASELINE)]
-    del returns[*a, 1]  # a run folder is gone: its run comes first
-    assert due() == [(*a, 1)]
+    assert state.due == [(noise, seed) for seed in range(1001, 1005) for noise in (b, BASELINE)]
+    del returns[a, 1]  # a run folder is gone: its run comes first
+    assert due() == [(a, 1)]
 
 
 def test_equal_scores_are_decided_by_the_order_given():
@@ -171,9 +171,10 @@ def test_the_simulation_confirms_by_the_test():
     noisy, baseline = rng.normal(0.3, 0.3, (60, CONFIRM)), rng.normal(0, 0.3, (60, CONFIRM))
     verdicts = []
     for x, y in zip(noisy, baseline, strict=True):
-        returns = {("A", "1", seed): value for seed, value in enumerate(x)}
-        returns |= {(*BASELINE, seed): value for seed, value in enumerate(y)}
-        comparison = compare(("A", "1"), range(CONFIRM), returns)
+        noise = Configuration.parse("A", 1)
+        returns = {(noise, seed): value for seed, value in enumerate(x)}
+        returns |= {(BASELINE, seed): value for seed, value in enumerate(y)}
+        comparison = compare(noise, range(CONFIRM), returns)
         verdicts.append(helps(comparison, comparison.p))
     assert 0 < sum(verdicts) < 60
     assert list(simulate_choose.confirmed(noisy, baseline)) == verdicts
@@ -218,7 +219,7 @@ def test_fewest_seeds():
 
 
 def test_verdicts_in_words():
-    noise = ("RandomEarlyTermination(50)", "1.0")
+    noise = Configuration.parse("RandomEarlyTermination(50)", 1.0)
     good = Comparison(noise, 10, 15.2, 3.9, 26.6, 0.83, 0.011, 20.0)
     assert verdict("PPO on Pusher-v5", 90, good, 0.011, 1) == (
         "PPO on Pusher-v5: RandomEarlyTermination(50) at 1.0 beats no noise: 10 fresh seeds, "
@@ -236,7 +237,7 @@ def test_verdicts_in_words():
     odd = " Test and interval disagree: the test decides."
     assert verdict("", 90, good._replace(low=-1.0), 0.011, 1).endswith(f"0.83.{odd}")
     assert verdict("", 90, good._replace(p=0.07), 0.07, 1).endswith(f"{seen}).{odd}")
-    falling = good._replace(winner=("RandomNormalNoisyReward(1.0)", "1.0:0.0"))
+    falling = good._replace(winner=Configuration.parse(A, "1.0:0.0"))
     assert "RandomNormalNoisyReward(1.0) at 1.0 to 0.0 beats" in verdict("", 2, falling, 0.011, 1)
     assert verdict("PPO on X", 1, good._replace(p=0.3), 0.3, 1).startswith(
         "PPO on X: RandomEarlyTermination(50) at 1.0 could not be shown to help: 10 fresh seeds, "
@@ -246,14 +247,14 @@ def test_verdicts_in_words():
 
 
 def test_a_comparison_by_hand():
-    noise = ("A", "0.1")
-    returns = {(*noise, 1001 + i): value for i, value in enumerate([12.0, 13.0, 14.0, 15.0])}
-    returns |= {(*BASELINE, 1001 + i): value for i, value in enumerate([8.0, 9.0, 11.0, 12.0])}
+    noise = Configuration.parse("A", 0.1)
+    returns = {(noise, 1001 + i): value for i, value in enumerate([12.0, 13.0, 14.0, 15.0])}
+    returns |= {(BASELINE, 1001 + i): value for i, value in enumerate([8.0, 9.0, 11.0, 12.0])}
     found = compare(noise, range(1001, 1005), returns)
     # 15 of 16 pairs and a tie are won. U >= 15.5: of 70 orders, 1 has U = 16, 1 has U = 15.
     assert found.probability == 15.5 / 16 and found.p == pytest.approx(2 * 2 / 70)
     assert found.improvement == pytest.approx(35) and found.low < 35 < found.high
-    zero = compare(noise, range(1001, 1005), returns | {(*BASELINE, 1001 + i): 0 for i in range(4)})
+    zero = compare(noise, range(1001, 1005), returns | {(BASELINE, 1001 + i): 0 for i in range(4)})
     sentence = verdict("PPO on X", 2, zero, zero.p, 1)
     assert "nan" not in sentence and "4 fresh seeds, p = 0.029; a run" in sentence
 
@@ -265,13 +266,13 @@ def test_rows_of_choice_csv():
     assert [list(line) for line in lines] == [CHOICE_COLUMNS] * len(lines)
     search = "PPO X search"
     assert [" ".join(str(value) for value in line.values()) for line in lines] == [
-        f"{search} 1 noise 0 1 0.0 no",
-        f"{search} 1 noise 1 1 1.0 yes",
-        f"{search} 1 noise 2 1 2.0 yes",
-        f"{search} 2 noise 1 2 1.0 no",
-        f"{search} 2 noise 2 2 2.0 yes",
+        f"{search} 1 noise 0.0 1 0.0 no",
+        f"{search} 1 noise 1.0 1 1.0 yes",
+        f"{search} 1 noise 2.0 1 2.0 yes",
+        f"{search} 2 noise 1.0 2 1.0 no",
+        f"{search} 2 noise 2.0 2 2.0 yes",
         "PPO X confirmation   0.0 10 3.0 ",
-        "PPO X confirmation  noise 2 10 2.0 no",
+        "PPO X confirmation  noise 2.0 10 2.0 no",
     ]
 
 
@@ -341,9 +342,8 @@ def test_two_algorithms_and_environments_at_once(tmp_path):
     assert len(lines) == 4 * (3 + 2 + 2)
     assert {line["noise_rate"] for line in lines} == {"0.0", "1.0", "0.3 + 1.0:0.0"}
     for line in lines:  # a search counts a run's last two tests of ten, the confirmation the last
-        noise = line["noise"].split(" + ") if line["noise"] else []
-        rates = [r if ":" in r else float(r) for r in line["noise_rate"].split(" + ") if noise]
-        run = line["algorithm"].lower(), line["environment"], noise, rates
+        noise = Configuration.parse(line["noise"], line["noise_rate"])
+        run = line["algorithm"].lower(), line["environment"], *noise.texts
         if line["round"]:
             last = range(1, int(line["seeds"]) + 1)
             wanted = [fmean(stub_run.tests_of(*run, seed)[-2:]) for seed in last]
@@ -389,12 +389,14 @@ def test_the_default_noises_and_those_of_the_paper(tmp_path):
         [choice] = choose.choices(args)
         return choice.state.noises
 
-    assert len(tried()) == 16 and {rate for _, rate in tried()} == {"0.05", "1.0"}
-    assert len({noise for noise, _ in tried()}) == 8
-    assert not any("RandomNormalNoisyObservation(1.0)" in noise for noise, _ in tried())
-    assert tried("--noise-rates 0.2") == [(noise, "0.2") for noise, _ in tried()[::2]]
+    assert len(tried()) == 16 and {noise.noise_rate for noise in tried()} == {"0.05", "1.00"}
+    assert len({noise.noise for noise in tried()}) == 8
+    assert not any(noise.noise == "RandomNormalNoisyObservation(1.0)" for noise in tried())
+    assert [str(noise) for noise in tried("--noise-rates 0.2")] == [
+        f"{noise.noise} at 0.2" for noise in tried()[::2]
+    ]
     paper = tried("--noises paper")
-    assert len(paper) == 90 and len({noise for noise, _ in paper}) == 15
+    assert len(paper) == 90 and len({noise.noise for noise in paper}) == 15
     assert len(tried("--noises paper --noise-rates 0.2")) == 15
 
 
