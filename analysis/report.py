@@ -111,4 +111,4 @@ def write_report(out, verdicts, tables, drawn, overview, problems, notes):
         notes=[note for note in notes if note not in averaged],
         averaged=averaged,
     )
-    (out / "report.html").write_text(html)
+    (out / "report.html").write_text(html, "utf-8")

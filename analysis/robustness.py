@@ -27,7 +27,7 @@ from analysis.verdicts import (
     significant,
     spread_of,
 )
-from noisy_wrappers import BASELINE, Configuration, rounded
+from noisy_wrappers import BASELINE, WRAPPERS, Configuration, rounded
 
 FILES = ("robustness.csv", "robustness.csv.gz")
 CONDITION = ["test_noise", "test_rate"]
@@ -86,7 +86,10 @@ def read_episodes(path):
     if not np.isfinite(returns).all() or not len(returns):
         raise ValueError("no episodes, or a return that is not finite")
     groups = returns.groupby([table["noise"], table["noise_rate"]], sort=False)
-    return {Configuration.parse(*key): group.to_numpy(float) for key, group in groups}
+    found = {Configuration.parse(*key): group.to_numpy(float) for key, group in groups}
+    for name in set().union(*(condition.wrappers for condition in found)) - WRAPPERS.keys():
+        raise ValueError(f"unknown noise {name!r}")
+    return found
 
 
 def cvar(returns):
@@ -266,7 +269,7 @@ def robustness_sentences(scores):
     """Yield one plain sentence for each training configuration: is it more robust?"""
     for row in scores[primary(scores)].itertuples():
         where = row.environment or "all environments together"
-        study = study_name(row.algorithm, row.settings, row.phase)
+        study = study_name(row.algorithm, row.exp_name, row.phase)
         start = f"{study} on {where}, trained with {row.noise} at rate {row.noise_rate}"
         evidence, limit = difference(row), ""
         if pd.isna(row.p):

@@ -357,7 +357,7 @@ def test_two_algorithms_and_environments_at_once(tmp_path):
     # Three noises, one of them in two spellings: rounds of 3 and 2 runs, then 5 fresh seeds
     found = batches(args)
     assert [len(batch) for batch in found] == [4 * 3, 4 * 2, 4 * 10]
-    assert set().union(*found) == {path.name for path in tmp_path.glob("*__*")}
+    assert set().union(*found) == {path.name for path in tmp_path.glob("*/*__*")}
     assert all("_s1_" in name for name in found[0])
     assert all("_s2_" in name for name in found[1])
     sentences = conclude(args, tmp_path)
@@ -416,23 +416,6 @@ def test_the_default_noises_and_those_of_the_paper(tmp_path):
     paper = tried("--noises paper")
     assert len(paper) == 90 and len({noise.noise for noise in paper}) == 15
     assert len(tried("--noises paper --noise-rates 0.2")) == 15
-
-
-def test_a_choice_among_the_papers_noises_is_not_mixed_with_todays(tmp_path, capsys):
-    words = "--algos | ppo | --envs | Pendulum-v1 | --noise-rates | 1"
-    paper = arguments(f"{words} | --noises | paper", tmp_path)
-    [choice] = choose.choices(paper)
-    for run in choice.state.due:
-        stub_run.train([choice.runs[run].script, *choice.runs[run].arguments])
-    with pytest.raises(SystemExit) as error:
-        choose.choices(arguments(words, tmp_path))
-    assert error.value.code == 2
-    message = capsys.readouterr().err
-    assert message.count("\n") == 1 and "holds a choice among other noises" in message
-    assert "--noises paper" in message and "--runs-dir" in message
-    [choice] = choose.choices(paper)
-    assert len(choice.returns) == 15 and len(choice.state.rounds) == 1  # it goes on
-    choose.choices(arguments(words.replace("ppo", "sac"), tmp_path))  # another one
 
 
 def test_an_excluded_noise_is_no_other_choice(tmp_path):
