@@ -872,17 +872,14 @@ class RandomEarlyTermination(NoiseWrapper):
 
 
 # Fields of MuJoCo's model that are usually randomized.
-_USUAL_FIELDS = (
-    "body_mass body_inertia geom_friction jnt_stiffness dof_armature dof_damping dof_frictionloss "
-    "actuator_gear actuator_gainprm"
-).split()
+_USUAL_FIELDS = ("body_mass", "body_inertia", "geom_friction", "jnt_stiffness", "dof_armature")
+_USUAL_FIELDS += ("dof_damping", "dof_frictionloss", "actuator_gear", "actuator_gainprm")
 # What mj_setConst computes from others (engine_setconst.c), in the model and in model.stat.
-_DERIVED_FIELDS = (
-    "body_subtreemass body_invweight0 dof_invweight0 dof_M0 dof_length actuator_acc0 "
-    "actuator_length0 actuator_biasprm tendon_invweight0 tendon_length0 tendon_lengthspring "
-    "eq_data cam_pos0 cam_poscom0 cam_mat0 light_pos0 light_poscom0 light_dir0 flexedge_length0 "
-    "flexedge_invweight0 flex_vertmetric flex_vert0"
-).split()
+_DERIVED_FIELDS = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "dof_length")
+_DERIVED_FIELDS += ("actuator_acc0", "actuator_length0", "actuator_biasprm", "tendon_invweight0")
+_DERIVED_FIELDS += ("tendon_length0", "tendon_lengthspring", "eq_data", "cam_pos0", "cam_poscom0")
+_DERIVED_FIELDS += ("cam_mat0", "light_pos0", "light_poscom0", "light_dir0", "flexedge_length0")
+_DERIVED_FIELDS += ("flexedge_invweight0", "flex_vertmetric", "flex_vert0")
 _STATISTICS = ("meaninertia", "meanmass", "meansize", "extent", "center")
 
 
