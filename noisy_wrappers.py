@@ -114,6 +114,9 @@ Keys = tuple[str | int, ...]  # of a Dict observation; of a Tuple, indices
 EntryPath = tuple[Any, ...]  # the keys that lead to an entry of nested observations
 
 
+# --------------------------------------------------------------------------- the base of all noises
+
+
 class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Base of the noise wrappers, ours and your own: the rate, the random streams, the counters.
 
@@ -271,6 +274,9 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if isinstance(below, tuple):  # of noise wrappers; anything else is the environment's own
             return {**info, "noise": (*below, name)}
         return {**info, "noise": (name,)}
+
+
+# ---------------------------------------------------------------------------- noise on observations
 
 
 class ObservationNoise(NoiseWrapper):
@@ -577,6 +583,9 @@ class RandomDropoutObservation(ObservationNoise):
         return np.where(self.noise.random(observation.shape) < self.keep_prob, observation, 0.0)
 
 
+# --------------------------------------------------------------------------------- noise on rewards
+
+
 class RewardNoise(NoiseWrapper):
     """Base of the reward wrappers: subclasses define ``_perturb``.
 
@@ -664,98 +673,7 @@ class RandomUniformScaleReward(RewardNoise):
         return reward * self.noise.uniform(self.low, self.high)
 
 
-class RandomEarlyTermination(NoiseWrapper):
-    """Ends an episode early, at a step drawn from the integers low, ..., high (section 3.3).
-
-    At ``reset()`` the episode is chosen with probability p, and its last step is drawn,
-    k = ``noise.integers(low, high, endpoint=True)``; it is drawn for the others too, so that a
-    higher rate leaves the chosen episodes as they are. A chosen episode that is still going at
-    its k-th step ends there: ``terminated`` is set, or ``truncated`` if ``truncate=True``, and
-    ``info["noise"]`` says who did it. ``high`` is ``low`` by default. ``each_step=True``, without
-    low and high, is the paper's alternative: every step ends the episode with probability p.
-
-    ``times_applied`` counts the episodes that it ended, which are fewer than the chosen ones where
-    some end before their k-th step. noisyenv 0.1.1 does not have this wrapper.
-
-    >>> env = RandomEarlyTermination(gym.make("CartPole-v1"), 1.0, 2)
-    >>> _ = env.reset(seed=0)
-    >>> [env.step(0)[2:] for _ in range(2)]
-    [(False, False, {}), (True, False, {'noise': ('RandomEarlyTermination',)})]
-    """
-
-    kind = "dynamics"
-
-    def __init__(
-        self,
-        env: Env,
-        noise_rate: float | str,
-        low: int | None = None,
-        high: int | None = None,
-        *,
-        each_step: bool = False,
-        truncate: bool = False,
-    ):
-        """Raise ValueError unless 1 <= low <= high are integers, or absent with each_step.
-
-        Nor may ``env`` record its episodes: the record would miss those that this one ends.
-        """
-        if any(env.has_wrapper_attr(name) for name in _OF_RECORDERS):
-            raise ValueError(_RECORDED_BENEATH_EARLY_TERMINATION)
-        self.each_step = _flag("each_step", each_step)
-        self.truncate = _flag("truncate", truncate)
-        if not each_step:
-            low, high = _whole_interval(low, high, least=1)
-        elif low is not None or high is not None:
-            raise ValueError(f"each_step=True excludes low and high, got low={low}, high={high}")
-        self.low = low
-        self.high = high
-        super().__init__(
-            env,
-            noise_rate,
-            low=low,
-            high=None if high == low else high,  # (50, 50) and (50) are one configuration
-            each_step=each_step,
-            truncate=truncate,
-        )
-        self._steps = 0
-        self._last_step: int | None = None
-        self._warn_if_late()
-
-    def _warn_if_late(self) -> None:
-        """Say if no episode lasts long enough to be ended."""
-        limits = [
-            layer._max_episode_steps
-            for layer in _layers(self.env)
-            if isinstance(layer, gym.wrappers.TimeLimit)
-        ]
-        limit = min(limits, default=None)
-        if limit is None or self.low is None or self.low < limit:
-            return
-        effect = "never acts"
-        if self.low == limit and not self.truncate:
-            effect = "only turns truncated into terminated there"
-        text = f"RandomEarlyTermination({self.low}) {effect}: episodes have at most {limit} steps"
-        gym.logger.warn(text, stacklevel=3)
-
-    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        """Reset the environment and decide when the episode ends."""
-        result = super().reset(seed=seed, options=options)
-        self._steps = 0
-        if self.low is not None and self.high is not None:  # that is, without each_step
-            last_step = int(self.noise.integers(self.low, self.high, endpoint=True))
-            self._last_step = last_step if self.acts() else None
-        return result
-
-    def step(self, action: Any) -> Step:
-        """Step the environment and end the episode if its time has come."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        self._steps += 1
-        at_last_step = self._steps == self._last_step
-        ends = self.acts() if self.each_step else at_last_step
-        if ends and not (truncated if self.truncate else terminated):
-            info = self.mark(info)
-            truncated, terminated = truncated or self.truncate, terminated or not self.truncate
-        return observation, reward, terminated, truncated, info
+# -------------------------------------------------------------------- noise on actions and dynamics
 
 
 class RandomNormalNoisyAction(NoiseWrapper):
@@ -860,16 +778,109 @@ class RandomActionDelay(NoiseWrapper):
         return observation, reward, terminated, truncated, info
 
 
+class RandomEarlyTermination(NoiseWrapper):
+    """Ends an episode early, at a step drawn from the integers low, ..., high (section 3.3).
+
+    At ``reset()`` the episode is chosen with probability p, and its last step is drawn,
+    k = ``noise.integers(low, high, endpoint=True)``; it is drawn for the others too, so that a
+    higher rate leaves the chosen episodes as they are. A chosen episode that is still going at
+    its k-th step ends there: ``terminated`` is set, or ``truncated`` if ``truncate=True``, and
+    ``info["noise"]`` says who did it. ``high`` is ``low`` by default. ``each_step=True``, without
+    low and high, is the paper's alternative: every step ends the episode with probability p.
+
+    ``times_applied`` counts the episodes that it ended, which are fewer than the chosen ones where
+    some end before their k-th step. noisyenv 0.1.1 does not have this wrapper.
+
+    >>> env = RandomEarlyTermination(gym.make("CartPole-v1"), 1.0, 2)
+    >>> _ = env.reset(seed=0)
+    >>> [env.step(0)[2:] for _ in range(2)]
+    [(False, False, {}), (True, False, {'noise': ('RandomEarlyTermination',)})]
+    """
+
+    kind = "dynamics"
+
+    def __init__(
+        self,
+        env: Env,
+        noise_rate: float | str,
+        low: int | None = None,
+        high: int | None = None,
+        *,
+        each_step: bool = False,
+        truncate: bool = False,
+    ):
+        """Raise ValueError unless 1 <= low <= high are integers, or absent with each_step.
+
+        Nor may ``env`` record its episodes: the record would miss those that this one ends.
+        """
+        if any(env.has_wrapper_attr(name) for name in _OF_RECORDERS):
+            raise ValueError(_RECORDED_BENEATH_EARLY_TERMINATION)
+        self.each_step = _flag("each_step", each_step)
+        self.truncate = _flag("truncate", truncate)
+        if not each_step:
+            low, high = _whole_interval(low, high, least=1)
+        elif low is not None or high is not None:
+            raise ValueError(f"each_step=True excludes low and high, got low={low}, high={high}")
+        self.low = low
+        self.high = high
+        super().__init__(
+            env,
+            noise_rate,
+            low=low,
+            high=None if high == low else high,  # (50, 50) and (50) are one configuration
+            each_step=each_step,
+            truncate=truncate,
+        )
+        self._steps = 0
+        self._last_step: int | None = None
+        self._warn_if_late()
+
+    def _warn_if_late(self) -> None:
+        """Say if no episode lasts long enough to be ended."""
+        limits = [
+            layer._max_episode_steps
+            for layer in _layers(self.env)
+            if isinstance(layer, gym.wrappers.TimeLimit)
+        ]
+        limit = min(limits, default=None)
+        if limit is None or self.low is None or self.low < limit:
+            return
+        effect = "never acts"
+        if self.low == limit and not self.truncate:
+            effect = "only turns truncated into terminated there"
+        text = f"RandomEarlyTermination({self.low}) {effect}: episodes have at most {limit} steps"
+        gym.logger.warn(text, stacklevel=3)
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
+        """Reset the environment and decide when the episode ends."""
+        result = super().reset(seed=seed, options=options)
+        self._steps = 0
+        if self.low is not None and self.high is not None:  # that is, without each_step
+            last_step = int(self.noise.integers(self.low, self.high, endpoint=True))
+            self._last_step = last_step if self.acts() else None
+        return result
+
+    def step(self, action: Any) -> Step:
+        """Step the environment and end the episode if its time has come."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._steps += 1
+        at_last_step = self._steps == self._last_step
+        ends = self.acts() if self.each_step else at_last_step
+        if ends and not (truncated if self.truncate else terminated):
+            info = self.mark(info)
+            truncated, terminated = truncated or self.truncate, terminated or not self.truncate
+        return observation, reward, terminated, truncated, info
+
+
 # Fields of MuJoCo's model that are usually randomized.
 _USUAL_FIELDS = ("body_mass", "body_inertia", "geom_friction", "jnt_stiffness", "dof_armature")
 _USUAL_FIELDS += ("dof_damping", "dof_frictionloss", "actuator_gear", "actuator_gainprm")
-# What mj_setConst computes from others (engine_setconst.c).
+# What mj_setConst computes from others (engine_setconst.c), in the model and in model.stat.
 _DERIVED_FIELDS = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "dof_length")
-_DERIVED_FIELDS += ("actuator_acc0", "actuator_length0", "actuator_biasprm", "eq_data")
-_DERIVED_FIELDS += ("tendon_invweight0", "tendon_length0", "tendon_lengthspring")
-_DERIVED_FIELDS += ("cam_pos0", "cam_poscom0", "cam_mat0")
-_DERIVED_FIELDS += ("light_pos0", "light_poscom0", "light_dir0")
-_DERIVED_FIELDS += ("flexedge_length0", "flexedge_invweight0", "flex_vertmetric", "flex_vert0")
+_DERIVED_FIELDS += ("actuator_acc0", "actuator_length0", "actuator_biasprm", "tendon_invweight0")
+_DERIVED_FIELDS += ("tendon_length0", "tendon_lengthspring", "eq_data", "cam_pos0", "cam_poscom0")
+_DERIVED_FIELDS += ("cam_mat0", "light_pos0", "light_poscom0", "light_dir0", "flexedge_length0")
+_DERIVED_FIELDS += ("flexedge_invweight0", "flex_vertmetric", "flex_vert0")
 _STATISTICS = ("meaninertia", "meanmass", "meansize", "extent", "center")
 
 
@@ -989,6 +1000,9 @@ class RandomDynamics(NoiseWrapper):
             self._changed = None
 
 
+# -------------------------------------------------------------------- noises in words, and combined
+
+
 WRAPPERS: dict[str, type[NoiseWrapper]] = {
     wrapper.__name__: wrapper
     for wrapper in (
@@ -1006,131 +1020,6 @@ WRAPPERS: dict[str, type[NoiseWrapper]] = {
         RandomDynamics,
     )
 }
-# Noise of these kinds acts before an episode's statistics are recorded.
-_BEFORE_STATISTICS = ("dynamics", "action")
-# What gives away Gymnasium's RecordEpisodeStatistics and Stable-Baselines3's Monitor.
-_OF_RECORDERS = ("return_queue", "get_episode_rewards")
-_RECORDED = (
-    "this environment records its episodes already (in info['episode'], as RecordEpisodeStatistics "
-    "and Monitor do): take that off, or use make_noisy(..., record_statistics=False)"
-)
-_RECORDED_BENEATH_EARLY_TERMINATION = (
-    "this environment records its episodes already, and the record would miss those that "
-    "RandomEarlyTermination ends: apply that first, as in Monitor(make_noisy(env, "
-    "['RandomEarlyTermination(50)'], [0.5], record_statistics=False)), and the other noises after"
-)
-
-
-class RecordEpisodeStatistics(gym.wrappers.RecordEpisodeStatistics[Any, Any]):
-    """Gymnasium's wrapper, with a clear error if the environment records its episodes itself."""
-
-    def step(self, action: Any) -> Step:
-        """Step the environment; raise ValueError if its info has an "episode" already."""
-        steps = self.episode_lengths
-        try:
-            return super().step(action)
-        except AssertionError as error:
-            if self.episode_lengths == steps:  # it comes from the environment's own step
-                raise
-            raise ValueError(_RECORDED) from error
-
-
-class NotFiniteError(FloatingPointError):
-    """A value that training cannot continue with: NaN, infinite, or not a number at all."""
-
-
-class SpaceError(ValueError):
-    """Observations or actions that are not vectors of numbers, or not what the API asks for."""
-
-
-class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Stops at NaN and infinity, and makes what an environment returns what the API asks for.
-
-    A learner that receives NaN does not recover, and may never show it. So this raises
-    NotFiniteError, which says whether the action was already NaN, as after a divergence. Rewards
-    become floats and the two ends bools; they may be arrays of one element, but not strings.
-    Observations, also in dictionaries and tuples, are copied, because an environment may write the
-    next one into the same array, and actions, because it may write into those. An observation that
-    has not the shape of its space, and a step of four values, raise SpaceError. The spaces are
-    looked up once, because an environment may make new ones, with new generators, at every access.
-
-    >>> env = FiniteNumbers(gym.make("Pendulum-v1", disable_env_checker=True))
-    >>> _ = env.reset(seed=0)
-    >>> env.step(np.array([np.nan]))
-    Traceback (most recent call last):
-    noisy_wrappers.NotFiniteError: step 1 of an episode: the environment was given the action [nan]
-    """
-
-    def __init__(self, env: Env):
-        """Wrap an environment; what is checked of observations are the Boxes, also in parts."""
-        gym.Wrapper.__init__(self, env)
-        RecordConstructorArgs.__init__(self)
-        self.action_space, self.observation_space = env.action_space, env.observation_space
-        self._boxes = {
-            path: part
-            for path, part in _entries(self.observation_space)
-            if isinstance(part, gym.spaces.Box)
-        }
-        self._steps = 0
-
-    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        """Reset the environment and check the first observation."""
-        self._steps = 0
-        try:
-            observation, info = self.env.reset(seed=seed, options=options)
-        except (TypeError, ValueError) as error:
-            self._refuse_old_api("reset() must return (observation, info)", error)
-            raise
-        return self._checked(observation), info
-
-    def step(self, action: Any) -> Step:
-        """Step the environment and check the observation and the reward."""
-        self._steps += 1
-        try:
-            observation, reward, terminated, truncated, info = self.env.step(copy.copy(action))
-        except (TypeError, ValueError) as error:
-            values = "(observation, reward, terminated, truncated, info)"
-            self._refuse_old_api(f"step() must return {values}", error)
-            raise
-        if isinstance(reward, str):
-            self._stop("returned the reward", reward)
-        number = float(reward.item() if isinstance(reward, np.ndarray) else reward)
-        if not math.isfinite(number):
-            self._blame("returned the reward", number, action)
-        return self._checked(observation, action), number, bool(terminated), bool(truncated), info
-
-    def _checked(self, observation: Any, action: Any = None) -> Any:
-        """Return a copy of an observation."""
-        parts = {}
-        for path, box in self._boxes.items():
-            part = np.array(functools.reduce(operator.getitem, path, observation))
-            if not np.isfinite(part).all():
-                self._blame(f"returned the observation{_subscript(path)}", part, action)
-            if part.shape != box.shape:
-                raise SpaceError(
-                    f"step {self._steps} of an episode: the environment returned an "
-                    f"observation{_subscript(path)} of shape {part.shape}, and its "
-                    f"observation_space has shape {box.shape}"
-                )
-            parts[path] = part
-        return _replaced(observation, parts) if parts else observation
-
-    def _refuse_old_api(self, wanted: str, error: Exception) -> None:
-        """Raise SpaceError if a wrapper, and not the environment's own code, could not unpack."""
-        *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-        place = frame.f_globals.get("__name__", "")
-        if "unpack" in str(error) and place.startswith(("gymnasium.wrappers.", __name__)):
-            at = f"step {self._steps} of an episode"
-            raise SpaceError(f"{at}: the environment's {wanted}: {error}") from error
-
-    def _blame(self, what: str, value: Any, action: Any) -> None:
-        """Stop at a value that is not finite, or rather at an action that was not, either."""
-        if isinstance(action, np.ndarray) and not np.isfinite(action).all():
-            self._stop("was given the action", action.tolist())
-        self._stop(what, np.asarray(value).tolist())
-
-    def _stop(self, what: str, value: Any) -> None:
-        raise NotFiniteError(f"step {self._steps} of an episode: the environment {what} {value!r}")
 
 
 @dataclass(frozen=True)
@@ -1467,101 +1356,36 @@ def make_noisy(
     return Configuration.read(noises, rates).wrap(env, record_statistics=record_statistics)
 
 
-def make_flat(env: Env, step_limit: int | None = None) -> Env:
-    """Prepare an environment for networks, whose inputs and outputs are vectors.
-
-    :class:`FiniteNumbers` makes rewards floats and stops at NaN and infinity; non-vector
-    observations (dictionaries, tuples, arrays, categories) are then flattened by
-    ``gymnasium.wrappers.FlattenObservation``. An environment whose spec has no time limit is cut
-    after ``step_limit`` steps, if that is given. Apply noise to the result,
-    ``make_noisy(make_flat(env), ...)``: it goes in between, so it knows the parts.
-
-    >>> make_flat(gym.make("Pendulum-v1").unwrapped)
-    <FiniteNumbers<PendulumEnv<Pendulum-v1>>>
-    >>> make_flat(gym.make("CartPole-v1"))  # doctest: +ELLIPSIS
-    Traceback (most recent call last):
-    noisy_wrappers.SpaceError: needs Box actions of floats in one dimension; CartPole-v1 has ...
-
-    Raises:
-        SpaceError: actions are not a vector of floats, or observations cannot become a vector; the
-            environment has been closed.
-    """
-    name = env.spec.id if env.spec else str(env)
-    if step_limit and env.spec and env.spec.max_episode_steps is None:
-        env = gym.wrappers.TimeLimit(env, step_limit)
-    env = FiniteNumbers(env)
-    space = env.observation_space
-    is_vector = isinstance(space, gym.spaces.Box) and len(space.shape) == 1
-    if space.is_np_flattenable and not is_vector:
-        env = gym.wrappers.FlattenObservation(env)
-    observations, actions = env.observation_space, env.action_space
-    if not isinstance(observations, gym.spaces.Box) or observations.dtype.kind not in "fiu":
-        env.close()
-        raise SpaceError(f"needs Box observations of numbers; {name} has {observations}")
-    if (
-        not isinstance(actions, gym.spaces.Box)
-        or actions.dtype.kind != "f"
-        or len(actions.shape) != 1
-    ):
-        env.close()
-        raise SpaceError(f"needs Box actions of floats in one dimension; {name} has {actions}")
-    return env
+# Noise of these kinds acts before an episode's statistics are recorded.
+_BEFORE_STATISTICS = ("dynamics", "action")
+# What gives away Gymnasium's RecordEpisodeStatistics and Stable-Baselines3's Monitor.
+_OF_RECORDERS = ("return_queue", "get_episode_rewards")
+_RECORDED = (
+    "this environment records its episodes already (in info['episode'], as RecordEpisodeStatistics "
+    "and Monitor do): take that off, or use make_noisy(..., record_statistics=False)"
+)
+_RECORDED_BENEATH_EARLY_TERMINATION = (
+    "this environment records its episodes already, and the record would miss those that "
+    "RandomEarlyTermination ends: apply that first, as in Monitor(make_noisy(env, "
+    "['RandomEarlyTermination(50)'], [0.5], record_statistics=False)), and the other noises after"
+)
 
 
-def into_space(action: NDArray[Any], space: gym.spaces.Box) -> NDArray[Any]:
-    """Return an action in its space's dtype and, to the last bit, within its bounds.
+class RecordEpisodeStatistics(gym.wrappers.RecordEpisodeStatistics[Any, Any]):
+    """Gymnasium's wrapper, with a clear error if the environment records its episodes itself."""
 
-    >>> into_space(np.float64([0.1, 2]), gym.spaces.Box(-1, 1, (2,)))
-    array([0.1, 1. ], dtype=float32)
-    """
-    # in this order, because the cast may round a bound up
-    return action.astype(space.dtype).clip(space.low, space.high)
-
-
-def seed_globals(seed: int) -> None:
-    """Seed the generators that an environment shares with everybody: Python's, NumPy's, PyTorch's.
-
-    PyTorch's is seeded only where PyTorch is loaded.
-    """
-    random.seed(seed)
-    np.random.seed(seed % 2**32)
-    if torch := sys.modules.get("torch"):
-        torch.manual_seed(seed)
+    def step(self, action: Any) -> Step:
+        """Step the environment; raise ValueError if its info has an "episode" already."""
+        steps = self.episode_lengths
+        try:
+            return super().step(action)
+        except AssertionError as error:
+            if self.episode_lengths == steps:  # it comes from the environment's own step
+                raise
+            raise ValueError(_RECORDED) from error
 
 
-@contextlib.contextmanager
-def seeded_globals(seed: int) -> Iterator[None]:
-    """Seed them as :func:`seed_globals` does for some lines of code, and restore them after it.
-
-    >>> with seeded_globals(1):
-    ...     first = random.random()
-    >>> with seeded_globals(1):
-    ...     random.random() == first
-    True
-    """
-    torch: Any = sys.modules.get("torch")
-    python, numpy = random.getstate(), np.random.get_state()
-    pytorch = torch.get_rng_state() if torch else None
-    seed_globals(seed)
-    try:
-        yield
-    finally:
-        random.setstate(python)
-        np.random.set_state(numpy)
-        if torch:
-            torch.set_rng_state(pytorch)
-
-
-def reset_worker_signals() -> None:
-    """Undo a script's signal handlers in a worker process that an environment forked.
-
-    SIGTERM and SIGHUP end it again, as ``terminate()`` asks; SIGINT is ignored: Ctrl-C is the
-    script's. A script calls ``os.register_at_fork(after_in_child=reset_worker_signals)``.
-    """
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        if callable(signal.getsignal(number)):
-            signal.signal(number, signal.SIG_DFL)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+# ---------------------------------------------------------------------------------- during training
 
 
 def set_progress(env: Any, fraction: float) -> None:
@@ -1649,6 +1473,605 @@ def _call_each(env: Any, method: str, *args: Any, **kwargs: Any) -> Sequence[Any
     raise TypeError(f"needs an environment or a vector of environments, not {type(env).__name__}")
 
 
+# ----------------------------------------------------------------------- names of files and folders
+
+
+def noise_slug(noises: Sequence[str], rates: Sequence[float | str]) -> str:
+    """Return noises as a part of a file's name, "" for none; equal configurations have equal ones.
+
+    >>> noise_slug(["RandomUniformScaleReward(.5, 1.5)"], [0.05])
+    'p0.05_UniformScaleReward_0.5_1.5'
+    """
+    return Configuration.read(noises, rates).slug
+
+
+def run_name(
+    env_id: str, exp_name: str, noises: Sequence[str], rates: Sequence[float | str], seed: int
+) -> str:
+    """Return the name of a run's folder, the same for all spellings of one configuration.
+
+    What tells the runs of a sweep apart comes first: TensorBoard's list shows 31 characters. Where
+    the name would be too long for a file system, the noises are cut and end in a hash.
+
+    >>> run_name("Hopper-v5", "sac", ["RandomUniformScaleReward(.5, 1.5)"], [0.05], seed=1)
+    'p0.05_s1_UniformScaleReward_0.5_1.5__Hopper-v5__sac'
+    >>> run_name("Hopper-v5", "sac", ["RandomEarlyTermination(50)"], ["1:0"], seed=1)
+    'p1.0to0.0_s1_EarlyTermination_50__Hopper-v5__sac'
+    >>> run_name("ALE/Pong-v5", "ppo", [], [], seed=1)
+    'baseline_s1__ALE-Pong-v5__ppo'
+    """
+    configuration = Configuration.read(noises, rates)
+    rate, *names = configuration._rates_and_names() or ["baseline"]
+    first = "_".join([rate, f"s{seed}", *names])
+    end = f"__{_safe(env_id)}__{_safe(exp_name)}"
+    if len(first + end) > 240:  # a file's name has at most 255 bytes
+        first = f"{first[:100]}_{hashlib.sha256(first.encode()).hexdigest()[:16]}"
+    return first + end
+
+
+def run_folder(
+    runs_dir: str | Path,
+    env_id: str,
+    exp_name: str,
+    noises: Sequence[str],
+    rates: Sequence[float | str],
+    seed: int,
+) -> Path:
+    """Return a run's folder: :func:`run_name` in runs_dir, or the folder that version 0.1 made."""
+    configuration = Configuration.read(noises, rates)
+    pairs = zip(configuration.noises, configuration.rates, strict=True)
+    slug = "+".join(f"{_words(noise)}_p{_rate_word(rate)}" for noise, rate in pairs) or "baseline"
+    old_name = f"{_safe(env_id)}__{_safe(exp_name)}__{slug}__{seed}"
+    if len(old_name) <= 240 and Path(runs_dir, old_name).is_dir():
+        return Path(runs_dir, old_name)
+    return Path(runs_dir, run_name(env_id, exp_name, noises, rates, seed))
+
+
+def _words(noise: str) -> str:
+    """Return a noise as a part of a file's name; different noises have different ones."""
+    plain = noise.replace("=(", "=").replace("', '", "-").replace("'", "")  # keys=a-b
+    words = _safe("_".join(re.findall(r"[^(), ]+", plain)))
+    if re.sub(r"'[A-Za-z_][A-Za-z0-9_.]*'", "", noise).count("'"):  # a key that is no plain name
+        words += "_" + hashlib.sha256(noise.encode()).hexdigest()[:8]
+    return words
+
+
+def _rate_word(rate: tuple[float, float]) -> str:
+    return str(_spelled(rate)).replace(":", "to")
+
+
+def _safe(text: str) -> str:
+    """Replace what a folder's name cannot hold: "/" by one dash, anything else by two."""
+    return re.sub(r"[^A-Za-z0-9._=+-]", lambda match: "-" if match[0] == "/" else "--", text)
+
+
+# ------------------------------------------------------------------------------ numbers for people
+
+
+def rounded(value: float, spread: float | None = None) -> str:
+    """Return a number as text, with two significant digits of its spread.
+
+    ``spread`` is what the number may be off by, in its own units: a standard deviation, or half the
+    width of an interval. The whole part is never cut. Without a spread (none, NaN, zero, or within
+    the rounding errors of floating point) the text has four significant digits.
+
+    >>> rounded(9512.34, 210.0), rounded(0.8712, 0.0342), rounded(-40.0, 8.165)
+    ('9,512', '0.871', '-40.0')
+    >>> rounded(0.8712345), rounded(1234567.8), rounded(0.0, 0.0), rounded(3.2e-7, 1.1e-8)
+    ('0.8712', '1,234,568', '0', '3.20e-07')
+    """
+    if not abs(value) < 1e15:  # beyond the precision of floats, infinite, or NaN
+        return f"{value:.3e}"
+    known = spread is not None and math.isfinite(spread) and spread > 1e-9 * abs(value)
+    digits, scale = (2, spread) if known else (4, abs(value))
+    if not scale:
+        return "0"
+    # "e" rounds first: 0.0996 has the two significant digits of 0.10, not of 0.09
+    decimals = max(0, digits - 1 - int(f"{scale:.{digits - 1}e}".partition("e")[2]))
+    if decimals <= 6:
+        return f"{value:z,.{decimals}f}"
+    if abs(value) < 0.5 * 10.0**-decimals:
+        return "0"
+    exponent = int(f"{value:e}".partition("e")[2])
+    return f"{value:.{max(0, exponent + decimals)}e}"
+
+
+# ------------------------------------------------------------------------------ wrappers and spaces
+
+
+def _layers(env: Env) -> Iterator[gym.Wrapper[Any, Any, Any, Any]]:
+    """Yield an environment's wrappers, outermost first."""
+    while isinstance(env, gym.Wrapper):
+        yield env
+        env = env.env
+
+
+def _noise_layers(env: Env) -> Iterator[NoiseWrapper]:
+    """Yield an environment's noise wrappers, outermost first."""
+    for layer in _layers(env):
+        if isinstance(layer, NoiseWrapper):
+            yield layer
+
+
+def _entries(space: gym.Space[Any], path: EntryPath = ()) -> Iterator[tuple[EntryPath, Any]]:
+    """Yield the entries of nested Dict and Tuple spaces, in the order in which they are flattened.
+
+    Each is (the keys that lead to it, its space); a space of another kind is one entry.
+    """
+    parts: Any = None
+    if isinstance(space, gym.spaces.Dict):
+        parts = space.items()
+    elif isinstance(space, gym.spaces.Tuple):
+        parts = enumerate(space)
+    if parts is None:
+        yield path, space
+        return
+    for key, part in parts:
+        yield from _entries(part, (*path, key))
+
+
+def _subscript(path: EntryPath) -> str:
+    return "".join(f"[{key!r}]" for key in path)
+
+
+def _replaced(nested: Any, entries: dict[EntryPath, Any]) -> Any:
+    """Return a nested observation, or its space, with other entries in containers of its own."""
+    if () in entries:
+        return entries[()]
+    of_key: dict[Any, dict[EntryPath, Any]] = {}
+    for (key, *path), entry in entries.items():
+        of_key.setdefault(key, {})[tuple(path)] = entry
+    pairs = nested.items() if isinstance(nested, Mapping) else enumerate(nested)
+    parts = {key: _replaced(part, of_key[key]) if key in of_key else part for key, part in pairs}
+    if isinstance(nested, gym.spaces.Dict):
+        return gym.spaces.Dict(list(parts.items()))
+    if isinstance(nested, gym.spaces.Tuple):
+        return gym.spaces.Tuple(list(parts.values()))
+    return parts if isinstance(nested, Mapping) else tuple(parts.values())
+
+
+def _has_categories(env: Env) -> bool:
+    """Return whether observations contain categories, which flattening makes numbers of."""
+    kinds = gym.spaces.Discrete | gym.spaces.MultiDiscrete | gym.spaces.MultiBinary
+    return any(isinstance(part, kinds) for _, part in _entries(env.observation_space))
+
+
+def _cast(values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Cast float64 values; to an integer dtype they are rounded and clipped to its range."""
+    if dtype.kind in "iu":
+        info = np.iinfo(dtype)
+        # The largest 64-bit integers are no doubles: float(2**63 - 1) would overflow the cast.
+        largest = info.max if info.bits < 64 else np.nextafter(float(info.max), 0.0)
+        values = np.clip(np.rint(values), info.min, largest)
+    return np.asarray(values, dtype)
+
+
+# --------------------------------------------------------------------------------------- parameters
+
+
+class _ProbeEnv(gym.Env[Any, Any]):
+    """Stands for an environment that is not known yet, while a wrapper's arguments are read.
+
+    So a wrapper leaves alone what only the environment can tell: its keys, its simulator.
+    """
+
+    def __init__(self) -> None:
+        self.observation_space = gym.spaces.Box(-1.0, 1.0, (1,))
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+
+
+def _parameters(wrapper: type[NoiseWrapper]) -> list[inspect.Parameter]:
+    """Return a wrapper's own parameters, those after self, env and noise_rate."""
+    return list(inspect.signature(wrapper.__init__).parameters.values())[3:]
+
+
+def _number(name: str, value: float, low: float = -math.inf, high: float = math.inf) -> float:
+    number = math.nan
+    plain = _without_arrays(value)
+    if isinstance(plain, numbers.Real) and not isinstance(plain, bool):
+        with contextlib.suppress(OverflowError):  # an integer beyond the range of floats
+            number = float(plain)
+    if not (math.isfinite(number) and low <= number <= high):
+        raise ValueError(f"{name} must be a finite number in [{low}, {high}], got {value!r}")
+    return number + 0.0  # -0.0 becomes 0.0
+
+
+def _interval(low: float, high: float, least: float = -math.inf) -> tuple[float, float]:
+    low, high = _number("low", low, least), _number("high", high, least)
+    if low > high:
+        raise ValueError(f"low must not exceed high, got low={low}, high={high}")
+    return low, high
+
+
+def _whole_interval(low: int | None, high: int | None, least: int) -> tuple[int, int]:
+    """Check two numbers of steps; the second is the first by default."""
+    ends = [_without_arrays(end) for end in (low, low if high is None else high)]
+    for name, end in zip(("low", "high"), ends, strict=True):
+        whole = isinstance(end, numbers.Integral) and not isinstance(end, bool)
+        if not (whole and least <= end < 2**63):  # Generator.integers draws 64-bit integers
+            raise ValueError(f"{name} must be an integer in [{least}, 2**63), got {end!r}")
+    low, high = map(int, ends)
+    if low > high:
+        raise ValueError(f"low must not exceed high, got low={low}, high={high}")
+    return low, high
+
+
+def _scale_or_scales(value: float | tuple[float, ...] | list[float]) -> float | tuple[float, ...]:
+    """Check one standard deviation for all dimensions, or a tuple (in JSON a list) of them."""
+    scales = _without_arrays(value)
+    if not isinstance(scales, tuple | list):
+        return _number("scale", scales, low=0)
+    if len(scales) < 2:
+        raise ValueError(f"scale must be one number, or a tuple of two or more, got {value!r}")
+    return tuple(_number("every scale", number, low=0) for number in scales)
+
+
+def _flag(name: str, value: bool) -> bool:
+    if not isinstance(value, bool):
+        raise ValueError(f"{name} must be True or False, got {value!r}")
+    return value
+
+
+def _keys(keys: Any) -> Keys | None:
+    """Check names or indices of observations; their order does not matter."""
+    if keys is None:
+        return None
+    found = (keys,) if isinstance(keys, str | int) else keys
+    of_one_kind = isinstance(found, tuple | list) and len({*map(type, found)} & {str, int}) == 1
+    if not of_one_kind or len({*map(type, found)}) > 1:
+        raise ValueError(f"keys must be a tuple of names, or of indices of a Tuple, got {keys!r}")
+    return tuple(sorted(set(found)))
+
+
+def _fields(fields: Any) -> tuple[str, ...]:
+    """Check names of arrays of MuJoCo's model."""
+    found = (fields,) if isinstance(fields, str) else fields
+    if not isinstance(found, tuple | list) or not found:
+        raise ValueError(f"fields must be a tuple of names, got {fields!r}")
+    for field in found:
+        if field not in _USUAL_FIELDS and not _is_field(field):
+            usual = ", ".join(_USUAL_FIELDS)
+            raise ValueError(
+                f"fields: {field!r} is not given in MuJoCo's model for each body, geom, joint, "
+                f"degree of freedom, actuator or tendon; usual are {usual}"
+            )
+    if {"body_mass", "body_inertia"} <= set(found):
+        raise ValueError("fields: body_mass takes body_inertia along, so name one of them")
+    return tuple(dict.fromkeys(found))
+
+
+def _is_field(name: Any) -> bool:
+    try:
+        import mujoco
+    except ImportError:  # then there is no environment to apply it to, either
+        return False
+    rows = ("body_", "geom_", "jnt_", "dof_", "actuator_", "tendon_")
+    return (
+        isinstance(name, str)
+        and name.startswith(rows)
+        and name not in _DERIVED_FIELDS
+        and hasattr(mujoco.MjModel, name)
+    )
+
+
+def _schedule(noise_rate: float | str) -> tuple[float, float]:
+    """Return the rates at the beginning and at the end of training."""
+    try:
+        if isinstance(noise_rate, str):
+            start, end = (float(number) for number in noise_rate.split(":"))
+        else:
+            start = end = noise_rate
+        return (
+            _number("noise_rate", start, low=0, high=1),
+            _number("noise_rate", end, low=0, high=1),
+        )
+    except ValueError:
+        raise ValueError(
+            'a noise_rate must be a number in [0, 1], or "start:end" of two such numbers, as '
+            f'"1.0:0.0", got {noise_rate!r}'
+        ) from None
+
+
+def _spelled(schedule: tuple[float, float]) -> float | str:
+    """Return a schedule as it is written: one number, or "start:end" where they differ."""
+    start, end = schedule
+    return start if start == end else f"{start}:{end}"
+
+
+def _without_arrays(value: Any) -> Any:
+    """Turn an array, also in nested dicts, into lists or a number of Python's own types."""
+    if isinstance(value, dict):
+        return {name: _without_arrays(part) for name, part in value.items()}
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+# ---------------------------------------------------------------------------- modules of the user's
+
+
+def _import_module(module: str, problem: str) -> None:
+    """Import a module of the user's, as if this file's folder came last.
+
+    ``problem`` is what an error says first, as "there is no environment 'a:b'".
+    """
+    here, caller, path = str(Path(__file__).parent), os.getcwd(), sys.path[:]
+    others = [folder for folder in path if folder not in (here, caller)]
+    sys.path[:] = [*others, here] if caller == here else [caller, *others, here]
+    top = module.partition(".")[0]
+    try:
+        if not all(map(str.isidentifier, module.split("."))):
+            raise ValueError(f"{problem}: {module!r} is not a module name")
+        loaded, found = sys.modules.get(top), importlib.machinery.PathFinder.find_spec(top)
+        if loaded and found and found.origin != getattr(loaded, "__file__", found.origin):
+            raise ValueError(
+                f"{problem}: a module {top!r} is loaded already, from "
+                f"{loaded.__file__}; rename yours"
+            )
+        importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+            raise  # it exists, and imports another one that does not
+        raise ValueError(f"{problem}: {error}") from error
+    except Exception as error:
+        _raise_if_of_mujoco(error, module)
+        raise
+    finally:
+        sys.path[:] = path
+
+
+def _raise_if_of_mujoco(error: Exception, name: str) -> None:
+    """Raise ValueError if MuJoCo could not be imported with the renderer that MUJOCO_GL names."""
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    packages = {frame.f_globals.get("__name__", "").partition(".")[0] for frame in frames}
+    renderer = os.environ.get("MUJOCO_GL")
+    if renderer and packages & {"mujoco", "dm_control"}:
+        raise ValueError(
+            f"{name} imports MuJoCo, which fails with MUJOCO_GL={renderer} ({error}): training "
+            "draws nothing, so unset it; drawing needs the library that it names"
+        ) from error
+
+
+# ----------------------------------------------------------------------- what only the scripts need
+
+
+class NotFiniteError(FloatingPointError):
+    """A value that training cannot continue with: NaN, infinite, or not a number at all."""
+
+
+class SpaceError(ValueError):
+    """Observations or actions that are not vectors of numbers, or not what the API asks for."""
+
+
+class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Stops at NaN and infinity, and makes what an environment returns what the API asks for.
+
+    A learner that receives NaN does not recover, and may never show it. So this raises
+    NotFiniteError, which says whether the action was already NaN, as after a divergence. Rewards
+    become floats and the two ends bools; they may be arrays of one element, but not strings.
+    Observations, also in dictionaries and tuples, are copied, because an environment may write the
+    next one into the same array, and actions, because it may write into those. An observation that
+    has not the shape of its space, and a step of four values, raise SpaceError. The spaces are
+    looked up once, because an environment may make new ones, with new generators, at every access.
+
+    >>> env = FiniteNumbers(gym.make("Pendulum-v1", disable_env_checker=True))
+    >>> _ = env.reset(seed=0)
+    >>> env.step(np.array([np.nan]))
+    Traceback (most recent call last):
+    noisy_wrappers.NotFiniteError: step 1 of an episode: the environment was given the action [nan]
+    """
+
+    def __init__(self, env: Env):
+        """Wrap an environment; what is checked of observations are the Boxes, also in parts."""
+        gym.Wrapper.__init__(self, env)
+        RecordConstructorArgs.__init__(self)
+        self.action_space, self.observation_space = env.action_space, env.observation_space
+        self._boxes = {
+            path: part
+            for path, part in _entries(self.observation_space)
+            if isinstance(part, gym.spaces.Box)
+        }
+        self._steps = 0
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
+        """Reset the environment and check the first observation."""
+        self._steps = 0
+        try:
+            observation, info = self.env.reset(seed=seed, options=options)
+        except (TypeError, ValueError) as error:
+            self._refuse_old_api("reset() must return (observation, info)", error)
+            raise
+        return self._checked(observation), info
+
+    def step(self, action: Any) -> Step:
+        """Step the environment and check the observation and the reward."""
+        self._steps += 1
+        try:
+            observation, reward, terminated, truncated, info = self.env.step(copy.copy(action))
+        except (TypeError, ValueError) as error:
+            values = "(observation, reward, terminated, truncated, info)"
+            self._refuse_old_api(f"step() must return {values}", error)
+            raise
+        if isinstance(reward, str):
+            self._stop("returned the reward", reward)
+        number = float(reward.item() if isinstance(reward, np.ndarray) else reward)
+        if not math.isfinite(number):
+            self._blame("returned the reward", number, action)
+        return self._checked(observation, action), number, bool(terminated), bool(truncated), info
+
+    def _checked(self, observation: Any, action: Any = None) -> Any:
+        """Return a copy of an observation."""
+        parts = {}
+        for path, box in self._boxes.items():
+            part = np.array(functools.reduce(operator.getitem, path, observation))
+            if not np.isfinite(part).all():
+                self._blame(f"returned the observation{_subscript(path)}", part, action)
+            if part.shape != box.shape:
+                raise SpaceError(
+                    f"step {self._steps} of an episode: the environment returned an "
+                    f"observation{_subscript(path)} of shape {part.shape}, and its "
+                    f"observation_space has shape {box.shape}"
+                )
+            parts[path] = part
+        return _replaced(observation, parts) if parts else observation
+
+    def _refuse_old_api(self, wanted: str, error: Exception) -> None:
+        """Raise SpaceError if a wrapper, and not the environment's own code, could not unpack."""
+        *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+        place = frame.f_globals.get("__name__", "")
+        if "unpack" in str(error) and place.startswith(("gymnasium.wrappers.", __name__)):
+            at = f"step {self._steps} of an episode"
+            raise SpaceError(f"{at}: the environment's {wanted}: {error}") from error
+
+    def _blame(self, what: str, value: Any, action: Any) -> None:
+        """Stop at a value that is not finite, or rather at an action that was not, either."""
+        if isinstance(action, np.ndarray) and not np.isfinite(action).all():
+            self._stop("was given the action", action.tolist())
+        self._stop(what, np.asarray(value).tolist())
+
+    def _stop(self, what: str, value: Any) -> None:
+        raise NotFiniteError(f"step {self._steps} of an episode: the environment {what} {value!r}")
+
+
+def make_flat(env: Env, step_limit: int | None = None) -> Env:
+    """Prepare an environment for networks, whose inputs and outputs are vectors.
+
+    :class:`FiniteNumbers` makes rewards floats and stops at NaN and infinity; non-vector
+    observations (dictionaries, tuples, arrays, categories) are then flattened by
+    ``gymnasium.wrappers.FlattenObservation``. An environment whose spec has no time limit is cut
+    after ``step_limit`` steps, if that is given. Apply noise to the result,
+    ``make_noisy(make_flat(env), ...)``: it goes in between, so it knows the parts.
+
+    >>> make_flat(gym.make("Pendulum-v1").unwrapped)
+    <FiniteNumbers<PendulumEnv<Pendulum-v1>>>
+    >>> make_flat(gym.make("CartPole-v1"))  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    noisy_wrappers.SpaceError: needs Box actions of floats in one dimension; CartPole-v1 has ...
+
+    Raises:
+        SpaceError: actions are not a vector of floats, or observations cannot become a vector; the
+            environment has been closed.
+    """
+    name = env.spec.id if env.spec else str(env)
+    if step_limit and env.spec and env.spec.max_episode_steps is None:
+        env = gym.wrappers.TimeLimit(env, step_limit)
+    env = FiniteNumbers(env)
+    space = env.observation_space
+    is_vector = isinstance(space, gym.spaces.Box) and len(space.shape) == 1
+    if space.is_np_flattenable and not is_vector:
+        env = gym.wrappers.FlattenObservation(env)
+    observations, actions = env.observation_space, env.action_space
+    if not isinstance(observations, gym.spaces.Box) or observations.dtype.kind not in "fiu":
+        env.close()
+        raise SpaceError(f"needs Box observations of numbers; {name} has {observations}")
+    if (
+        not isinstance(actions, gym.spaces.Box)
+        or actions.dtype.kind != "f"
+        or len(actions.shape) != 1
+    ):
+        env.close()
+        raise SpaceError(f"needs Box actions of floats in one dimension; {name} has {actions}")
+    return env
+
+
+def into_space(action: NDArray[Any], space: gym.spaces.Box) -> NDArray[Any]:
+    """Return an action in its space's dtype and, to the last bit, within its bounds.
+
+    >>> into_space(np.float64([0.1, 2]), gym.spaces.Box(-1, 1, (2,)))
+    array([0.1, 1. ], dtype=float32)
+    """
+    # in this order, because the cast may round a bound up
+    return action.astype(space.dtype).clip(space.low, space.high)
+
+
+def canonical_env_id(env_id: str) -> str:
+    """Return the id of the environment that ``gymnasium.make(env_id)`` makes, with its version.
+
+    "module:Env-v0" imports the module, which registers the environment, and stays "module:Env-v0".
+    A module of the folder that Python was started in wins over one of this project's.
+
+    >>> canonical_env_id("Hopper")
+    'Hopper-v5'
+
+    Raises:
+        ValueError: an environment that is not registered, a module that does not exist, or a
+            renderer that MUJOCO_GL names and MuJoCo lacks; what else a module raises while it is
+            imported passes through.
+    """
+    module, colon, name = env_id.rpartition(":")
+    if module:
+        _import_module(module, f"there is no environment {env_id!r}")
+    try:
+        namespace, base_name, version = parse_env_id(name)
+        if version is None:
+            version = find_highest_version(namespace, base_name)
+        spec = gym.spec(get_env_id(namespace, base_name, version))
+    except gym.error.Error as error:
+        raise ValueError(f"there is no environment {env_id!r}: {error}") from error
+    if os.environ.get("MUJOCO_GL") and isinstance(spec.entry_point, str):
+        try:
+            load_env_creator(spec.entry_point)
+        except Exception as error:  # gymnasium.make() will raise it again
+            _raise_if_of_mujoco(error, env_id)
+    return f"{module}{colon}{spec.id}"
+
+
+def refusals(env_id: str) -> tuple[type[Exception], ...]:
+    """Return the errors that ``make_flat(gymnasium.make(env_id))`` raises on purpose.
+
+    They are Gymnasium's and this module's. Of Gymnasium's own environments a missing dependency is
+    an ImportError; any other error comes from the environment's code.
+    """
+    spec = gym.registry.get(env_id.rpartition(":")[2])
+    maker: Any = spec.entry_point if spec else ""  # "package.module:Class" or a function
+    is_gymnasiums = getattr(maker, "__module__", str(maker)).startswith("gymnasium.")
+    return (gym.error.Error, SpaceError, *([ImportError] if is_gymnasiums else []))
+
+
+def seed_globals(seed: int) -> None:
+    """Seed the generators that an environment shares with everybody: Python's, NumPy's, PyTorch's.
+
+    PyTorch's is seeded only where PyTorch is loaded.
+    """
+    random.seed(seed)
+    np.random.seed(seed % 2**32)
+    if torch := sys.modules.get("torch"):
+        torch.manual_seed(seed)
+
+
+@contextlib.contextmanager
+def seeded_globals(seed: int) -> Iterator[None]:
+    """Seed them as :func:`seed_globals` does for some lines of code, and restore them after it.
+
+    >>> with seeded_globals(1):
+    ...     first = random.random()
+    >>> with seeded_globals(1):
+    ...     random.random() == first
+    True
+    """
+    torch: Any = sys.modules.get("torch")
+    python, numpy = random.getstate(), np.random.get_state()
+    pytorch = torch.get_rng_state() if torch else None
+    seed_globals(seed)
+    try:
+        yield
+    finally:
+        random.setstate(python)
+        np.random.set_state(numpy)
+        if torch:
+            torch.set_rng_state(pytorch)
+
+
+def reset_worker_signals() -> None:
+    """Undo a script's signal handlers in a worker process that an environment forked.
+
+    SIGTERM and SIGHUP end it again, as ``terminate()`` asks; SIGINT is ignored: Ctrl-C is the
+    script's. A script calls ``os.register_at_fork(after_in_child=reset_worker_signals)``.
+    """
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if callable(signal.getsignal(number)):
+            signal.signal(number, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 class EnvState:
     """What an environment carries from one episode to the next, to resume training.
 
@@ -1718,13 +2141,6 @@ def _stream(generator: Any) -> Any:
     return _without_arrays(generator.bit_generator.state)
 
 
-def _without_arrays(value: Any) -> Any:
-    """Turn an array, also in nested dicts, into lists or a number of Python's own types."""
-    if isinstance(value, dict):
-        return {name: _without_arrays(part) for name, part in value.items()}
-    return value.tolist() if isinstance(value, np.ndarray) else value
-
-
 # The scripts' arguments that change nothing about what a run learns. A run may be resumed with
 # others, and a finished one counts as done whatever it had.
 MAY_DIFFER_IN_A_RUN = frozenset(
@@ -1733,385 +2149,3 @@ MAY_DIFFER_IN_A_RUN = frozenset(
 # Runs with other values of these may stand in one row of a table, too: a GPU rounds otherwise, and
 # tests do not touch training. But a run keeps to the ones that it began with.
 MAY_DIFFER_IN_A_TABLE = MAY_DIFFER_IN_A_RUN | {"cuda", "eval_frequency"}
-
-
-def noise_slug(noises: Sequence[str], rates: Sequence[float | str]) -> str:
-    """Return noises as a part of a file's name, "" for none; equal configurations have equal ones.
-
-    >>> noise_slug(["RandomUniformScaleReward(.5, 1.5)"], [0.05])
-    'p0.05_UniformScaleReward_0.5_1.5'
-    """
-    return Configuration.read(noises, rates).slug
-
-
-def _words(noise: str) -> str:
-    """Return a noise as a part of a file's name; different noises have different ones."""
-    plain = noise.replace("=(", "=").replace("', '", "-").replace("'", "")  # keys=a-b
-    words = _safe("_".join(re.findall(r"[^(), ]+", plain)))
-    if re.sub(r"'[A-Za-z_][A-Za-z0-9_.]*'", "", noise).count("'"):  # a key that is no plain name
-        words += "_" + hashlib.sha256(noise.encode()).hexdigest()[:8]
-    return words
-
-
-def _rate_word(rate: tuple[float, float]) -> str:
-    return str(_spelled(rate)).replace(":", "to")
-
-
-def run_name(
-    env_id: str, exp_name: str, noises: Sequence[str], rates: Sequence[float | str], seed: int
-) -> str:
-    """Return the name of a run's folder, the same for all spellings of one configuration.
-
-    What tells the runs of a sweep apart comes first: TensorBoard's list shows 31 characters. Where
-    the name would be too long for a file system, the noises are cut and end in a hash.
-
-    >>> run_name("Hopper-v5", "sac", ["RandomUniformScaleReward(.5, 1.5)"], [0.05], seed=1)
-    'p0.05_s1_UniformScaleReward_0.5_1.5__Hopper-v5__sac'
-    >>> run_name("Hopper-v5", "sac", ["RandomEarlyTermination(50)"], ["1:0"], seed=1)
-    'p1.0to0.0_s1_EarlyTermination_50__Hopper-v5__sac'
-    >>> run_name("ALE/Pong-v5", "ppo", [], [], seed=1)
-    'baseline_s1__ALE-Pong-v5__ppo'
-    """
-    configuration = Configuration.read(noises, rates)
-    rate, *names = configuration._rates_and_names() or ["baseline"]
-    first = "_".join([rate, f"s{seed}", *names])
-    end = f"__{_safe(env_id)}__{_safe(exp_name)}"
-    if len(first + end) > 240:  # a file's name has at most 255 bytes
-        first = f"{first[:100]}_{hashlib.sha256(first.encode()).hexdigest()[:16]}"
-    return first + end
-
-
-def run_folder(
-    runs_dir: str | Path,
-    env_id: str,
-    exp_name: str,
-    noises: Sequence[str],
-    rates: Sequence[float | str],
-    seed: int,
-) -> Path:
-    """Return a run's folder: :func:`run_name` in runs_dir, or the folder that version 0.1 made."""
-    configuration = Configuration.read(noises, rates)
-    pairs = zip(configuration.noises, configuration.rates, strict=True)
-    slug = "+".join(f"{_words(noise)}_p{_rate_word(rate)}" for noise, rate in pairs) or "baseline"
-    old_name = f"{_safe(env_id)}__{_safe(exp_name)}__{slug}__{seed}"
-    if len(old_name) <= 240 and Path(runs_dir, old_name).is_dir():
-        return Path(runs_dir, old_name)
-    return Path(runs_dir, run_name(env_id, exp_name, noises, rates, seed))
-
-
-def _safe(text: str) -> str:
-    """Replace what a folder's name cannot hold: "/" by one dash, anything else by two."""
-    return re.sub(r"[^A-Za-z0-9._=+-]", lambda match: "-" if match[0] == "/" else "--", text)
-
-
-def canonical_env_id(env_id: str) -> str:
-    """Return the id of the environment that ``gymnasium.make(env_id)`` makes, with its version.
-
-    "module:Env-v0" imports the module, which registers the environment, and stays "module:Env-v0".
-    A module of the folder that Python was started in wins over one of this project's.
-
-    >>> canonical_env_id("Hopper")
-    'Hopper-v5'
-
-    Raises:
-        ValueError: an environment that is not registered, a module that does not exist, or a
-            renderer that MUJOCO_GL names and MuJoCo lacks; what else a module raises while it is
-            imported passes through.
-    """
-    module, colon, name = env_id.rpartition(":")
-    if module:
-        _import_module(module, f"there is no environment {env_id!r}")
-    try:
-        namespace, base_name, version = parse_env_id(name)
-        if version is None:
-            version = find_highest_version(namespace, base_name)
-        spec = gym.spec(get_env_id(namespace, base_name, version))
-    except gym.error.Error as error:
-        raise ValueError(f"there is no environment {env_id!r}: {error}") from error
-    if os.environ.get("MUJOCO_GL") and isinstance(spec.entry_point, str):
-        try:
-            load_env_creator(spec.entry_point)
-        except Exception as error:  # gymnasium.make() will raise it again
-            _raise_if_of_mujoco(error, env_id)
-    return f"{module}{colon}{spec.id}"
-
-
-def _raise_if_of_mujoco(error: Exception, name: str) -> None:
-    """Raise ValueError if MuJoCo could not be imported with the renderer that MUJOCO_GL names."""
-    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
-    packages = {frame.f_globals.get("__name__", "").partition(".")[0] for frame in frames}
-    renderer = os.environ.get("MUJOCO_GL")
-    if renderer and packages & {"mujoco", "dm_control"}:
-        raise ValueError(
-            f"{name} imports MuJoCo, which fails with MUJOCO_GL={renderer} ({error}): training "
-            "draws nothing, so unset it; drawing needs the library that it names"
-        ) from error
-
-
-def _import_module(module: str, problem: str) -> None:
-    """Import a module of the user's, as if this file's folder came last.
-
-    ``problem`` is what an error says first, as "there is no environment 'a:b'".
-    """
-    here, caller, path = str(Path(__file__).parent), os.getcwd(), sys.path[:]
-    others = [folder for folder in path if folder not in (here, caller)]
-    sys.path[:] = [*others, here] if caller == here else [caller, *others, here]
-    top = module.partition(".")[0]
-    try:
-        if not all(map(str.isidentifier, module.split("."))):
-            raise ValueError(f"{problem}: {module!r} is not a module name")
-        loaded, found = sys.modules.get(top), importlib.machinery.PathFinder.find_spec(top)
-        if loaded and found and found.origin != getattr(loaded, "__file__", found.origin):
-            raise ValueError(
-                f"{problem}: a module {top!r} is loaded already, from "
-                f"{loaded.__file__}; rename yours"
-            )
-        importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
-            raise  # it exists, and imports another one that does not
-        raise ValueError(f"{problem}: {error}") from error
-    except Exception as error:
-        _raise_if_of_mujoco(error, module)
-        raise
-    finally:
-        sys.path[:] = path
-
-
-def refusals(env_id: str) -> tuple[type[Exception], ...]:
-    """Return the errors that ``make_flat(gymnasium.make(env_id))`` raises on purpose.
-
-    They are Gymnasium's and this module's. Of Gymnasium's own environments a missing dependency is
-    an ImportError; any other error comes from the environment's code.
-    """
-    spec = gym.registry.get(env_id.rpartition(":")[2])
-    maker: Any = spec.entry_point if spec else ""  # "package.module:Class" or a function
-    is_gymnasiums = getattr(maker, "__module__", str(maker)).startswith("gymnasium.")
-    return (gym.error.Error, SpaceError, *([ImportError] if is_gymnasiums else []))
-
-
-def _layers(env: Env) -> Iterator[gym.Wrapper[Any, Any, Any, Any]]:
-    """Yield an environment's wrappers, outermost first."""
-    while isinstance(env, gym.Wrapper):
-        yield env
-        env = env.env
-
-
-def _noise_layers(env: Env) -> Iterator[NoiseWrapper]:
-    """Yield an environment's noise wrappers, outermost first."""
-    for layer in _layers(env):
-        if isinstance(layer, NoiseWrapper):
-            yield layer
-
-
-def _has_categories(env: Env) -> bool:
-    """Return whether observations contain categories, which flattening makes numbers of."""
-    kinds = gym.spaces.Discrete | gym.spaces.MultiDiscrete | gym.spaces.MultiBinary
-    return any(isinstance(part, kinds) for _, part in _entries(env.observation_space))
-
-
-def _entries(space: gym.Space[Any], path: EntryPath = ()) -> Iterator[tuple[EntryPath, Any]]:
-    """Yield the entries of nested Dict and Tuple spaces, in the order in which they are flattened.
-
-    Each is (the keys that lead to it, its space); a space of another kind is one entry.
-    """
-    parts: Any = None
-    if isinstance(space, gym.spaces.Dict):
-        parts = space.items()
-    elif isinstance(space, gym.spaces.Tuple):
-        parts = enumerate(space)
-    if parts is None:
-        yield path, space
-        return
-    for key, part in parts:
-        yield from _entries(part, (*path, key))
-
-
-def _subscript(path: EntryPath) -> str:
-    return "".join(f"[{key!r}]" for key in path)
-
-
-def _replaced(nested: Any, entries: dict[EntryPath, Any]) -> Any:
-    """Return a nested observation, or its space, with other entries in containers of its own."""
-    if () in entries:
-        return entries[()]
-    of_key: dict[Any, dict[EntryPath, Any]] = {}
-    for (key, *path), entry in entries.items():
-        of_key.setdefault(key, {})[tuple(path)] = entry
-    pairs = nested.items() if isinstance(nested, Mapping) else enumerate(nested)
-    parts = {key: _replaced(part, of_key[key]) if key in of_key else part for key, part in pairs}
-    if isinstance(nested, gym.spaces.Dict):
-        return gym.spaces.Dict(list(parts.items()))
-    if isinstance(nested, gym.spaces.Tuple):
-        return gym.spaces.Tuple(list(parts.values()))
-    return parts if isinstance(nested, Mapping) else tuple(parts.values())
-
-
-class _ProbeEnv(gym.Env[Any, Any]):
-    """Stands for an environment that is not known yet, while a wrapper's arguments are read.
-
-    So a wrapper leaves alone what only the environment can tell: its keys, its simulator.
-    """
-
-    def __init__(self) -> None:
-        self.observation_space = gym.spaces.Box(-1.0, 1.0, (1,))
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,))
-
-
-def _parameters(wrapper: type[NoiseWrapper]) -> list[inspect.Parameter]:
-    """Return a wrapper's own parameters, those after self, env and noise_rate."""
-    return list(inspect.signature(wrapper.__init__).parameters.values())[3:]
-
-
-def _cast(values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Cast float64 values; to an integer dtype they are rounded and clipped to its range."""
-    if dtype.kind in "iu":
-        info = np.iinfo(dtype)
-        # The largest 64-bit integers are no doubles: float(2**63 - 1) would overflow the cast.
-        largest = info.max if info.bits < 64 else np.nextafter(float(info.max), 0.0)
-        values = np.clip(np.rint(values), info.min, largest)
-    return np.asarray(values, dtype)
-
-
-def _number(name: str, value: float, low: float = -math.inf, high: float = math.inf) -> float:
-    number = math.nan
-    plain = _without_arrays(value)
-    if isinstance(plain, numbers.Real) and not isinstance(plain, bool):
-        with contextlib.suppress(OverflowError):  # an integer beyond the range of floats
-            number = float(plain)
-    if not (math.isfinite(number) and low <= number <= high):
-        raise ValueError(f"{name} must be a finite number in [{low}, {high}], got {value!r}")
-    return number + 0.0  # -0.0 becomes 0.0
-
-
-def _schedule(noise_rate: float | str) -> tuple[float, float]:
-    """Return the rates at the beginning and at the end of training."""
-    try:
-        if isinstance(noise_rate, str):
-            start, end = (float(number) for number in noise_rate.split(":"))
-        else:
-            start = end = noise_rate
-        return (
-            _number("noise_rate", start, low=0, high=1),
-            _number("noise_rate", end, low=0, high=1),
-        )
-    except ValueError:
-        raise ValueError(
-            'a noise_rate must be a number in [0, 1], or "start:end" of two such numbers, as '
-            f'"1.0:0.0", got {noise_rate!r}'
-        ) from None
-
-
-def _spelled(schedule: tuple[float, float]) -> float | str:
-    """Return a schedule as it is written: one number, or "start:end" where they differ."""
-    start, end = schedule
-    return start if start == end else f"{start}:{end}"
-
-
-def _interval(low: float, high: float, least: float = -math.inf) -> tuple[float, float]:
-    low, high = _number("low", low, least), _number("high", high, least)
-    if low > high:
-        raise ValueError(f"low must not exceed high, got low={low}, high={high}")
-    return low, high
-
-
-def _scale_or_scales(value: float | tuple[float, ...] | list[float]) -> float | tuple[float, ...]:
-    """Check one standard deviation for all dimensions, or a tuple (in JSON a list) of them."""
-    scales = _without_arrays(value)
-    if not isinstance(scales, tuple | list):
-        return _number("scale", scales, low=0)
-    if len(scales) < 2:
-        raise ValueError(f"scale must be one number, or a tuple of two or more, got {value!r}")
-    return tuple(_number("every scale", number, low=0) for number in scales)
-
-
-def _whole_interval(low: int | None, high: int | None, least: int) -> tuple[int, int]:
-    """Check two numbers of steps; the second is the first by default."""
-    ends = [_without_arrays(end) for end in (low, low if high is None else high)]
-    for name, end in zip(("low", "high"), ends, strict=True):
-        whole = isinstance(end, numbers.Integral) and not isinstance(end, bool)
-        if not (whole and least <= end < 2**63):  # Generator.integers draws 64-bit integers
-            raise ValueError(f"{name} must be an integer in [{least}, 2**63), got {end!r}")
-    low, high = map(int, ends)
-    if low > high:
-        raise ValueError(f"low must not exceed high, got low={low}, high={high}")
-    return low, high
-
-
-def _keys(keys: Any) -> Keys | None:
-    """Check names or indices of observations; their order does not matter."""
-    if keys is None:
-        return None
-    found = (keys,) if isinstance(keys, str | int) else keys
-    of_one_kind = isinstance(found, tuple | list) and len({*map(type, found)} & {str, int}) == 1
-    if not of_one_kind or len({*map(type, found)}) > 1:
-        raise ValueError(f"keys must be a tuple of names, or of indices of a Tuple, got {keys!r}")
-    return tuple(sorted(set(found)))
-
-
-def _fields(fields: Any) -> tuple[str, ...]:
-    """Check names of arrays of MuJoCo's model."""
-    found = (fields,) if isinstance(fields, str) else fields
-    if not isinstance(found, tuple | list) or not found:
-        raise ValueError(f"fields must be a tuple of names, got {fields!r}")
-    for field in found:
-        if field not in _USUAL_FIELDS and not _is_field(field):
-            usual = ", ".join(_USUAL_FIELDS)
-            raise ValueError(
-                f"fields: {field!r} is not given in MuJoCo's model for each body, geom, joint, "
-                f"degree of freedom, actuator or tendon; usual are {usual}"
-            )
-    if {"body_mass", "body_inertia"} <= set(found):
-        raise ValueError("fields: body_mass takes body_inertia along, so name one of them")
-    return tuple(dict.fromkeys(found))
-
-
-def _is_field(name: Any) -> bool:
-    try:
-        import mujoco
-    except ImportError:  # then there is no environment to apply it to, either
-        return False
-    rows = ("body_", "geom_", "jnt_", "dof_", "actuator_", "tendon_")
-    return (
-        isinstance(name, str)
-        and name.startswith(rows)
-        and name not in _DERIVED_FIELDS
-        and hasattr(mujoco.MjModel, name)
-    )
-
-
-def _flag(name: str, value: bool) -> bool:
-    if not isinstance(value, bool):
-        raise ValueError(f"{name} must be True or False, got {value!r}")
-    return value
-
-
-# ------------------------------------------------------------------------------ numbers for people
-
-
-def rounded(value: float, spread: float | None = None) -> str:
-    """Return a number as text, with two significant digits of its spread.
-
-    ``spread`` is what the number may be off by, in its own units: a standard deviation, or half the
-    width of an interval. The whole part is never cut. Without a spread (none, NaN, zero, or within
-    the rounding errors of floating point) the text has four significant digits.
-
-    >>> rounded(9512.34, 210.0), rounded(0.8712, 0.0342), rounded(-40.0, 8.165)
-    ('9,512', '0.871', '-40.0')
-    >>> rounded(0.8712345), rounded(1234567.8), rounded(0.0, 0.0), rounded(3.2e-7, 1.1e-8)
-    ('0.8712', '1,234,568', '0', '3.20e-07')
-    """
-    if not abs(value) < 1e15:  # beyond the precision of floats, infinite, or NaN
-        return f"{value:.3e}"
-    known = spread is not None and math.isfinite(spread) and spread > 1e-9 * abs(value)
-    digits, scale = (2, spread) if known else (4, abs(value))
-    if not scale:
-        return "0"
-    # "e" rounds first: 0.0996 has the two significant digits of 0.10, not of 0.09
-    decimals = max(0, digits - 1 - int(f"{scale:.{digits - 1}e}".partition("e")[2]))
-    if decimals <= 6:
-        return f"{value:z,.{decimals}f}"
-    if abs(value) < 0.5 * 10.0**-decimals:
-        return "0"
-    exponent = int(f"{value:e}".partition("e")[2])
-    return f"{value:.{max(0, exponent + decimals)}e}"

@@ -9,6 +9,7 @@ import difflib
 import functools
 import itertools
 import os
+import re
 import shlex
 import subprocess
 from pathlib import Path
@@ -324,7 +325,8 @@ def other_options(run, made_with):
 def command_line(run):
     """Return a run's command, complete: it can be pasted into a shell in the project's folder."""
     words = [os.environ.get("PYTHON", "python"), run.script, *run.arguments]
-    if ":" in run.kind[1] and "PYTHONPATH" in os.environ:  # where the environment's module lies
+    own = any(re.match(r"[\w.]+:[A-Za-z_]", word) for word in run.arguments)  # module:Name
+    if own and "PYTHONPATH" in os.environ:  # where a module of the user's lies
         words = ["env", f"PYTHONPATH={os.environ['PYTHONPATH']}", *words]
     return shlex.join(words)
 

@@ -556,9 +556,11 @@ def test_dict_observations_are_flattened(algorithm, tmp_path, capsys):
 
 
 @one_script
-def test_reward_noise_works_beside_a_one_hot_observation(algorithm, tmp_path):
-    noise = {"noise": ("RandomNormalNoisyReward(0.5)",), "noise_rate": (0.5,)}
-    run(algorithm, tmp_path, env_id="toy_envs:OneHotObservation-v0", **noise)
+def test_noise_on_the_numbers_beside_a_category(algorithm, tmp_path):
+    noise = {"noise": ("RandomNormalNoisyObservation(0.5)",), "noise_rate": (0.5,)}
+    run_dir = run(algorithm, tmp_path, env_id="toy_envs:OneHotObservation-v0", **noise)
+    result = json.loads((run_dir / "result.json").read_text())
+    assert 0.3 < result["noise_applied_fraction"]["RandomNormalNoisyObservation"] < 0.7
 
 
 @pytest.mark.parametrize("algorithm", ["TD3", "PPO"])  # SAC has TD3's buffer
@@ -659,7 +661,7 @@ BAD = [  # arguments, what the message names, of which scripts
     (
         {
             "env_id": "toy_envs:OneHotObservation-v0",
-            "noise": ("RandomDropoutObservation(0.5)",),
+            "noise": ("RandomDropoutObservation(0.5, keys='phase')",),
             "noise_rate": (0.1,),
         },
         "RandomDropoutObservation cannot perturb categories",
