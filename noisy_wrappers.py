@@ -371,11 +371,12 @@ class ObservationNoise(NoiseWrapper):
         if () in self._boxes:
             return _cast(numbers, self._boxes[()].dtype)
         ends = np.cumsum([math.prod(box.shape) for box in self._boxes.values()])
-        parts = zip(self._boxes.items(), np.split(numbers, ends[:-1]), strict=True)
-        return _replaced(
-            observation,
-            {path: _cast(part.reshape(box.shape), box.dtype) for (path, box), part in parts},
-        )
+        parts = {}
+        for (path, box), part in zip(
+            self._boxes.items(), np.split(numbers, ends[:-1]), strict=True
+        ):
+            parts[path] = _cast(part.reshape(box.shape), box.dtype)
+        return _replaced(observation, parts)
 
     def _widen(self, reach: Callable[[NDArray[Any]], Sequence[Any]]) -> None:
         """Extend the observation space to what ``reach`` says noise makes of its bounds."""
@@ -836,19 +837,15 @@ class RandomEarlyTermination(NoiseWrapper):
 
     def _warn_if_late(self) -> None:
         """Say if no episode lasts long enough to be ended."""
-        limits = [
-            layer._max_episode_steps
-            for layer in _layers(self.env)
-            if isinstance(layer, gym.wrappers.TimeLimit)
-        ]
-        limit = min(limits, default=None)
-        if limit is None or self.low is None or self.low < limit:
-            return
-        effect = "never acts"
-        if self.low == limit and not self.truncate:
-            effect = "only turns truncated into terminated there"
-        text = f"RandomEarlyTermination({self.low}) {effect}: episodes have at most {limit} steps"
-        gym.logger.warn(text, stacklevel=3)
+        timers = [layer for layer in _layers(self.env) if isinstance(layer, gym.wrappers.TimeLimit)]
+        limit = min((timer._max_episode_steps for timer in timers), default=math.inf)
+        if self.low is not None and self.low >= limit:
+            only = self.low == limit and not self.truncate
+            effect = "only turns truncated into terminated there" if only else "never acts"
+            text = (
+                f"RandomEarlyTermination({self.low}) {effect}: episodes have at most {limit} steps"
+            )
+            gym.logger.warn(text, stacklevel=3)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and decide when the episode ends."""
@@ -923,6 +920,7 @@ class RandomDynamics(NoiseWrapper):
         if any(isinstance(layer, RandomDynamics) for layer in _noise_layers(env)):
             raise ValueError("this environment has RandomDynamics already: name all fields in one")
         self._changed: Any = None  # the model that is not as it was, and its values before
+        self._scratch: Any = None  # a model, and data to compute with
         if not isinstance(env, _ProbeEnv):
             model = self._model()
             for field in self.fields:
@@ -984,8 +982,10 @@ class RandomDynamics(NoiseWrapper):
         self._changed = model, nominal, statistics
         for name, values in scaled.items():
             arrays[name][:] = (nominal[name].T * values).T
-        # in data of its own: the environment's are left as they are until its reset
-        mujoco.mj_setConst(model, mujoco.MjData(model))
+        # In data of its own, made once: the environment's are left as they are until its reset.
+        if self._scratch is None or self._scratch[0] is not model:
+            self._scratch = model, mujoco.MjData(model)
+        mujoco.mj_setConst(*self._scratch)
         for name in ("meansize", "extent", "center"):  # of the picture, as the model's file says
             setattr(model.stat, name, statistics[name])
 
