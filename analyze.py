@@ -8,12 +8,12 @@ report.html first.
 
 The unit of replication is the seed: a run's value at a step is the mean over its test episodes, and
 every mean, standard deviation (ddof=1) and interval is taken over runs. Only finished runs (those
-with a result.json) count; all others are listed. The paper is Khraishi and Okhrati (2023),
+with a result.json) count; all others are listed, and the exit status is 1 if one is damaged. The
+paper is Khraishi and Okhrati (2023),
 https://arxiv.org/abs/2305.02882; IQM and probability of improvement are those of Agarwal et al.
 (2021), https://arxiv.org/abs/2108.13264.
 """
 
-import os
 import shutil
 import subprocess
 import sys
@@ -22,9 +22,9 @@ from pathlib import Path
 
 import tyro
 
-from analysis.effects import ENDS
-from analysis.errors import fail
-from analysis.figures import NARROW, figures, write_figure
+from analysis.errors import fail, take_over_terminal
+from analysis.figures import figures, write_figure
+from analysis.folders import is_run
 from analysis.formatting import text_table, wrapped, write_table
 from analysis.paper import read_paper
 from analysis.report import write_report
@@ -34,8 +34,8 @@ from analysis.tables import family_notes, make_tables, table_of
 from analysis.verdicts import clear_first, headlines, sentences, tally
 
 # Columns that a terminal may have room for, the most important ones first
-BEST_IN_SHORT = ["algorithm, environment", "noise", "noise_rate", *ENDS, "p_adjusted", "n"]
-BEST_IN_SHORT += ["luck_95_percent", "p_luck_of_best", "baseline_mean", "baseline_std"]
+BEST_IN_SHORT = ["algorithm, environment", "noise", "noise_rate", "difference", "p_adjusted", "n"]
+BEST_IN_SHORT += ["luck_95", "p_luck_of_best", "baseline_mean", "baseline_std"]
 BEST_IN_SHORT += ["noisy_mean", "noisy_std"]
 MISSING_IN_SHORT = ["status", "reason", "seeds", "environment", "noise", "noise_rate", "run"]
 
@@ -72,7 +72,7 @@ def output_folder(args):
 def no_finished_run(runs_dir):
     """End with an error that says where there are finished runs, if that is below `runs_dir`."""
     paths = [*runs_dir.glob("*/*/result.json"), *runs_dir.glob("*/*/*/result.json")]
-    folders = sorted({path.parent.parent for path in paths})
+    folders = sorted({path.parent.parent for path in paths if is_run(path.parent)})
     if not folders:
         fail(f"no finished run in {runs_dir}")
     found = ", ".join(str(folder) for folder in folders)
@@ -108,16 +108,24 @@ def overview_of(runs, studies):
 
 
 def write_results(out, verdicts, tables, studies, overview, problems, notes):
-    """Write all tables, all figures and the report."""
+    """Write all tables, all figures and the report; return the names of tables and figures."""
     out.mkdir(parents=True, exist_ok=True)
     for table in tables.values():
         write_table(out, table)
-    drawn = []
-    for name, figure, caption in figures(studies, tables):
-        write_figure(out, name, figure)
-        if not name.endswith(NARROW):
-            drawn.append((name, caption))
+    drawn = list(figures(studies, tables))
+    names = {*tables}
+    for drawing in drawn:
+        write_figure(out, drawing)
+        names |= {drawing.name, drawing.narrow_name}
     write_report(out, verdicts, tables, drawn, overview, problems, notes)
+    return names
+
+
+def left_by_others(out, names):
+    """Return the tables and figures in `out` that have other names: an earlier analysis's."""
+    found = {path.stem for path in out.glob("*.csv") if path.with_suffix(".tex").exists()}
+    found |= {path.stem for path in out.glob("*.svg")}
+    return sorted(found - names)
 
 
 def terminal_width():
@@ -156,7 +164,11 @@ def print_results(out, verdicts, tables, overview, problems, notes):
 
 
 def main(args):
-    """Read the runs, write tables, figures and report, and print verdicts and main table."""
+    """Read the runs, write tables, figures and report, and print verdicts and main table.
+
+    Return the exit status: 1 where a run's files are damaged.
+    """
+    args = Args(*(path and path.expanduser() for path in (args.runs_dir, args.out, args.compare)))
     if not args.runs_dir.is_dir():
         fail(f"no folder {args.runs_dir}")
     try:
@@ -180,22 +192,20 @@ def main(args):
     tables["missing"] = table_of("missing", missing)
     if choice is not None:
         tables["choice"] = table_of("choice", choice)
-    verdicts = sentences(studies, tables["statistics"].frame)
+    verdicts = sentences(tables["statistics"].frame)
     notes = family_notes(tables["statistics"].frame) + notes
     overview = overview_of(runs, studies)
     try:
-        write_results(out, verdicts, tables, studies, overview, problems, notes)
+        names = write_results(out, verdicts, tables, studies, overview, problems, notes)
     except OSError as error:
         fail(f"--out: {error}")
-    old = sorted(path.name for path in out.glob("*.csv") if path.stem not in tables)
+    old = left_by_others(out, names)
     if old:
         notes.append(f"{out} also holds an earlier analysis, not renewed: {', '.join(old)}")
     print_results(out, verdicts, tables, overview, problems, notes)
+    return int(number["corrupt"] > 0)
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args, description=__doc__))
-        sys.stdout.flush()
-    except BrokenPipeError:  # `| head` has read enough; all files are written
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    take_over_terminal()
+    sys.exit(main(tyro.cli(Args, description=__doc__)))

@@ -83,7 +83,7 @@ END
 fail() { echo "error: $*" >&2 || true; exit 2; }
 
 caller=$(pwd -P)
-cd "$(dirname "${BASH_SOURCE[0]}")"
+cd "$(dirname -- "$(readlink -f -- "${BASH_SOURCE[0]}")")" # it may be called through a link
 . sweep/executors.sh
 case ${1:-} in # how the executors call this script: run-one SWEEP FOLDER COMMAND
   run-one) # on a machine whose connection may break: the run must outlive its reader
@@ -143,11 +143,13 @@ if [ $view = status ]; then
   exit
 fi
 
-list_todo() { # sets `lines`, all runs; and `todo`, those that are to do and were not yet tried
+# sets `lines`, all runs; and `todo`, those that are to do and were not yet tried. LC_ALL=C: folders
+# may have names that are not UTF-8
+list_todo() {
   lines=$(show "${dry_run:-list}") || exit $?
-  todo=$(awk -F'\t' -v OFS='\t' '$2 == "todo" {print $1, $3}' <<<"$lines" |
-    grep -vxFf <(printf '%s\n' "$tried") || true)
-  count=$(grep -c . <<<"$todo" || true)
+  todo=$(LC_ALL=C awk -F'\t' -v OFS='\t' '$2 == "todo" {print $1, $3}' <<<"$lines" |
+    LC_ALL=C grep -vxFf <(printf '%s\n' "$tried") || true)
+  count=$(LC_ALL=C grep -c . <<<"$todo" || true)
 }
 tried=''
 list_todo
@@ -174,7 +176,16 @@ fi
 
 sweep=$HOSTNAME-$$-$(date +%Y%m%d%H%M%S)
 logs=${first%/*}/logs list=${first%/*}/logs/lines-$sweep.tsv
-mkdir -p "$logs" || fail "--runs-dir: cannot write to ${first%/*}"
+
+write_list() { # the runs to do, for the executor; and the folders of their logs
+  local folders reason
+  mapfile -t folders < <(cut -f1 <<<"$todo" | LC_ALL=C sed 's,/[^/]*$,/logs,' | LC_ALL=C sort -u)
+  reason=$( (mkdir -p "${folders[@]}" && printf '%s\n' "$todo" >"$list") 2>&1) ||
+    fail "--runs-dir: cannot write to $logs: ${reason##*: }"
+}
+trap 'rm -f "$list"' EXIT
+write_list
+locks_work "$list" || fail "--runs-dir: $(no_locks "$logs")"
 
 # Were this command killed, the executor would start run after run: the guard stops it then
 guard() { # a killed command may stay as a zombie: it is dead when the guard has another parent
@@ -200,8 +211,9 @@ stop() { # EXIT_STATUS
 # reaches every run once.
 run_todo() {
   local guard watch=''
-  printf '%s\n' "$todo" >"$list"
+  write_list
   if [ "$executor" = slurm ]; then
+    trap - EXIT # its tasks read the list later
     submit
     [ -n "$wait" ] || exit "$stopped"
     [ "${#ids[@]}" -gt 0 ] || return 0 # stopped before the first array
@@ -226,7 +238,6 @@ run_todo() {
 }
 
 if [ "$executor" != slurm ]; then
-  trap 'rm -f "$list"' EXIT
   [ -z "$sshlogin" ] || parallel "${parallel_options[@]}" --nonall --tag \
     "$PYTHON" -c "'import mujoco, torch, tyro, noisy_wrappers'" "&&" test -x benchmark.sh >&2 ||
     fail "a machine of --sshlogin cannot run the project in ${remote_dir:-$PWD} with $PYTHON"

@@ -97,6 +97,7 @@ __all__ = [
     "rate_order",
     "refusals",
     "reset_worker_signals",
+    "rounded",
     "run_folder",
     "run_name",
     "seed_globals",
@@ -1542,6 +1543,37 @@ def _rate_word(rate: tuple[float, float]) -> str:
 def _safe(text: str) -> str:
     """Replace what a folder's name cannot hold: "/" by one dash, anything else by two."""
     return re.sub(r"[^A-Za-z0-9._=+-]", lambda match: "-" if match[0] == "/" else "--", text)
+
+
+# ------------------------------------------------------------------------------ numbers for people
+
+
+def rounded(value: float, spread: float | None = None) -> str:
+    """Return a number as text, with two significant digits of its spread.
+
+    ``spread`` is what the number may be off by, in its own units: a standard deviation, or half the
+    width of an interval. The whole part is never cut. Without a spread (none, NaN, zero, or within
+    the rounding errors of floating point) the text has four significant digits.
+
+    >>> rounded(9512.34, 210.0), rounded(0.8712, 0.0342), rounded(-40.0, 8.165)
+    ('9,512', '0.871', '-40.0')
+    >>> rounded(0.8712345), rounded(1234567.8), rounded(0.0, 0.0), rounded(3.2e-7, 1.1e-8)
+    ('0.8712', '1,234,568', '0', '3.20e-07')
+    """
+    if not abs(value) < 1e15:  # beyond the precision of floats, infinite, or NaN
+        return f"{value:.3e}"
+    known = spread is not None and math.isfinite(spread) and spread > 1e-9 * abs(value)
+    digits, scale = (2, spread) if known else (4, abs(value))
+    if not scale:
+        return "0"
+    # "e" rounds first: 0.0996 has the two significant digits of 0.10, not of 0.09
+    decimals = max(0, digits - 1 - int(f"{scale:.{digits - 1}e}".partition("e")[2]))
+    if decimals <= 6:
+        return f"{value:z,.{decimals}f}"
+    if abs(value) < 0.5 * 10.0**-decimals:
+        return "0"
+    exponent = int(f"{value:e}".partition("e")[2])
+    return f"{value:.{max(0, exponent + decimals)}e}"
 
 
 # ------------------------------------------------------------------------------ wrappers and spaces

@@ -7,19 +7,19 @@ command computes from the finished runs where each choice stands.
 import csv
 import fcntl
 import itertools
-import json
 import os
 import sys
 from statistics import fmean
 from typing import NamedTuple
 
 from analysis.errors import fail
+from analysis.folders import CONFIRMATION, SEARCH, flat_choice, read_config
 from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED, read_run
 from analysis.statistics import detectable_shift, holm
 from noisy_wrappers import BASELINE, Configuration
 from sweep import halving
 from sweep.environment import ask_all, remember, remembered, run_seconds, time_left, wall_time
-from sweep.grid import NOISES, RATES, PlannedRun, cell, cells, make_run, of_the_paper, result
+from sweep.grid import PlannedRun, cell, cells, make_run, of_the_paper, result
 
 
 class Choice(NamedTuple):
@@ -89,28 +89,29 @@ def follow(args, algorithm, env_id, environment):
     last_seed = sum(seeds for _, seeds in schedule)
     if last_seed >= FIRST_CONFIRMATION_SEED:
         fail(f"--budget {budget} is too large: the best noises would run with {last_seed} seeds")
-    if not args.noises:
-        check_others(args, algorithm, env_id)
     runs, returns, last_tests = {}, {}, {}
     while True:
         state = halving.advance(noises, budget, args.confirm, returns)
+        phase = SEARCH if len(state.rounds) < len(schedule) else CONFIRMATION
         finished = {}
         for noise, seed in state.due:
-            run = make_run(args, algorithm, env_id, noise, seed)
-            runs[noise, seed] = run
+            run = make_run(args, algorithm, env_id, noise, seed, phase)
+            check_place(run)
             if result(run)[0]:
-                row = read_finished(run)
-                finished[noise, seed] = counted(row, seed)
-                if seed < FIRST_CONFIRMATION_SEED:
+                run, row = with_row(run)
+                if row and phase == CONFIRMATION:
+                    finished[noise, seed] = row["returns"][-1]
+                elif row:
+                    finished[noise, seed] = halving.score(row["steps"], row["returns"])
                     last_tests.setdefault(noise, []).append(row["returns"][-1])
+            runs[noise, seed] = run
         if not finished:
             break
         returns |= finished
     check_frequencies(runs[key] for key in returns)
-    seconds = None
-    if returns:
-        seconds = fmean(wall_time(runs[key]) for key in returns)
-    elif environment:
+    taken = [taken for taken in map(wall_time, map(runs.get, returns)) if taken]
+    seconds = fmean(taken) if taken else None
+    if environment and not taken:
         seconds = run_seconds(next(iter(runs.values())), environment)
     return Choice(
         name=f"{algorithm.upper()} on {env_id}",
@@ -124,24 +125,6 @@ def follow(args, algorithm, env_id, environment):
         spread=halving.spread(last_tests.values()),
         run_seconds=seconds,
     )
-
-
-def check_others(args, algorithm, env_id):
-    """Exit if the folder holds a search among all of the paper's noises.
-
-    They were the default once. With today's list a search would mix with theirs.
-    """
-    ours = cells(args, algorithm, env_id)
-    for noise, rate in itertools.product(NOISES, args.noise_rates or RATES):
-        found = cell([(noise, rate)])
-        if found in ours:
-            continue
-        if result(make_run(args, algorithm, env_id, found, seed=1))[0]:
-            fail(
-                f"{args.runs_dir} holds a choice among other noises, one of them "
-                f"{found}: continue it (--noises paper tries all 90), "
-                "or choose another --runs-dir"
-            )
 
 
 def runs_of(found):
@@ -169,35 +152,34 @@ def candidates(args, algorithm, env_id, unfit=()):
     return noises
 
 
-def read_finished(run):
-    """Return a finished run's row, or exit if its files do not hold what it should."""
+def check_place(run):
+    """Exit if the runs of an earlier version are side by side, not in the folders of the phases."""
+    phase = run.folder.parent
+    if not phase.exists() and (phase.parent / run.folder.name).exists():
+        fail(f"{flat_choice(phase.parent)} (or choose another --runs-dir, if it is another sweep)")
+
+
+def with_row(run):
+    """Return a finished run and its data; or the run with what is damaged in it, and None."""
     row = read_run(run.folder)
-    if row["status"] != "finished":
-        fail(f"{run.folder} cannot be used ({row['reason']}); delete it to run it again")
-    return row
-
-
-def counted(row, seed):
-    """Return what a finished run counts for.
-
-    That is halving.score in the search, and its last test in the confirmation.
-    """
-    if seed >= FIRST_CONFIRMATION_SEED:
-        return row["returns"][-1]
-    return halving.score(row["steps"], row["returns"])
+    if row["status"] == "finished":
+        return run, row
+    damage = f"{run.folder}/{row['reason']}; move its folder away to run it again"
+    return run._replace(damage=damage), None
 
 
 def check_frequencies(runs):
     """Exit if finished runs were not all tested equally often: their scores do not compare."""
     found = {}
     for run in runs:
-        made_with = json.loads((run.folder / "config.json").read_text())["args"]
-        found.setdefault(made_with.get("eval_frequency"), run.folder)
+        made_with = read_config(run.folder)["args"]
+        if "eval_frequency" in made_with:
+            found.setdefault(made_with["eval_frequency"], run.folder)
     if len(found) > 1:
         (every, one), (other, another), *_ = found.items()
         fail(
             f"{one} was tested every {every} steps and {another} every {other}: choose another "
-            f"--runs-dir, or delete the runs of one kind"
+            f"--runs-dir, or move the runs of one kind away"
         )
 
 
@@ -304,6 +286,14 @@ def standing(found, args):
     yield total(found, args)
 
 
+def report(found, path):
+    """Print the verdicts, and write choice.csv; or, where runs are left, what to do about them."""
+    finished = rows(found)
+    if finished:
+        write_choice(path, finished)
+    print(*conclusion(found), sep="\n")
+
+
 def conclusion(found):
     """Yield the verdicts, one line for each choice.
 
@@ -342,7 +332,8 @@ def verdicts(found, judgements):
     """Yield what came out, one line for each choice."""
     for choice, (comparison, p) in zip(found, judgements, strict=True):
         noises = choice.schedule[0][0] if choice.schedule else 1
-        yield halving.verdict(choice.name, noises, comparison, p, len(found))
+        [winner] = choice.state.noises
+        yield halving.sentence(choice.name, winner, noises, comparison, p, len(found))
 
 
 def obstacle(choice):
@@ -360,7 +351,7 @@ def obstacle(choice):
 def write_choice(path, rows):
     """Write choice.csv whole or not at all; it keeps what other commands have chosen."""
     try:
-        with open(path.with_name(".choice.lock"), "w") as lock:
+        with open(path.with_name(".choice.lock"), "w", encoding="utf-8") as lock:
             fcntl.lockf(lock, fcntl.LOCK_EX)  # until it is closed: commands may end side by side
             replace_choice(path, rows)
     except (OSError, KeyError, ValueError) as error:
@@ -371,11 +362,11 @@ def replace_choice(path, rows):
     """Replace the lines of what was chosen now, and keep the others."""
     ours = {(row["algorithm"], row["environment"]) for row in rows}
     if path.exists():
-        with open(path, newline="") as file:
+        with open(path, newline="", encoding="utf-8") as file:
             old = list(csv.DictReader(file))
         rows = [r for r in old if (r["algorithm"], r["environment"]) not in ours] + rows
     temporary = path.with_suffix(".tmp")
-    with open(temporary, "w", newline="") as file:
+    with open(temporary, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, CHOICE_COLUMNS, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)

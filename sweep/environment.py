@@ -20,6 +20,7 @@ import numpy as np
 
 import noisy_wrappers as noisy
 from analysis.errors import fail
+from analysis.folders import read_json
 from sweep.grid import script_of, script_options
 
 # Seconds of learning for each step, without the environment's own, and what each number of an
@@ -202,7 +203,8 @@ def cost(args, done, todo):
     """
     seconds = {}
     for run in done:
-        seconds.setdefault(run.kind, []).append(wall_time(run))
+        if wall_time(run):
+            seconds.setdefault(run.kind, []).append(wall_time(run))
     seconds = {kind: fmean(values) for kind, values in seconds.items()}
     new = {run.kind: run for run in todo if run.kind not in seconds}
     answers = ask_all(args, {env_id: [] for _, env_id in new})
@@ -212,8 +214,9 @@ def cost(args, done, todo):
 
 
 def wall_time(run):
-    """Return how many seconds a finished run has taken."""
-    return json.loads((run.folder / "result.json").read_text())["wall_time_seconds"]
+    """Return how many seconds a finished run has taken, or None where it does not say."""
+    seconds = read_json(run.folder / "result.json").get("wall_time_seconds")
+    return seconds if isinstance(seconds, int | float) and seconds > 0 else None
 
 
 def hours_of(seconds):

@@ -14,6 +14,7 @@ GRID_OPTIONS = ["--algos", "--envs", "--noises", "--noise-rates", "--seeds", "--
 GRID_OPTIONS += ["--runs-dir", "--combine", "--exclude", "--budget", "--confirm"]
 EXECUTOR_OPTIONS = ["--dry-run", "--executor", "--jobs", "--sshlogin", "--remote-dir"]
 EXECUTOR_OPTIONS += ["--slurm-args", "--wait", "--help"]  # benchmark.sh reads these
+MOST_SEEDS = 10_000  # in a range
 
 
 def parse_args(view, caller, argv):
@@ -81,7 +82,7 @@ def from_project(caller, text):
 
     It is relative where it lies in the project, so that it means the same on other machines.
     """
-    path = os.path.normpath(os.path.join(caller, text))
+    path = os.path.normpath(os.path.join(caller, os.path.expanduser(text)))
     if Path(path).is_relative_to(os.getcwd()):
         path = os.path.relpath(path)
     if not re.fullmatch(r"[^-\t\n][^\t\n]*", path):
@@ -108,6 +109,8 @@ def seeds(text):
     if match:
         first, last = match.groups(default=match[1])
         values = range(int(first), int(last) + 1)
+    if values.stop - values.start > MOST_SEEDS:
+        fail(f"--seeds {text} is a range of more than {MOST_SEEDS:,} seeds")
     if not values:
         fail(f"--seeds takes numbers and ranges, separated by spaces: 1 2 3 or 1-3, not {text!r}")
     return values

@@ -8,6 +8,7 @@ fail.
 """
 
 import argparse
+import fcntl
 import fnmatch
 import json
 import os
@@ -85,6 +86,8 @@ def train(argv):
     configuration = (args.env_id, exp_name, args.noise, args.noise_rate, args.seed)
     folder = run_folder(args.runs_dir, *configuration)
     folder.mkdir(parents=True, exist_ok=True)
+    lock = open(folder / ".lock", "w")  # noqa: SIM115
+    fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # as the scripts do
     config = {"algorithm": exp_name[:3].upper(), "versions": {}}
     config["args"] = vars(args) | {"eval_episodes": EPISODES, "exp_name": exp_name}
     (folder / "config.json").write_text(json.dumps(config))
@@ -102,6 +105,7 @@ def train(argv):
     result["final_return_mean"] = fmean(tests[-1])
     (folder / "result.tmp").write_text(json.dumps(result))
     (folder / "result.tmp").rename(folder / "result.json")
+    lock.close()
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """evaluate.py as a user meets it: stored returns, the table, videos, bad input."""
 
 import csv
+import importlib
 import json
 import os
 import re
@@ -22,6 +23,7 @@ import ppo_continuous_noisy as ppo
 import sac_continuous_noisy as sac
 import td3_continuous_noisy as td3
 from evaluate import Args, main
+from noisy_wrappers import Configuration
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = {"SAC": sac, "TD3": td3, "PPO": ppo}
@@ -89,7 +91,7 @@ def run(*options, cwd=None, **environment):
 @pytest.mark.parametrize("algorithm", SCRIPTS)
 def test_clean_returns_are_those_of_the_last_evaluation(runs, algorithm):
     run_dir = one(runs, algorithm)
-    [finished] = evaluate.find_runs([run_dir])
+    [finished], _ = evaluate.find_runs([run_dir])
     played = evaluate.play(finished, [], [], Args((run_dir,), episodes=10, seed=1_000_000))
     with open(run_dir / "eval.csv", newline="") as file:
         last = list(csv.DictReader(file))[-10:]
@@ -200,7 +202,7 @@ def test_another_seed_plays_everything_and_stores_nothing(runs, capsys):
     said, *table = capsys.readouterr().out.splitlines()
     assert said == "--seed 7 is not the default: everything is played, nothing is stored"
     assert files(runs) == before
-    [finished] = evaluate.find_runs([run_dir])
+    [finished], _ = evaluate.find_runs([run_dir])
     means = []
     for rate in (0, 0.5, 1.0):
         played = evaluate.play(finished, [OBSERVATION], [rate], args)
@@ -258,7 +260,7 @@ def test_two_processes_on_one_run_lose_nothing(runs):
 
 
 def test_the_longer_of_two_results_is_kept(runs):
-    [finished] = evaluate.find_runs([one(runs, "PPO")])
+    [finished], _ = evaluate.find_runs([one(runs, "PPO")])
     short, long = [(1.0, 1)], [(1.0, 1), (2.0, 2)]
     for results in (short, long, short):
         evaluate.store(finished, ("", "0.0"), results)
@@ -302,7 +304,8 @@ def test_a_full_disk_leaves_the_previous_file(runs, monkeypatch, capsys):
 
 def test_the_table_of_known_returns(capsys):
     def a_run(noise, rate):
-        return evaluate.FinishedRun(Path(str(len(cells))), "PPO", "E", noise, rate, "{}")
+        config = Configuration.parse(noise, rate)
+        return evaluate.FinishedRun(Path(str(len(cells))), "PPO", "", "E", config, {})
 
     cells = {}
     for noise, rate, clean, noisy in [
@@ -339,11 +342,13 @@ def test_trainings_with_other_settings_are_other_rows_of_the_table(runs, capsys)
     first, second = sorted(runs.glob("*ppo_continuous_noisy*"))
     args = json.loads((second / "config.json").read_text())["args"]
     edit_config(second, args=args | {"total_timesteps": 2560, "gamma": 0.9})
+    result = (second / "result.json").read_text()
+    (second / "result.json").write_text(result.replace('_timesteps": 256,', '_timesteps": 2560,'))
     main(Args((first, second, one(runs, "TD3")), episodes=1))
     table = [re.split(r" {2,}", line) for line in capsys.readouterr().out.splitlines()]
     assert [(row[1], row[4]) for row in table[2:]] == [
-        ("PPO [gamma=0.99, total_timesteps=256]", "1"),
-        ("PPO [gamma=0.9, total_timesteps=2560]", "1"),
+        ("PPO, gamma=0.99, total_timesteps=256", "1"),
+        ("PPO", "1"),
         ("TD3", "1"),
     ]
 
@@ -377,18 +382,12 @@ def test_all_of_a_folder_with_logs_and_an_analysis(runs, capsys):
     assert files(runs) == before
 
 
-def test_the_demo_keeps_its_text_where_all_of_its_folder_can_be_tested():
-    """evaluate.py runs/demo/* refuses a file, but skips logs."""
-    written = re.findall(r"> ?(runs/demo/\S+)", (ROOT / "Makefile").read_text())
-    assert written and all(path.startswith("runs/demo/logs/") for path in written)
-
-
 def test_a_folder_stands_for_its_finished_runs(runs, capsys):
     (one(runs, "SAC") / "result.json").unlink()
     runs = runs.rename(runs.parent / "two__words")  # which is no run's name here
     (runs / "report.html").touch()  # analyze.py --out may be the same folder
     main(Args((runs, one(runs, "TD3")), episodes=1))
-    assert f"{runs}: unfinished runs are left out (1)" in capsys.readouterr().out
+    assert "unfinished runs are left out: 1\n" in capsys.readouterr().out
     assert sum((run_dir / "robustness.csv").exists() for run_dir in runs.glob("*Inv*")) == 3
 
 
@@ -527,24 +526,84 @@ def other_environment(run_dir, env_id="Reacher-v5"):
 
 
 BAD_RUNS = {
-    "is not finished": lambda run_dir: (run_dir / "result.json").unlink(),
-    "is not a policy for Reacher-v5": other_environment,
-    "is not a policy for InvertedPendulum-v5": lambda run_dir: (run_dir / "policy.pt").write_bytes(
-        b"x"
+    "policy.pt is not a policy for Reacher-v5": other_environment,
+    "policy.pt is not a policy for InvertedPendulum-v5": lambda run_dir: (
+        run_dir / "policy.pt"
+    ).write_bytes(b"x"),
+    "config.json: args is None": lambda run_dir: (run_dir / "config.json").write_text("{}"),
+    "config.json: algorithm is 'DQN'": lambda run_dir: edit_config(run_dir, algorithm="DQN"),
+    "delete that file": lambda run_dir: (run_dir / "robustness.csv").write_text("a,b\n1,2\n"),
+    "there is no environment 'Nothing-v0'": lambda run_dir: other_environment(
+        run_dir, "Nothing-v0"
     ),
-    "cannot read": lambda run_dir: (run_dir / "config.json").write_text("{"),
-    "KeyError: 'args'": lambda run_dir: (run_dir / "config.json").write_text("{}"),
-    "cannot import": lambda run_dir: edit_config(run_dir, algorithm="DQN"),
-    "delete it": lambda run_dir: (run_dir / "robustness.csv").write_text("a,b\n1,2\n"),
-    "no environment|exist": lambda run_dir: other_environment(run_dir, "Nothing-v0"),
+    "RuntimeError: not today .*broken.py, line 2": lambda run_dir: other_environment(
+        run_dir, "broken:Mine-v0"
+    ),
 }
 
 
 @pytest.mark.parametrize("message", BAD_RUNS)
-def test_bad_runs(runs, capsys, message):
+def test_a_bad_run_is_named_and_the_others_are_tested(runs, capsys, message, monkeypatch, tmp_path):
+    (tmp_path / "broken.py").write_text("def f():\n    raise RuntimeError('not today')\nf()\n")
+    monkeypatch.chdir(tmp_path)
     run_dir = one(runs, "PPO")
     BAD_RUNS[message](run_dir)
-    refused(Args((one(runs, "TD3"), run_dir)), message, runs, capsys)
+    assert main(Args((one(runs, "TD3"), run_dir), episodes=1)) == 1
+    out, err = capsys.readouterr()
+    assert err.count("\n") == 1 and re.match(f"error: {run_dir}: .*{message}", err), err
+    assert len(stored(one(runs, "TD3"))) == 1 and "TD3" in out and "PPO" not in out
+
+
+def test_one_reason_of_many_runs_is_one_line(runs, capsys):
+    for run_dir in runs.iterdir():
+        other_environment(run_dir, "Nothing-v0")
+    refused(Args((runs,)), "/[^/]* and 3 more: there is no environment", runs, capsys)
+
+
+# A downloaded folder of runs, with its own modules: where they lie in it, and the id in config.json
+FOREIGN = {
+    "beside the runs": ("runs/dl/evil.py", "runs.dl.evil:Mine-v0", "."),
+    "in the run": ("runs/dl/{run}/evil.py", "runs.dl.{run}.evil:Mine-v0", "."),
+    "above the runs": ("runs/evil.py", "runs.evil:Mine-v0", "."),
+    "a package": ("runs/dl/__init__.py", "runs.dl:Mine-v0", "."),
+    "called from there": ("runs/dl/evil.py", "evil:Mine-v0", "runs/dl"),
+    "called from the run": ("runs/dl/{run}/evil.py", "evil:Mine-v0", "runs/dl/{run}"),
+    "through a link": ("runs/dl/evil.py", "link.evil:Mine-v0", "."),
+    "not even a late import": ("runs/dl/my_physics.py", "InvertedPendulum-v5", "runs/dl"),
+}
+
+
+@pytest.mark.parametrize("place", FOREIGN)
+def test_no_module_is_imported_from_a_folder_of_runs(place, trained, tmp_path, monkeypatch, capsys):
+    """As `python evaluate.py runs/dl` would, were it in this process's module path."""
+    file, env_id, cwd = (text.replace("{run}", "run") for text in FOREIGN[place])
+    shutil.copytree(one(trained, "PPO"), tmp_path / "runs/dl/run")
+    (tmp_path / file).write_text("raise SystemExit('imported')")
+    (tmp_path / "link").symlink_to("runs/dl")
+    other_environment(tmp_path / "runs/dl/run", env_id)
+    monkeypatch.chdir(tmp_path / cwd)
+    monkeypatch.setattr(sys, "path", sys.path[:])
+    if place == "not even a late import":
+        main(Args((tmp_path / "runs/dl",), episodes=1))
+        with pytest.raises(ImportError):
+            importlib.import_module("my_physics")
+        return
+    assert main(Args((tmp_path / "runs/dl",), episodes=1)) == 2
+    assert "in a folder of runs; if you trust that module, move it" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("runs_dir", [".", "runs"])
+def test_a_module_of_ones_own_is_imported(runs_dir, trained, tmp_path, monkeypatch):
+    """Also where the runs lie in the folder of the project, which is on the module path."""
+    run_dir = tmp_path / runs_dir / "run"
+    shutil.copytree(one(trained, "PPO"), run_dir)
+    register(tmp_path, f"own_{len(runs_dir)}", "")
+    other_environment(run_dir, f"own_{len(runs_dir)}:Mine-v0")
+    monkeypatch.setattr(evaluate, "__file__", str(tmp_path / "evaluate.py"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", sys.path[:])
+    assert main(Args((run_dir,), episodes=1)) == 0
+    assert len(stored(run_dir)) == 1
 
 
 @pytest.mark.parametrize(
@@ -566,7 +625,7 @@ def test_bad_runs(runs, capsys, message):
         ({"runs": (Path("nowhere"),)}, "nowhere is neither a run nor a folder of runs"),
         ({"runs": (Path(__file__),)}, "is neither a run nor a folder of runs"),
         ({"runs": (ROOT / "docs",)}, "is neither a run nor a folder of runs"),
-        ({"runs": (Path("runs/logs"),)}, "no finished run"),
+        ({"runs": (ROOT / "docs", ROOT / "tests")}, "no finished run"),
     ],
 )
 def test_bad_arguments(runs, capsys, options, message):
@@ -576,10 +635,12 @@ def test_bad_arguments(runs, capsys, options, message):
 def refused(args, message, runs, capsys):
     """One line, exit status 2, nothing written."""
     before = files(runs)
-    with pytest.raises(SystemExit) as exit:
-        main(args)
+    try:
+        code = main(args)
+    except SystemExit as exit:
+        code = exit.code
     out, err = capsys.readouterr()
-    assert (exit.value.code, out) == (2, "")
+    assert (code, out) == (2, "")
     first, *others = err.splitlines()
     assert first.startswith("error: ") and re.search(message, first)
     assert all(line.startswith("  Random") for line in others)  # the list of the wrappers

@@ -14,12 +14,11 @@ import simulate_choose
 import stub_run
 
 from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED
-from analysis.statistics import holm
+from analysis.statistics import Comparison, holm
 from noisy_wrappers import BASELINE, Configuration
 from sweep import choose
 from sweep.environment import Environment, remember
 from sweep.halving import (
-    Comparison,
     advance,
     compare,
     fewest_seeds,
@@ -28,7 +27,7 @@ from sweep.halving import (
     rows,
     schedule,
     score,
-    verdict,
+    sentence,
 )
 from sweep.options import check_arguments, parse_args
 
@@ -178,20 +177,26 @@ def test_the_simulation_confirms_by_the_test():
         comparison = compare(noise, range(CONFIRM), returns)
         verdicts.append(helps(comparison, comparison.p))
     assert 0 < sum(verdicts) < 60
-    assert list(simulate_choose.confirmed(noisy, baseline)) == verdicts
+    found = simulate_choose.confirmed(noisy, baseline, rng)  # with fewer partitions
+    assert np.mean(found != verdicts) <= 0.05
 
 
 @pytest.mark.parametrize("noises", [16, 90])
 def test_the_default_finds_and_confirms_what_docs_say(noises):
     sizes = schedule(noises, 3 * noises)
     found = [simulate_choose.simulate(noises, sizes, 25, gain, trials=4000) for gain in (1, 1.5)]
-    assert [confirmed for _, confirmed, _ in found] == pytest.approx([0.63, 0.89], abs=0.025)
+    assert [confirmed for _, confirmed, _ in found] == pytest.approx([0.63, 0.90], abs=0.025)
 
 
-@pytest.mark.parametrize("draw", [simulate_choose.normal, simulate_choose.two_peaked])
-def test_useless_noises_are_claimed_to_help_in_at_most_three_percent(draw):
-    _, _, claims = simulate_choose.simulate(90, schedule(90, 270), 25, 0, draw, trials=2000)
-    assert 0.01 <= claims <= 0.032
+@pytest.mark.slow
+@pytest.mark.parametrize("draw", ["normal", "high_peak", "failing"])
+@pytest.mark.parametrize("spread", [1, 0.5, 2])
+def test_useless_noises_are_claimed_to_help_in_at_most_four_percent(draw, spread):
+    """Also where they change the spread of the returns."""
+    draw = getattr(simulate_choose, draw)
+    _, _, claims = simulate_choose.simulate(1, [], 25, 0, draw, spread, trials=4000)
+    assert 0.012 <= claims <= 0.042
+    assert abs(draw(np.random.default_rng(0), 10**6).mean()) < 0.005
 
 
 @pytest.mark.parametrize("noises", [1, 4, 10])
@@ -219,45 +224,72 @@ def test_fewest_seeds():
     assert [fewest_seeds(verdicts) for verdicts in (1, 2, 6, 7)] == [4, 5, 5, 6]
 
 
+GOOD = Comparison(
+    environments=1,
+    n=10,
+    n_baseline=10,
+    n_baseline_most=10,
+    difference=11.8,
+    difference_low=8.4,
+    difference_high=15.3,
+    difference_percent=21.0,
+    effect_size=1.2,
+    pooled_std=9.8,
+    t=2.7,
+    p=0.011,
+    smallest_p=2e-5,
+    detectable=12.9,
+    seeds_needed=12,
+)
+
+
 def test_verdicts_in_words():
     noise = Configuration.parse("RandomEarlyTermination(50)", 1.0)
-    good = Comparison(noise, 10, 15.2, 3.9, 26.6, 0.83, 0.011, 20.0)
-    assert verdict("PPO on Pusher-v5", 90, good, 0.011, 1) == (
+    name = "PPO on Pusher-v5"
+    assert sentence(name, noise, 90, GOOD, 0.011, 1) == (
         "PPO on Pusher-v5: RandomEarlyTermination(50) at 1.0 beats no noise: 10 fresh seeds, "
-        "+15 % [4, 27], p = 0.011; a run with it beats one without with probability 0.83."
+        "+11.8 [8.4, 15.3] (+21 %), p = 0.011."
     )
-    assert not helps(good, 0.06)
-    corrected = verdict("PPO on Pusher-v5", 90, good, 0.055, 5)
+    assert not helps(GOOD, 0.06)
+    corrected = sentence(name, noise, 90, GOOD, 0.055, 5)
     assert "none of 90 noises could be shown to help; the best of them, Random" in corrected
     assert "p = 0.011, corrected for 5 verdicts 0.055; " in corrected
-    seen = "; with 10 seeds a difference of 20 % would have been seen (80 % power"
+    seen = "; with 10 seeds a difference of 12.9 would have been seen (80 % power"
     assert corrected.endswith(f"{seen} before the correction).")
-    alone = verdict("PPO on Pusher-v5", 90, good._replace(p=0.07, low=-1.0), 0.07, 1)
-    assert alone.endswith(f"{seen}).")
-    # An interval with zero in it beside a p below 0.05 looks like a mistake
-    odd = " Test and interval disagree: the test decides."
-    assert verdict("", 90, good._replace(low=-1.0), 0.011, 1).endswith(f"0.83.{odd}")
-    assert verdict("", 90, good._replace(p=0.07), 0.07, 1).endswith(f"{seen}).{odd}")
-    falling = good._replace(winner=Configuration.parse(A, "1.0:0.0"))
-    assert "RandomNormalNoisyReward(1.0) at 1.0 to 0.0 beats" in verdict("", 2, falling, 0.011, 1)
-    assert verdict("PPO on X", 1, good._replace(p=0.3), 0.3, 1).startswith(
+    unclear = GOOD._replace(p=0.07, difference_low=-1.0)
+    assert sentence(name, noise, 90, unclear, 0.07, 1).endswith("(80 % power).")
+    # An interval with zero in it beside a p below 0.05 would look like a mistake
+    odd = " Borderline: the interval includes zero."
+    assert sentence("", noise, 90, unclear._replace(p=0.03), 0.03, 1).endswith(f"p = 0.03.{odd}")
+    odd = odd.replace("includes", "excludes")
+    assert sentence("", noise, 90, GOOD._replace(p=0.07), 0.07, 1).endswith(f"power).{odd}")
+    falling = Configuration.parse(A, "1.0:0.0")
+    assert f"{A} at 1.0 to 0.0 beats" in sentence("", falling, 2, GOOD, 0.011, 1)
+    assert sentence("PPO on X", noise, 1, unclear, 0.3, 1).startswith(
         "PPO on X: RandomEarlyTermination(50) at 1.0 could not be shown to help: 10 fresh seeds, "
     )
-    bad = good._replace(probability=0.17, low=-26.6, high=-3.9)
-    assert not helps(bad, bad.p) and "is worse than no noise: 10 fresh" in verdict("", 9, bad, 0, 1)
+    bad = GOOD._replace(t=-2.7, difference=-11.8, difference_low=-15.3, difference_high=-8.4)
+    assert not helps(bad, bad.p)
+    assert "is worse than no noise: 10 fresh seeds, -11.8" in sentence("", noise, 9, bad, 0.01, 1)
 
 
-def test_a_comparison_by_hand():
+@pytest.mark.parametrize(
+    ("baseline", "expected"),
+    [
+        ([8.0, 9.0, 11.0, 12.0], "+3.5 (+35 %), p = 0.057 (smallest possible: 0.029); with 4"),
+        ([0.0, 0.0, 0.0, 0.0], "beats no noise: 4 fresh seeds, +13.50, p = 0.029 (smallest"),
+        ([-1e-6, 0.0, 1e-6, 0.0], "beats no noise: 4 fresh seeds, +13.50, p = 0.029 (smallest"),
+        ([-12.0, -13.0, -14.0, -15.0], "+27.0 (+200 %), p = 0.029"),
+    ],
+)
+def test_a_comparison_by_hand(baseline, expected):
+    """The 12 is in both: with it exchanged, the difference is the same."""
     noise = Configuration.parse("A", 0.1)
     returns = {(noise, 1001 + i): value for i, value in enumerate([12.0, 13.0, 14.0, 15.0])}
-    returns |= {(BASELINE, 1001 + i): value for i, value in enumerate([8.0, 9.0, 11.0, 12.0])}
+    returns |= {(BASELINE, 1001 + i): value for i, value in enumerate(baseline)}
     found = compare(noise, range(1001, 1005), returns)
-    # 15 of 16 pairs and a tie are won. U >= 15.5: of 70 orders, 1 has U = 16, 1 has U = 15.
-    assert found.probability == 15.5 / 16 and found.p == pytest.approx(2 * 2 / 70)
-    assert found.improvement == pytest.approx(35) and found.low < 35 < found.high
-    zero = compare(noise, range(1001, 1005), returns | {(BASELINE, 1001 + i): 0 for i in range(4)})
-    sentence = verdict("PPO on X", 2, zero, zero.p, 1)
-    assert "nan" not in sentence and "4 fresh seeds, p = 0.029; a run" in sentence
+    assert found.difference == pytest.approx(13.5 - np.mean(baseline)) and found.n == 4
+    assert expected in sentence("PPO on X", noise, 2, found, found.p, 1)
 
 
 def test_rows_of_choice_csv():
@@ -325,7 +357,7 @@ def test_two_algorithms_and_environments_at_once(tmp_path):
     # Three noises, one of them in two spellings: rounds of 3 and 2 runs, then 5 fresh seeds
     found = batches(args)
     assert [len(batch) for batch in found] == [4 * 3, 4 * 2, 4 * 10]
-    assert set().union(*found) == {path.name for path in tmp_path.glob("*__*")}
+    assert set().union(*found) == {path.name for path in tmp_path.glob("*/*__*")}
     assert all("_s1_" in name for name in found[0])
     assert all("_s2_" in name for name in found[1])
     sentences = conclude(args, tmp_path)
@@ -384,23 +416,6 @@ def test_the_default_noises_and_those_of_the_paper(tmp_path):
     paper = tried("--noises paper")
     assert len(paper) == 90 and len({noise.noise for noise in paper}) == 15
     assert len(tried("--noises paper --noise-rates 0.2")) == 15
-
-
-def test_a_choice_among_the_papers_noises_is_not_mixed_with_todays(tmp_path, capsys):
-    words = "--algos | ppo | --envs | Pendulum-v1 | --noise-rates | 1"
-    paper = arguments(f"{words} | --noises | paper", tmp_path)
-    [choice] = choose.choices(paper)
-    for run in choice.state.due:
-        stub_run.train([choice.runs[run].script, *choice.runs[run].arguments])
-    with pytest.raises(SystemExit) as error:
-        choose.choices(arguments(words, tmp_path))
-    assert error.value.code == 2
-    message = capsys.readouterr().err
-    assert message.count("\n") == 1 and "holds a choice among other noises" in message
-    assert "--noises paper" in message and "--runs-dir" in message
-    [choice] = choose.choices(paper)
-    assert len(choice.returns) == 15 and len(choice.state.rounds) == 1  # it goes on
-    choose.choices(arguments(words.replace("ppo", "sac"), tmp_path))  # another one
 
 
 def test_an_excluded_noise_is_no_other_choice(tmp_path):
