@@ -1076,16 +1076,13 @@ def parse_noise(text: str) -> Noise:
             wrappers, one on a line. What a module of your own raises passes through.
     """
     if not isinstance(text, str):
-        raise _bad_noise(text, "expected Name(number, ..., keyword=value)")
+        raise _bad_noise(text, _EXPECTED)
     return _read_noise(text)
 
 
 @functools.cache  # the runs of a large sweep have few different noises
 def _read_noise(text: str) -> Noise:
-    try:
-        module, name, args, kwargs = _read_call(text)
-    except (MemoryError, RecursionError, SyntaxError, TypeError, ValueError):
-        raise _bad_noise(text, "expected Name(number, ..., keyword=value)") from None
+    module, name, args, kwargs = _read_call(text)
     wrapper = _import_wrapper(module, name, text) if module else WRAPPERS.get(name)
     if wrapper is None:
         raise _bad_noise(text, "unknown name")
@@ -1108,18 +1105,19 @@ def _read_noise(text: str) -> Noise:
 
 def _read_call(text: str) -> tuple[str, str, list[Any], dict[str, Any]]:
     """Return the module, the name, the positional and the keyword arguments of literals."""
-    module, colon, rest = text.strip().partition(":")
-    if not colon or "(" in module:
-        module, rest = "", text.strip()
-    call = ast.parse(rest, mode="eval").body
-    if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name):
-        raise ValueError("not a call of a name")
-    kwargs = {}
-    for keyword in call.keywords:
-        if keyword.arg is None or keyword.arg in kwargs:
+    try:
+        module, colon, rest = text.strip().partition(":")
+        if not colon or "(" in module:
+            module, rest = "", text.strip()
+        call = ast.parse(rest, mode="eval").body
+        if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name):
+            raise ValueError("not a call of a name")
+        kwargs = {word.arg: ast.literal_eval(word.value) for word in call.keywords}
+        if None in kwargs or len(kwargs) < len(call.keywords):
             raise ValueError("an unpacked or repeated keyword")
-        kwargs[keyword.arg] = ast.literal_eval(keyword.value)
-    return module, call.func.id, [ast.literal_eval(arg) for arg in call.args], kwargs
+        return module, call.func.id, [ast.literal_eval(arg) for arg in call.args], kwargs
+    except (AttributeError, MemoryError, RecursionError, SyntaxError, TypeError, ValueError):
+        raise _bad_noise(text, _EXPECTED) from None
 
 
 def _import_wrapper(module: str, name: str, text: str) -> type[NoiseWrapper]:
@@ -1133,6 +1131,9 @@ def _import_wrapper(module: str, name: str, text: str) -> type[NoiseWrapper]:
     return wrapper
 
 
+_EXPECTED = "expected Name(number, ..., keyword=value)"
+
+
 def _bad_noise(text: str, reason: str, module: str = "") -> ValueError:
     if module:
         return ValueError(f"bad noise {text!r}: {reason}")
@@ -1143,8 +1144,8 @@ def _bad_noise(text: str, reason: str, module: str = "") -> ValueError:
 class Configuration:
     """The noises of a run or of a test, each with its rate; without any it is the baseline.
 
-    It is made once, from what a user writes (:meth:`read`) or from what a program has stored
-    (:meth:`stored`, :meth:`parse`), and then asked: no other code takes such text apart. Equal
+    It is made once, of what a user writes or config.json holds (:meth:`read`) or of two cells of a
+    csv file (:meth:`parse`), and then asked: no other code takes such text apart. Equal
     configurations are equal objects. They are ordered by noise, then by rate, the baseline first.
 
     >>> ending = Configuration.read(["RandomEarlyTermination(50, 50)"], ["1:0"])
@@ -1156,8 +1157,14 @@ class Configuration:
     rates: tuple[tuple[float, float], ...] = ()  # of each, at the start and the end of training
 
     @classmethod
-    def read(cls, noises: Sequence[str], rates: Sequence[float | str]) -> "Configuration":
-        """Check noises and rates and make them canonical, as :func:`canonical_noises` says."""
+    def read(
+        cls, noises: Sequence[str], rates: Sequence[float | str], *, stored: bool = False
+    ) -> "Configuration":
+        """Check noises and rates and make them canonical, as :func:`canonical_noises` says.
+
+        ``stored`` are those of a config.json. They are canonical; one of the user's own is taken as
+        it stands, because its module need not be where its runs are analysed.
+        """
         noises = _listed("noises", noises, '["RandomNormalNoisyReward(0.1)"]')
         rates = _listed("rates", rates, "[0.5]")
         if noises and not rates:
@@ -1172,21 +1179,22 @@ class Configuration:
         schedules = [_schedule(rate) for rate in rates]
         if len(schedules) == 1:
             schedules = schedules * len(noises)
-        parsed = [parse_noise(noise) for noise in noises]
+        parsed = [n if stored and _read_call(n)[0] else parse_noise(n) for n in noises]
         pairs = [pair for pair in zip(parsed, schedules, strict=True) if pair[1] != (0.0, 0.0)]
-        pairs.sort(key=lambda pair: _place(pair[0].wrapper))
+        if not stored:
+            pairs.sort(key=lambda pair: _place(pair[0].wrapper))
         return cls(tuple(str(noise) for noise, _ in pairs), tuple(rate for _, rate in pairs))
 
     @classmethod
-    def stored(cls, noises: Sequence[str], rates: Sequence[float | str]) -> "Configuration":
-        """Return what :attr:`texts` describe, as config.json holds them; names are not checked."""
-        ends = [[float(end) for end in re.split(":| to ", str(rate))] for rate in rates]
-        return cls(tuple(noises), tuple((rate[0], rate[-1]) for rate in ends))
-
-    @classmethod
     def parse(cls, noise: str, noise_rate: float | str) -> "Configuration":
-        """Read two cells of a csv file, :attr:`columns` or :attr:`noise` and :attr:`noise_rate`."""
-        return cls.stored(noise.split(" + "), str(noise_rate).split(" + ")) if noise else cls()
+        """Read two cells of a csv file, :attr:`columns` or :attr:`noise` and :attr:`noise_rate`.
+
+        Nothing is checked.
+        """
+        if not noise:
+            return cls()
+        rates = [re.split(":| to ", rate) for rate in str(noise_rate).split(" + ")]
+        return cls(tuple(noise.split(" + ")), tuple((float(r[0]), float(r[-1])) for r in rates))
 
     @property
     def texts(self) -> tuple[list[str], list[float | str]]:
