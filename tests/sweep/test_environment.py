@@ -1,9 +1,11 @@
 """What a plan asks the environment: who can be trained in it, with which noise, and how fast."""
 
+import contextlib
 import json
 import re
 
 import pytest
+import toy_envs
 from views import view
 
 from noisy_wrappers import BASELINE, Configuration
@@ -52,6 +54,15 @@ def test_an_environment_that_is_too_slow_is_timed_by_fewer_steps(monkeypatch, tm
     assert shown.code == 0 and 1 <= int(line[1]) <= 20
     monkeypatch.setattr(environment, "PATIENCE", -1)  # one that takes half a minute to be made
     assert ask("toy_envs:Slow-v0", [Configuration.read([SCALE], [1.0])]).timed_steps == 1
+
+
+@pytest.mark.parametrize("env", ["Count", "OneReset"])
+def test_an_environment_is_closed(env, monkeypatch):
+    closed = []
+    monkeypatch.setattr(toy_envs.Count, "close", lambda self: closed.append(env))
+    with contextlib.suppress(environment.Refused):
+        ask(f"toy_envs:{env}-v0")
+    assert closed
 
 
 def test_resets_count_in_proportion(monkeypatch):
