@@ -246,10 +246,10 @@ def reach(choice, verdicts):
         return f"{seeds} {gain:.1f} standard deviations over seeds {power}"
     if not choice.spread > 0:
         return ""
-    shift = float(f"{gain * choice.spread:.2g}")
+    shift = gain * choice.spread
     return (
-        f"{choice.name}: {seeds} about {shift:,g} ({gain:.1f} standard deviations of the last "
-        f"tests in the search) {power}"
+        f"{choice.name}: {seeds} about {rounded(shift, shift)} ({gain:.1f} standard deviations of "
+        f"the last tests in the search) {power}"
     )
 
 
