@@ -376,11 +376,12 @@ class ObservationNoise(NoiseWrapper):
         if () in self._boxes:
             return _cast(numbers, self._boxes[()].dtype)
         ends = np.cumsum([math.prod(box.shape) for box in self._boxes.values()])
-        parts = zip(self._boxes.items(), np.split(numbers, ends[:-1]), strict=True)
-        return _replaced(
-            observation,
-            {path: _cast(part.reshape(box.shape), box.dtype) for (path, box), part in parts},
-        )
+        parts = {}
+        for (path, box), part in zip(
+            self._boxes.items(), np.split(numbers, ends[:-1]), strict=True
+        ):
+            parts[path] = _cast(part.reshape(box.shape), box.dtype)
+        return _replaced(observation, parts)
 
     def _widen(self, reach: Callable[[NDArray[Any]], Sequence[Any]]) -> None:
         """Extend the observation space to what ``reach`` says noise makes of its bounds."""
@@ -841,19 +842,15 @@ class RandomEarlyTermination(NoiseWrapper):
 
     def _warn_if_late(self) -> None:
         """Say if no episode lasts long enough to be ended."""
-        limits = [
-            layer._max_episode_steps
-            for layer in _layers(self.env)
-            if isinstance(layer, gym.wrappers.TimeLimit)
-        ]
-        limit = min(limits, default=None)
-        if limit is None or self.low is None or self.low < limit:
-            return
-        effect = "never acts"
-        if self.low == limit and not self.truncate:
-            effect = "only turns truncated into terminated there"
-        text = f"RandomEarlyTermination({self.low}) {effect}: episodes have at most {limit} steps"
-        gym.logger.warn(text, stacklevel=3)
+        timers = [layer for layer in _layers(self.env) if isinstance(layer, gym.wrappers.TimeLimit)]
+        limit = min((timer._max_episode_steps for timer in timers), default=math.inf)
+        if self.low is not None and self.low >= limit:
+            only = self.low == limit and not self.truncate
+            effect = "only turns truncated into terminated there" if only else "never acts"
+            text = (
+                f"RandomEarlyTermination({self.low}) {effect}: episodes have at most {limit} steps"
+            )
+            gym.logger.warn(text, stacklevel=3)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and decide when the episode ends."""
@@ -928,6 +925,7 @@ class RandomDynamics(NoiseWrapper):
         if any(isinstance(layer, RandomDynamics) for layer in _noise_layers(env)):
             raise ValueError("this environment has RandomDynamics already: name all fields in one")
         self._changed: Any = None  # the model that is not as it was, and its values before
+        self._scratch: Any = None  # a model, and data to compute with
         if not isinstance(env, _ProbeEnv):
             model = self._model()
             for field in self.fields:
@@ -989,8 +987,10 @@ class RandomDynamics(NoiseWrapper):
         self._changed = model, nominal, statistics
         for name, values in scaled.items():
             arrays[name][:] = (nominal[name].T * values).T
-        # in data of its own: the environment's are left as they are until its reset
-        mujoco.mj_setConst(model, mujoco.MjData(model))
+        # In data of its own, made once: the environment's are left as they are until its reset.
+        if self._scratch is None or self._scratch[0] is not model:
+            self._scratch = model, mujoco.MjData(model)
+        mujoco.mj_setConst(*self._scratch)
         for name in ("meansize", "extent", "center"):  # of the picture, as the model's file says
             setattr(model.stat, name, statistics[name])
 
@@ -1080,16 +1080,13 @@ def parse_noise(text: str) -> Noise:
             wrappers, one on a line. What a module of your own raises passes through.
     """
     if not isinstance(text, str):
-        raise _bad_noise(text, "expected Name(number, ..., keyword=value)")
+        raise _bad_noise(text, _EXPECTED)
     return _read_noise(text)
 
 
 @functools.cache  # the runs of a large sweep have few different noises
 def _read_noise(text: str) -> Noise:
-    try:
-        module, name, args, kwargs = _read_call(text)
-    except (MemoryError, RecursionError, SyntaxError, TypeError, ValueError):
-        raise _bad_noise(text, "expected Name(number, ..., keyword=value)") from None
+    module, name, args, kwargs = _read_call(text)
     wrapper = _import_wrapper(module, name, text) if module else WRAPPERS.get(name)
     if wrapper is None:
         raise _bad_noise(text, "unknown name")
@@ -1112,18 +1109,19 @@ def _read_noise(text: str) -> Noise:
 
 def _read_call(text: str) -> tuple[str, str, list[Any], dict[str, Any]]:
     """Return the module, the name, the positional and the keyword arguments of literals."""
-    module, colon, rest = text.strip().partition(":")
-    if not colon or "(" in module:
-        module, rest = "", text.strip()
-    call = ast.parse(rest, mode="eval").body
-    if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name):
-        raise ValueError("not a call of a name")
-    kwargs = {}
-    for keyword in call.keywords:
-        if keyword.arg is None or keyword.arg in kwargs:
+    try:
+        module, colon, rest = text.strip().partition(":")
+        if not colon or "(" in module:
+            module, rest = "", text.strip()
+        call = ast.parse(rest, mode="eval").body
+        if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name):
+            raise ValueError("not a call of a name")
+        kwargs = {word.arg: ast.literal_eval(word.value) for word in call.keywords}
+        if None in kwargs or len(kwargs) < len(call.keywords):
             raise ValueError("an unpacked or repeated keyword")
-        kwargs[keyword.arg] = ast.literal_eval(keyword.value)
-    return module, call.func.id, [ast.literal_eval(arg) for arg in call.args], kwargs
+        return module, call.func.id, [ast.literal_eval(arg) for arg in call.args], kwargs
+    except (AttributeError, MemoryError, RecursionError, SyntaxError, TypeError, ValueError):
+        raise _bad_noise(text, _EXPECTED) from None
 
 
 def _import_wrapper(module: str, name: str, text: str) -> type[NoiseWrapper]:
@@ -1137,6 +1135,9 @@ def _import_wrapper(module: str, name: str, text: str) -> type[NoiseWrapper]:
     return wrapper
 
 
+_EXPECTED = "expected Name(number, ..., keyword=value)"
+
+
 def _bad_noise(text: str, reason: str, module: str = "") -> ValueError:
     if module:
         return ValueError(f"bad noise {text!r}: {reason}")
@@ -1147,8 +1148,8 @@ def _bad_noise(text: str, reason: str, module: str = "") -> ValueError:
 class Configuration:
     """The noises of a run or of a test, each with its rate; without any it is the baseline.
 
-    It is made once, from what a user writes (:meth:`read`) or from what a program has stored
-    (:meth:`stored`, :meth:`parse`), and then asked: no other code takes such text apart. Equal
+    It is made once, of what a user writes or config.json holds (:meth:`read`) or of two cells of a
+    csv file (:meth:`parse`), and then asked: no other code takes such text apart. Equal
     configurations are equal objects. They are ordered by noise, then by rate, the baseline first.
 
     >>> ending = Configuration.read(["RandomEarlyTermination(50, 50)"], ["1:0"])
@@ -1160,8 +1161,14 @@ class Configuration:
     rates: tuple[tuple[float, float], ...] = ()  # of each, at the start and the end of training
 
     @classmethod
-    def read(cls, noises: Sequence[str], rates: Sequence[float | str]) -> "Configuration":
-        """Check noises and rates and make them canonical, as :func:`canonical_noises` says."""
+    def read(
+        cls, noises: Sequence[str], rates: Sequence[float | str], *, stored: bool = False
+    ) -> "Configuration":
+        """Check noises and rates and make them canonical, as :func:`canonical_noises` says.
+
+        ``stored`` are those of a config.json. They are canonical; one of the user's own is taken as
+        it stands, because its module need not be where its runs are analysed.
+        """
         noises = _listed("noises", noises, '["RandomNormalNoisyReward(0.1)"]')
         rates = _listed("rates", rates, "[0.5]")
         if noises and not rates:
@@ -1176,21 +1183,22 @@ class Configuration:
         schedules = [_schedule(rate) for rate in rates]
         if len(schedules) == 1:
             schedules = schedules * len(noises)
-        parsed = [parse_noise(noise) for noise in noises]
+        parsed = [n if stored and _read_call(n)[0] else parse_noise(n) for n in noises]
         pairs = [pair for pair in zip(parsed, schedules, strict=True) if pair[1] != (0.0, 0.0)]
-        pairs.sort(key=lambda pair: _place(pair[0].wrapper))
+        if not stored:
+            pairs.sort(key=lambda pair: _place(pair[0].wrapper))
         return cls(tuple(str(noise) for noise, _ in pairs), tuple(rate for _, rate in pairs))
 
     @classmethod
-    def stored(cls, noises: Sequence[str], rates: Sequence[float | str]) -> "Configuration":
-        """Return what :attr:`texts` describe, as config.json holds them; names are not checked."""
-        ends = [[float(end) for end in re.split(":| to ", str(rate))] for rate in rates]
-        return cls(tuple(noises), tuple((rate[0], rate[-1]) for rate in ends))
-
-    @classmethod
     def parse(cls, noise: str, noise_rate: float | str) -> "Configuration":
-        """Read two cells of a csv file, :attr:`columns` or :attr:`noise` and :attr:`noise_rate`."""
-        return cls.stored(noise.split(" + "), str(noise_rate).split(" + ")) if noise else cls()
+        """Read two cells of a csv file, :attr:`columns` or :attr:`noise` and :attr:`noise_rate`.
+
+        Nothing is checked.
+        """
+        if not noise:
+            return cls()
+        rates = [re.split(":| to ", rate) for rate in str(noise_rate).split(" + ")]
+        return cls(tuple(noise.split(" + ")), tuple((float(r[0]), float(r[-1])) for r in rates))
 
     @property
     def texts(self) -> tuple[list[str], list[float | str]]:

@@ -16,7 +16,7 @@ from analysis.errors import fail
 from analysis.folders import CONFIRMATION, SEARCH, flat_choice, read_config
 from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED, read_run
 from analysis.statistics import detectable_shift, holm
-from noisy_wrappers import BASELINE, Configuration
+from noisy_wrappers import BASELINE, Configuration, rounded
 from sweep import halving
 from sweep.environment import ask_all, remember, remembered, run_seconds, time_left, wall_time
 from sweep.grid import PlannedRun, cell, cells, make_run, of_the_paper, result
@@ -282,7 +282,7 @@ def standing(found, args):
             yield f"  mean return after round {len(choice.state.rounds)}:"
             scores = choice.state.rounds[-1].scores
             for noise in sorted(choice.state.noises, key=scores.get, reverse=True):
-                yield f"  {scores[noise]:10.2f}  {noise}"
+                yield f"  {rounded(scores[noise]):>10}  {noise}"
     yield total(found, args)
 
 

@@ -79,6 +79,17 @@ class Other(Count):
         vars(self).update(spaces)
 
 
+class Category(Other):
+    """Observes one of three categories."""
+
+    def reset(self, **kwargs):
+        super().reset(**kwargs)
+        return 1, {}
+
+    def step(self, action):
+        return 1, *super().step(action)[1:]
+
+
 class Buggy(Count):
     """Its author made a mistake, in the constructor, in reset or in step."""
 
@@ -204,6 +215,7 @@ register("NanObservation", Count, 8, break_observation_at=70)
 register("NanLate", Count, 8, break_reward_at=130)
 register("DictObservation", Parts, 8)
 register("OneHotObservation", Parts, 8, categories=True)
+register("CategoryObservation", Category, 8, observation_space=gym.spaces.Discrete(3))
 register("SequenceObservation", Other, 8, observation_space=sequence)
 register("ArrayReward", ArrayReward, 8)
 register("Endless", Endless, None)

@@ -7,6 +7,7 @@ import os
 import pty
 import random
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -262,8 +263,7 @@ def test_evaluate_plays_the_same_again_and_closes(algorithm, tmp_path, log, caps
     assert rows[0] == rows[1]
     assert_closed(log(), number=2 + 2 * 2)
     (run_dir / "policy.pt").write_bytes(b"damaged")
-    with pytest.raises(SystemExit):
-        evaluate.main(evaluate.Args(runs=(run_dir,), episodes=2))
+    assert evaluate.main(evaluate.Args(runs=(run_dir,), episodes=2)) == 2
     assert_closed(log(), number=7)
 
 
@@ -449,3 +449,58 @@ def test_progress_goes_forward(algorithm, tmp_path, capsys):
     for tag in events.Tags()["scalars"]:
         steps = [event.step for event in events.Scalars(tag)]
         assert steps == sorted(set(steps)), tag
+
+
+# THE COMPILER'S CACHE
+
+
+def compiled_run(runs_dir, cache, **environment):
+    """Run a command whose updates are compiled into a cache -> (its output, its policy)."""
+    short = {"total_timesteps": 24, "eval_frequency": 0, "matmul_precision": "highest"}
+    words = flags(arguments("PPO", runs_dir, compile=True, **ALONE | short))
+    # the compiler is to ask what this processor can do, which conftest.py spares other tests
+    environment |= {"TORCHINDUCTOR_CACHE_DIR": str(cache), "TORCHINDUCTOR_VEC_ISA_OK": ""}
+    result = real_command("PPO", *words, **environment)
+    assert (result.code, result.err) == (0, "")
+    [run_dir] = runs_dir.iterdir()
+    return result.out, policy(run_dir)
+
+
+def empty(paths, seconds):
+    """Leave what a compiler leaves that was killed some seconds ago."""
+    assert paths
+    for path in paths:
+        path.write_bytes(b"")
+        os.utime(path, (time.time() - seconds, time.time() - seconds))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("g++"), reason="no C++ compiler")
+def test_what_a_killed_compiler_leaves_changes_nothing(tmp_path):
+    cache = tmp_path / "cache"
+    out, healthy = compiled_run(tmp_path / "healthy", cache)
+    assert "not compiled" not in out
+    kernels = sorted(cache.rglob("*.main.so"))
+    probes = sorted(set(cache.rglob("*.so")) - set(kernels))
+    empty(kernels, seconds=0)  # too young to be removed: a compiler may be at work
+    out, again = compiled_run(tmp_path / "kernel", cache, TMPDIR=str(tmp_path))
+    assert out.count("not compiled, starting again: ") == 1 and "file too short" in out
+    torch.testing.assert_close(again, healthy, rtol=0, atol=0)
+    for name in ("fxgraph", "aotautograd"):  # where finished graphs are remembered
+        shutil.rmtree(cache / name)
+    for kernel in kernels:
+        kernel.unlink()
+    empty(probes, seconds=100)
+    out, again = compiled_run(tmp_path / "probe", cache)
+    assert "not compiled" not in out
+    torch.testing.assert_close(again, healthy, rtol=0, atol=0)
+
+
+@pytest.mark.slow
+def test_without_a_compiler_it_starts_again_and_trains_eagerly(tmp_path):
+    no_compiler = {"CXX": str(tmp_path / "no-compiler"), "TMPDIR": str(tmp_path)}
+    out, eager = compiled_run(tmp_path / "runs", tmp_path / "cache", **no_compiler)
+    assert out.count("not compiled, starting again: No working C++ compiler found") == 2
+    short = {"total_timesteps": 24, "eval_frequency": 0, "matmul_precision": "highest"}
+    plain = policy(run("PPO", tmp_path / "plain", **ALONE | short))
+    torch.testing.assert_close(eager, plain, rtol=0, atol=0)

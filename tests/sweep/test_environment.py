@@ -116,10 +116,12 @@ def test_everything_that_is_wrong_is_said_at_once():
 
 
 def test_noises_that_cannot_act_are_left_out_or_refused(tmp_path):
-    shown = choose("OneHotObservation", "--runs-dir", tmp_path)
+    shown = choose("CategoryObservation", "--runs-dir", tmp_path)
     assert shown.code == 0 and shown.out.count("\n") == 8  # reward and action noise at two rates
     [line] = [line for line in shown.err.splitlines() if "left out" in line]
-    assert line.startswith("toy_envs:OneHotObservation-v0: left out, because they cannot act there")
+    assert line.startswith(
+        "toy_envs:CategoryObservation-v0: left out, because they cannot act there"
+    )
     assert line.count("cannot perturb categories") == 1 and f"{SCALE}, " in line
     assert f"; {LATE} (an episode has at most 8 steps)" in line
     assert " of 8 noises" in shown.err
@@ -210,9 +212,11 @@ def test_any_dry_run_says_what_it_costs_and_finished_runs_tell_better(tmp_path):
     assert view("list", *grid).err == "3 runs, 3 to do\n"
     folder = tmp_path / shown.out.split("\t")[0]
     folder.mkdir()
-    result = {"total_timesteps": 4000, "wall_time_seconds": 1800}
+    result = {"final_return_mean": 1.0, "total_timesteps": 4000, "wall_time_seconds": 1800}
     (folder / "result.json").write_text(json.dumps(result))
-    (folder / "config.json").write_text('{"args": {}}')
+    args = {"env_id": "toy_envs:Slow-v0", "exp_name": "x", "seed": 1, "noise": [], "noise_rate": []}
+    args |= {"eval_episodes": 10, "total_timesteps": 4000}
+    (folder / "config.json").write_text(json.dumps({"algorithm": "PPO", "args": args}))
     assert view("dry-run", *grid).err == (
         "3 runs, 2 to do; about 1.0 core-hours are left, 0.5 hours on the clock with 2 runs at a "
         "time\n"

@@ -126,6 +126,10 @@ def test_a_sweep_and_a_test_from_the_folder_of_the_noise(folder):
     assert len([*folder.glob("runs/*/result.json")]) == 2
     test = ["--noise", TEXT, "--noise-rate", "1", "--episodes", "2"]
     run(sys.executable, ROOT / "evaluate.py", "runs", *test)
+    (folder / "my_noises.py").unlink()
+    run(sys.executable, ROOT / "analyze.py")  # reads runs without their noise
+    tables = (folder / "runs/results/robustness.csv", folder / "runs/results/summary_PPO.csv")
+    assert all(TEXT in table.read_text() for table in tables)
     rows = list(csv.DictReader((noisy.parent / "robustness.csv").open()))
     assert {row["noise"] for row in rows} == {"", TEXT}
     assert np.isfinite([float(row["episodic_return"]) for row in rows]).all()
