@@ -148,10 +148,11 @@ def condition_rows(runs):
 def environment_scores(runs, config):
     """Score a configuration and the baseline in one environment, or return None.
 
-    runs: those of one study and environment. The result is a dict: `x` (seeds) and `y` (baseline seeds) are mean returns over the
-    conditions; in percent of the clean return C of the baseline, NaN where that has no percentages,
-    are `percent` (what a difference of 1 is), `scores`, `cvar_scores` (of the worst tenth of the
-    episodes) and `worst_scores` (under each condition), pairs of x and y, and `clean_change`.
+    runs: those of one study and environment. The result is a dict: `x` (seeds) and `y` (baseline
+    seeds) are mean returns over the conditions; in percent of the clean return C of the baseline,
+    NaN where that has no percentages, are `percent` (what a difference of 1 is), `scores`,
+    `cvar_scores` (of the worst tenth of the episodes) and `worst_scores` (under each condition),
+    pairs of x and y, and `clean_change`.
     """
     x, y = by_run(runs, config, "mean"), by_run(runs, BASELINE, "mean")
     if x.empty or y.empty or CLEAN not in x or CLEAN not in y:

@@ -355,8 +355,9 @@ def test_bad_input(args, message, tmp_path):
     assert not result.out and not list(tmp_path.iterdir())
 
 
-def test_a_list_of_runs_waits_for_no_heavy_import():
+def test_a_list_of_runs_waits_for_no_heavy_import(monkeypatch):
     """status, watch and the dry run of 9,100 commands answer in a moment."""
+    monkeypatch.delenv("MUJOCO_GL", raising=False)  # which is checked by importing MuJoCo
     code = "import sys; from sweep.__main__ import main; main('list', '/', ['demo']); "
     code += "print(*sys.modules)"
     command = [sys.executable, "-c", code]
