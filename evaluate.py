@@ -18,6 +18,7 @@ import csv
 import fcntl
 import importlib
 import itertools
+import math
 import multiprocessing
 import os
 import signal
@@ -55,10 +56,12 @@ from noisy_wrappers import (
     canonical_env_id,
     make_noisy,
     noise_slug,
+    outcome,
     rounded,
     seed_globals,
     seeded_globals,
     split_noises,
+    success_rate,
 )
 
 DISPLAY = "import glfw; assert glfw.init() and glfw.get_primary_monitor()"
@@ -240,13 +243,13 @@ def with_place(error):
 
 
 def play(run, noises, rates, args):
-    """Play episodes; return their true returns and lengths, [(return, length), ...]."""
+    """Play episodes; return what play_episodes does."""
     with load(run) as (env, policy):
         return play_episodes(make_noisy(env, noises, rates), policy, args.episodes, args.seed)
 
 
 def draw(run, noises, rates, args):
-    """Play an episode in a window or into a video: (return, length), or in words why it cannot."""
+    """Play an episode in a window or into a video: its result, or in words why it cannot."""
     try:
         if args.video:
             return record(run, noises, rates, args)
@@ -258,7 +261,7 @@ def draw(run, noises, rates, args):
 
 
 def record(run, noises, rates, args):
-    """Play one episode into a video; return (return, length)."""
+    """Play one episode into a video; return its result."""
     name = f"{run.folder.name}__{noise_slug(noises, rates) or 'clean'}.mp4"
     with tempfile.TemporaryDirectory(dir=args.video, prefix=".") as temporary:
         folder = Path(temporary, "video")  # a new one: RecordVideo warns of one that exists
@@ -275,7 +278,7 @@ def record(run, noises, rates, args):
 
 
 def play_episodes(env, policy, number, seed):
-    """Play episodes; return [(true return, length), ...]."""
+    """Play episodes; return their results, [(true return, length, outcome), ...]."""
     results = []
     for episode in range(number):
         with seeded_globals(seed + episode):
@@ -284,7 +287,7 @@ def play_episodes(env, policy, number, seed):
             while not (terminated or truncated):
                 observation, _, terminated, truncated, info = env.step(policy(observation))
         record = info["episode"]  # the return is a sum of numbers or of arrays
-        results.append((np.asarray(record["r"]).item(), int(record["l"])))
+        results.append((np.asarray(record["r"]).item(), int(record["l"]), outcome(info)))
     return results
 
 
@@ -307,13 +310,14 @@ def play_all(play, tasks, args):
 
 
 def read_stored(run):
-    """Read robustness.csv: {(noise, noise rate): [(return, length), ...]}. Raises UnusableError."""
+    """Read robustness.csv: {(noise, noise rate): results as of play_episodes}. Raises UnusableError."""
     path = run.folder / "robustness.csv"
     stored = {}
     try:
         text = path.read_text("utf-8") if path.exists() else ""
         for row in csv.DictReader(text.splitlines()):
-            result = float(row["episodic_return"]), int(row["episodic_length"])
+            success = float(row.get("success") or math.nan)
+            result = float(row["episodic_return"]), int(row["episodic_length"]), success
             stored.setdefault((row["noise"], row["noise_rate"]), []).append(result)
     except (OSError, ValueError, KeyError, TypeError, OverflowError, csv.Error) as error:
         text = f"robustness.csv: {in_words(error)}; delete that file to play everything again"
@@ -340,9 +344,13 @@ def write_stored(run, stored):
     try:
         with open(temporary, "w", encoding="utf-8") as file:
             writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(ROBUSTNESS_COLUMNS)
+            told = any(success_rate(outcomes(results)) for results in stored.values())
+            columns = [*ROBUSTNESS_COLUMNS, "success"] if told else ROBUSTNESS_COLUMNS
+            writer.writerow(columns)
             for key, results in stored.items():
-                writer.writerows([*key, i, *result] for i, result in enumerate(results))
+                for i, (*result, success) in enumerate(results):
+                    known = "" if math.isnan(success) else int(success)
+                    writer.writerow([*key, i, *result, known][: len(columns)])
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(run.folder / "robustness.csv")
@@ -383,13 +391,25 @@ def print_table(runs, conditions, stored, episodes):
         print(tabulate(rows, headers, disable_numparse=True))
 
 
+def outcomes(results):
+    """Return whether each episode was a success: 1, 0, or NaN where its environment tells none."""
+    return [success for *_, success in results]
+
+
 def mean_return(seeds, key, episodes):
-    """Spell the mean return under a condition, and its standard deviation if there are seeds."""
+    """Spell the mean return under a condition, and its standard deviation if there are seeds.
+
+    The rate of success stands behind it where the environment tells it.
+    """
     means = [np.mean(seed[key][:episodes], axis=0)[0] for seed in seeds]
+    rates = [
+        rate for seed in seeds for rate in success_rate(outcomes(seed[key][:episodes])).values()
+    ]
+    success = f", {100 * np.mean(rates):.0f} % solved" if rates else ""
     if len(means) == 1:
-        return rounded(means[0])
+        return rounded(means[0]) + success
     spread = np.std(means, ddof=1)
-    return f"{rounded(np.mean(means), spread)} ± {rounded(spread, spread)}"
+    return f"{rounded(np.mean(means), spread)} ± {rounded(spread, spread)}{success}"
 
 
 def works(code):
@@ -432,7 +452,7 @@ def show(runs, conditions, args):
         if isinstance(result, str):
             failures.append(f"{name}: {result}")
             continue
-        episodic_return, length = result
+        episodic_return, length, _ = result
         print(f"{name}: return {rounded(episodic_return)}, {length} steps")
     for failure in failures:
         print(f"error: cannot draw {failure}", file=sys.stderr)
