@@ -61,7 +61,6 @@ from noisy_wrappers import (
     seed_globals,
     seeded_globals,
     split_noises,
-    success_rate,
 )
 
 DISPLAY = "import glfw; assert glfw.init() and glfw.get_primary_monitor()"
@@ -278,7 +277,10 @@ def record(run, noises, rates, args):
 
 
 def play_episodes(env, policy, number, seed):
-    """Play episodes; return their results, [(true return, length, outcome), ...]."""
+    """Play episodes; return [(true return, length), ...].
+
+    Where the environment tells success, 1 or 0 follows.
+    """
     results = []
     for episode in range(number):
         with seeded_globals(seed + episode):
@@ -287,7 +289,9 @@ def play_episodes(env, policy, number, seed):
             while not (terminated or truncated):
                 observation, _, terminated, truncated, info = env.step(policy(observation))
         record = info["episode"]  # the return is a sum of numbers or of arrays
-        results.append((np.asarray(record["r"]).item(), int(record["l"]), outcome(info)))
+        success = outcome(info)
+        told = () if math.isnan(success) else (int(success),)
+        results.append((np.asarray(record["r"]).item(), int(record["l"]), *told))
     return results
 
 
@@ -310,14 +314,17 @@ def play_all(play, tasks, args):
 
 
 def read_stored(run):
-    """Read robustness.csv: {(noise, noise rate): results as of play_episodes}. Raises UnusableError."""
+    """Read robustness.csv: {(noise, noise rate): what play_episodes returns}.
+
+    Raises UnusableError.
+    """
     path = run.folder / "robustness.csv"
     stored = {}
     try:
         text = path.read_text("utf-8") if path.exists() else ""
         for row in csv.DictReader(text.splitlines()):
-            success = float(row.get("success") or math.nan)
-            result = float(row["episodic_return"]), int(row["episodic_length"]), success
+            told = (int(row["success"]),) if row.get("success") else ()
+            result = (float(row["episodic_return"]), int(row["episodic_length"]), *told)
             stored.setdefault((row["noise"], row["noise_rate"]), []).append(result)
     except (OSError, ValueError, KeyError, TypeError, OverflowError, csv.Error) as error:
         text = f"robustness.csv: {in_words(error)}; delete that file to play everything again"
@@ -344,13 +351,10 @@ def write_stored(run, stored):
     try:
         with open(temporary, "w", encoding="utf-8") as file:
             writer = csv.writer(file, lineterminator="\n")
-            told = any(success_rate(outcomes(results)) for results in stored.values())
-            columns = [*ROBUSTNESS_COLUMNS, "success"] if told else ROBUSTNESS_COLUMNS
-            writer.writerow(columns)
+            told = any(len(result) > 2 for results in stored.values() for result in results)
+            writer.writerow([*ROBUSTNESS_COLUMNS, "success"] if told else ROBUSTNESS_COLUMNS)
             for key, results in stored.items():
-                for i, (*result, success) in enumerate(results):
-                    known = "" if math.isnan(success) else int(success)
-                    writer.writerow([*key, i, *result, known][: len(columns)])
+                writer.writerows([*key, i, *result] for i, result in enumerate(results))
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(run.folder / "robustness.csv")
@@ -391,25 +395,21 @@ def print_table(runs, conditions, stored, episodes):
         print(tabulate(rows, headers, disable_numparse=True))
 
 
-def outcomes(results):
-    """Return whether each episode was a success: 1, 0, or NaN where its environment tells none."""
-    return [success for *_, success in results]
-
-
 def mean_return(seeds, key, episodes):
     """Spell the mean return under a condition, and its standard deviation if there are seeds.
 
-    The rate of success stands behind it where the environment tells it.
+    Behind it is the rate of success, where the environment tells it.
     """
-    means = [np.mean(seed[key][:episodes], axis=0)[0] for seed in seeds]
-    rates = [
-        rate for seed in seeds for rate in success_rate(outcomes(seed[key][:episodes])).values()
-    ]
-    success = f", {100 * np.mean(rates):.0f} % solved" if rates else ""
+    played = [seed[key][:episodes] for seed in seeds]
+    means = [np.mean([result[0] for result in results]) for results in played]
+    solved = ""
+    if any(len(result) > 2 for results in played for result in results):
+        rates = [np.mean([result[2:] == (1,) for result in results]) for results in played]
+        solved = f", {100 * np.mean(rates):.0f} % solved"
     if len(means) == 1:
-        return rounded(means[0]) + success
+        return rounded(means[0]) + solved
     spread = np.std(means, ddof=1)
-    return f"{rounded(np.mean(means), spread)} ± {rounded(spread, spread)}{success}"
+    return f"{rounded(np.mean(means), spread)} ± {rounded(spread, spread)}{solved}"
 
 
 def works(code):
@@ -452,7 +452,7 @@ def show(runs, conditions, args):
         if isinstance(result, str):
             failures.append(f"{name}: {result}")
             continue
-        episodic_return, length, _ = result
+        episodic_return, length, *_ = result
         print(f"{name}: return {rounded(episodic_return)}, {length} steps")
     for failure in failures:
         print(f"error: cannot draw {failure}", file=sys.stderr)
