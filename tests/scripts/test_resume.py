@@ -834,6 +834,24 @@ def test_a_finished_run_says_so_and_changes_nothing(algorithm, alone, tmp_path):
     assert files(path) == before
 
 
+@one_script
+def test_success_survives_an_interruption(algorithm, tmp_path):
+    small = {"env_id": "toy_envs:IsSuccess-v0", "noise": NOISE[3:4], "rates": RATES[3:4]}
+    found = []
+    for name, stops in (("whole", []), ("stopped", [LATE])):
+        words = options(algorithm, tmp_path / name, **small)
+        for episodes in stops:
+            assert not train(algorithm, words, episodes)
+        assert train(algorithm, words)
+        [path] = (tmp_path / name).iterdir()
+        events = EventAccumulator(str(path)).Reload()
+        curves = [events.Scalars(tag) for tag in ("charts/success_rate", "eval/success_rate")]
+        curves = [[(event.step, event.value) for event in curve] for curve in curves]
+        found.append((curves, (path / "eval.csv").read_text()))
+    assert found[0] == found[1]
+    assert len(found[0][0][0]) > LATE
+
+
 @pytest.mark.slow
 @one_script
 def test_another_precision_is_said_and_recorded(algorithm, tmp_path, monkeypatch, capsys):
