@@ -50,7 +50,7 @@ EVAL_FREQUENCY = 10_000  # default of --eval-frequency; at most a tenth of the r
 class Args:
     """Command-line arguments; the algorithm's are those of CleanRL and the paper (Appendix A.2)."""
 
-    env_id: str = "HalfCheetah-v5"  # Gymnasium environment: Name-v0, or module:Name-v0
+    env_id: str = "HalfCheetah-v5"  # RUN: Gymnasium environment, Name-v0, or module:Name-v0
     seed: int = 1  # seed of everything that is random
     total_timesteps: int = 1_000_000  # environment steps to train for
     max_episode_steps: int | None = None  # time limit of an episode; None: the environment's own
@@ -58,19 +58,19 @@ class Args:
     runs_dir: str = "runs"  # folder in which the run's own folder is made
     overwrite: bool = False  # delete the files in the run's folder and start again
     checkpoint_frequency: int = 50_000  # environment steps between two checkpoints
-    noise: tuple[str, ...] = ()  # noises of the training environment; the baseline has none
+    noise: tuple[str, ...] = ()  # NOISE: noises of the training environment; the baseline has none
     noise_rate: tuple[float | str, ...] = ()  # probability of each noise; 1.0:0.0 falls linearly
+    eval_episodes: int = 10  # TESTS: episodes in each test
     eval_frequency: int | None = None  # steps between tests; None: up to 10,000; 0: only at the end
-    eval_episodes: int = 10  # episodes in each test
 
-    cuda: bool = False  # train on a GPU (not tested on one yet); these networks are small
+    cuda: bool = False  # SPEED: train on a GPU (not tested on one yet); these networks are small
     torch_threads: int = 1  # CPU threads; runs in parallel gain more than extra threads
     compile: bool = True  # compile the updates; needs a C++ compiler
     # precision of float32 products, raised to highest where another would cost accuracy; with bf16
     # the updates are computed in bfloat16, even if this costs accuracy
     matmul_precision: Literal["highest", "medium", "bf16"] = "medium"
 
-    buffer_size: int = 1_000_000  # transitions in the replay buffer
+    buffer_size: int = 1_000_000  # ALGORITHM: transitions in the replay buffer
     gamma: float = 0.99  # discount factor
     tau: float = 0.005  # target smoothing coefficient
     batch_size: int = 256  # transitions in a minibatch

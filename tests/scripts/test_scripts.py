@@ -902,6 +902,8 @@ def test_help_has_examples_and_noises(algorithm):
     assert "module:Name-v0" in text
     for signature in signatures():
         assert f"  {signature}\n" in text
+    groups = ["RUN", "NOISE", "TESTS", "SPEED", "ALGORITHM"]  # each begins with its name
+    assert re.findall(r"\b([A-Z]+): ", text.partition(" options ")[2]) == groups
 
 
 @pytest.mark.slow
