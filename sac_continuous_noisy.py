@@ -556,8 +556,7 @@ class Run:
             self.checkpoint.unlink(missing_ok=True)
             self._say_finished()
         else:
-            noises = zip(args.noise, args.noise_rate, strict=True)
-            noises = " + ".join(f"{noise} at {rate}" for noise, rate in noises)
+            noises = " + ".join(map("{} at {}".format, args.noise, args.noise_rate))
             begun = f"{algorithm} on {args.env_id} | noise: {noises or 'none (baseline)'}"
             begun += f" | seed {args.seed} | {args.total_timesteps:,} steps"
             say(f"{begun} | {'cuda' if args.cuda else 'cpu'} | {self.folder}")
@@ -573,9 +572,7 @@ class Run:
             old = {name: config["args"].get(name) for name in asdict(self.args)}
         if self.args.eval_frequency is None:
             self.args.eval_frequency = old["eval_frequency"]
-        new = asdict(self.args)
-        for name in noisy.MAY_DIFFER_IN_A_RUN:
-            del new[name]
+        new = {k: v for k, v in asdict(self.args).items() if k not in noisy.MAY_DIFFER_IN_A_RUN}
         differ = [f"{name} {old[name]}, not {new[name]}" for name in new if old[name] != new[name]]
         if differ:
             advice = "choose another --exp-name or --runs-dir; --overwrite deletes that run"
@@ -623,6 +620,8 @@ class Run:
         checkpoint = torch.load(self.checkpoint, weights_only=True)
         if checkpoint["format"] != 5:
             raise ValueError("another version wrote it: finish the run with that version")
+        if checkpoint["run"] != self.folder.name:
+            raise ValueError(f"it belongs to {checkpoint['run']}")
         for part, state in zip(self.state, checkpoint["state"], strict=True):
             part.load_state_dict(state)
         torch.set_rng_state(checkpoint["torch"])
@@ -637,6 +636,7 @@ class Run:
             self.writer.flush()  # to be no older than the checkpoint
         checkpoint = {
             "format": 5,
+            "run": self.folder.name,
             "step": step,
             "state": [part.state_dict() for part in self.state],
             "torch": torch.get_rng_state(),
@@ -724,9 +724,9 @@ class Run:
 
     def _say_finished(self):
         mean, std = self.result["final_return_mean"], self.result["final_return_std"]
+        text = f"{self.folder} is finished: mean test return {noisy.rounded(mean, std)}"
         rate = self.result.get("final_success_rate")
-        success = "" if rate is None else f", success rate {rate:.2f}"
-        say(f"{self.folder} is finished: mean test return {noisy.rounded(mean, std)}{success}")
+        say(text if rate is None else f"{text}, success rate {rate:.2f}")
         say(f"See its curves with: tensorboard --logdir {self.args.runs_dir}")
 
     def _reading(self, path):

@@ -34,6 +34,7 @@ from analysis.verdicts import UNLEARNED, counted, difference, listed, seeds_of, 
 from noisy_wrappers import BASELINE, rounded
 
 PERCENTS = ("difference_percent", "iqm_change_percent", "iqm_change_low", "iqm_change_high")
+INTERVAL = ("difference_low", "difference_high")
 SEEDS_FOR_INTERACTION = 3  # of each of the four configurations
 # After those that name a study
 _COLUMNS = {
@@ -202,10 +203,10 @@ def statistics_rows(study):
         if config != BASELINE and both.any():
             clear = not any(low <= 0 <= high for low, high in limits[:, chosen][:, both].T)
             row |= against_baseline(x[:, both], y[:, both], clear)
-            if study.metric == SUCCESS:
-                row |= dict.fromkeys(PERCENTS, np.nan)  # never percent of a rate
+            if study.metric == SUCCESS:  # never percent of a rate
+                row |= dict.fromkeys(PERCENTS, np.nan)
             if environment in unlearned:
-                row |= dict.fromkeys(("p", "t", "difference_low", "difference_high"), np.nan)
+                row |= dict.fromkeys([*PERCENTS, *INTERVAL, "t", "p"], np.nan)
                 row["verdict"] = UNLEARNED
         yield row
 

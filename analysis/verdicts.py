@@ -70,8 +70,11 @@ def spread_of(row):
     return row.pooled_std if pd.isna(half) else half
 
 
-def difference(row):
-    """Spell what a comparison found: "+11.8 [8.4, 15.3] (+21 %)", of several environments in sd."""
+def difference(row, unit=""):
+    """Spell what a comparison found: "+11.8 [8.4, 15.3] (+21 %)", of several environments in sd.
+
+    unit: of the difference, such as POINTS.
+    """
     if pd.isna(row.difference):
         text = f"{row.effect_size:+z.2f} standard deviations on average"
         if pd.isna(row.effect_size):
@@ -83,6 +86,7 @@ def difference(row):
         if pd.notna(row.difference_low):
             ends = row.difference_low, row.difference_high
             text += f" [{', '.join(rounded(end, spread) for end in ends)}]"
+        text += unit
     if pd.notna(row.difference_percent):
         text += f" ({percent(row.difference_percent)})"
     return text
@@ -124,8 +128,8 @@ def sentence(row, unit=""):
     if row["verdict"] == UNLEARNED:
         return f"{start} cannot be judged: all runs have the same results, nothing was learned."
     if row["verdict"] == TOO_FEW:
-        return f"{start} has too few seeds for a test: {difference(row)}{unit}."
-    evidence = f"{difference(row)}{unit}, p {p_value(row['p'])}{smallest(row)}"
+        return f"{start} has too few seeds for a test: {difference(row, unit)}."
+    evidence = f"{difference(row, unit)}, p {p_value(row['p'])}{smallest(row)}"
     if row["verdict"] == UNCLEAR:
         return f"{start} shows {UNCLEAR}: {evidence}{power(row)}.{borderline(row)}"
     alone = ", the only comparison" if row["comparisons"] == 1 else ""
@@ -211,7 +215,9 @@ def headlines(statistics, best):
             tried = f"{counted(len(rows), 'comparison')} ({tried})"
         counts = [(word, (rows["verdict"] == word).sum()) for word in VERDICTS]
         counts = [(word, n) for word, n in counts if n or word in CLEAR]
-        luck = luck_sentence(best[rows_of(best, key)])
+        luck = ""
+        if (rows["verdict"] != UNLEARNED).any():
+            luck = luck_sentence(best[rows_of(best, key)])
         lines.append({"name": study_name(*key), "tried": tried, "counts": counts, "luck": luck})
     return lines
 

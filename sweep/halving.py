@@ -158,7 +158,7 @@ def sentence(name, winner, noises, comparison, p_corrected, verdicts, unit=""):
     verdicts p is corrected. unit: of the difference.
     """
     start = f"{name}:"
-    evidence = f"{comparison.n} fresh seeds, {difference(comparison)}{unit}"
+    evidence = f"{comparison.n} fresh seeds, {difference(comparison, unit)}"
     evidence += f", p {p_value(comparison.p)}"
     evidence += smallest(comparison) + corrected(p_corrected, verdicts, "verdict")
     end = f".{borderline(comparison)}"
