@@ -469,7 +469,7 @@ INERT |= {"outcomes"}  # Hopper tells no success: test_success_survives_an_inter
 INERT |= {"RandomEarlyTermination_2.gate", "RandomEarlyTermination_2.noise"}  # always the same
 
 
-FIELDS_OF_THE_RUN = "format run step torch eval_csv outcomes events seconds".split()
+FIELDS_OF_THE_RUN = ["format", "run", "step", "torch", "eval_csv", "outcomes", "events", "seconds"]
 
 
 def paths(algorithm):
