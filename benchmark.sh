@@ -40,8 +40,8 @@ Grid options replace a preset's values
              runs/demo)
 
 Options of choose
-  --noises paper           the paper's 15 noises at 6 rates: 318 runs. The default is 8 noises at
-                           rates 0.05 and 1.0, in 96 runs (docs/sweeps.md lists them). Both confirm
+  --noises paper           the paper's 15 noises at 6 rates: 318 runs. The default is 10 noises at
+                           rates 0.05 and 1.0, in 105 runs (docs/sweeps.md lists them). Both confirm
                            a true gain of 1.5 standard deviations in 9 of 10 cases
   --exclude "NOISE@RATE"   noises to leave out, for example because they always fail
   --budget N               about how many runs the search may take (default: 3 for each noise)

@@ -757,9 +757,7 @@ class RandomActionDelay(NoiseWrapper):
         unlike = None if self.high == self.low else self.high
         super().__init__(env, noise_rate, low=self.low, high=unlike)
         self._delay = 0
-        self._actions: deque[Any] = (
-            deque()
-        )  # those that have not taken effect, and the last that did
+        self._actions: deque[Any] = deque()  # the one that acts now, and those that wait
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and decide by how much the episode's actions are delayed."""
@@ -847,10 +845,8 @@ class RandomEarlyTermination(NoiseWrapper):
         if self.low is not None and self.low >= limit:
             only = self.low == limit and not self.truncate
             effect = "only turns truncated into terminated there" if only else "never acts"
-            text = (
-                f"RandomEarlyTermination({self.low}) {effect}: episodes have at most {limit} steps"
-            )
-            gym.logger.warn(text, stacklevel=3)
+            most = f"episodes have at most {limit} steps"
+            gym.logger.warn(f"RandomEarlyTermination({self.low}) {effect}: {most}", stacklevel=3)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and decide when the episode ends."""
@@ -875,7 +871,7 @@ class RandomEarlyTermination(NoiseWrapper):
 
 # Fields of MuJoCo's model that are usually randomized.
 _USUAL_FIELDS = ("body_mass", "body_inertia", "geom_friction", "jnt_stiffness", "dof_armature")
-_USUAL_FIELDS += ("dof_damping", "dof_frictionloss", "actuator_gear", "actuator_gainprm")
+_USUAL_FIELDS += ("dof_damping", "dof_frictionloss", "actuator_gear")
 # What mj_setConst computes from others (engine_setconst.c), in the model and in model.stat.
 _DERIVED_FIELDS = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "dof_length")
 _DERIVED_FIELDS += ("actuator_acc0", "actuator_length0", "actuator_biasprm", "tendon_invweight0")
@@ -1758,12 +1754,10 @@ def _is_field(name: Any) -> bool:
     except ImportError:  # then there is no environment to apply it to, either
         return False
     rows = ("body_", "geom_", "jnt_", "dof_", "actuator_", "tendon_")
-    return (
-        isinstance(name, str)
-        and name.startswith(rows)
-        and name not in _DERIVED_FIELDS
-        and hasattr(mujoco.MjModel, name)
-    )
+    if not isinstance(name, str) or not name.startswith(rows) or name in _DERIVED_FIELDS:
+        return False
+    array = getattr(mujoco.MjModel.from_xml_string("<mujoco/>"), name, None)
+    return isinstance(array, np.ndarray) and array.dtype == np.float64
 
 
 def _schedule(noise_rate: float | str) -> tuple[float, float]:

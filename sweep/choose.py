@@ -270,10 +270,10 @@ def reach(choice, verdicts):
         return f"{seeds} {gain:.1f} standard deviations over seeds {power}"
     if not choice.spread > 0:
         return ""
-    shift = float(f"{gain * choice.spread:.2g}")
+    shift = gain * choice.spread
     return (
-        f"{choice.name}: {seeds} about {shift:,g}{unit(choice)} ({gain:.1f} standard deviations of "
-        f"the last tests in the search) {power}"
+        f"{choice.name}: {seeds} about {rounded(shift, shift)}{unit(choice)} ({gain:.1f} standard "
+        f"deviations of the last tests in the search) {power}"
     )
 
 

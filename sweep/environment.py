@@ -5,12 +5,14 @@ takes until finished runs tell. `remember` keeps the answer, because `status` ma
 """
 
 import contextlib
+import functools
 import json
 import math
 import re
 import sys
 import time
 import traceback
+import warnings
 from pathlib import Path
 from statistics import fmean
 from typing import NamedTuple
@@ -21,7 +23,7 @@ import numpy as np
 import noisy_wrappers as noisy
 from analysis.errors import fail
 from analysis.folders import read_json
-from sweep.grid import script_of, script_options
+from sweep.grid import PROJECT, script_of, script_options
 
 # Seconds of learning for each step, without the environment's own, and what each number of an
 # observation adds to them: docs/sweeps.md says on which machine
@@ -29,7 +31,6 @@ LEARNING = {"sac": (6.8e-3, 22e-6), "td3": (5.1e-3, 13e-6), "ppo": (0.103e-3, 0.
 START_UP = 10  # seconds, with compilation
 STEPS, SECONDS = 200, 1  # an environment is timed for at least so many steps, and so long
 PATIENCE = 30  # seconds until it is timed by fewer steps
-TIME_LIMIT = 10_000  # steps of an episode where the environment declares no limit
 
 
 class Environment(NamedTuple):
@@ -53,29 +54,26 @@ class Refused(Exception):
 def ask(env_id, configurations=(), max_episode_steps=None, clock=time.perf_counter):
     """Make an environment as the scripts do, time it, and try configurations of noise on it.
 
-    clock: what times the environment. Raises Refused if it
-    cannot be made or played.
+    clock: what times the environment. Raises Refused if it cannot be made or played.
     """
     deadline = time.perf_counter() + PATIENCE
     try:
-        env = gym.make(env_id, disable_env_checker=True, max_episode_steps=max_episode_steps)
-        with contextlib.closing(env), contextlib.redirect_stdout(sys.stderr):
-            env = noisy.make_flat(env)
+        with contextlib.redirect_stdout(sys.stderr), contextlib.ExitStack() as stack:
+            env = gym.make(env_id, disable_env_checker=True, max_episode_steps=max_episode_steps)
+            stack.callback(env.close)
             declared = env.spec.max_episode_steps
-            seconds, steps, length = time_steps(env, declared or TIME_LIMIT, deadline, clock)
+            env = noisy.make_flat(env, constant("sac_continuous_noisy.py", "STEP_LIMIT"))
+            limit = env.spec.max_episode_steps
+            seconds, steps, length = time_steps(env, limit, deadline, clock)
             env.reset()  # a failure after this one is the noise's
-            unfit = {}
-            for configuration in configurations:
-                reason = why_unfit(env, configuration, declared or TIME_LIMIT, deadline)
-                if reason:
-                    unfit[configuration.noise] = reason
+            reasons = {noise: why_unfit(env, noise, limit, deadline) for noise in configurations}
             return Environment(
                 step_seconds=seconds,
                 timed_steps=steps,
                 episode_steps=declared or length,
                 observed=math.prod(env.observation_space.shape),
                 bounded=bool(np.isfinite([env.action_space.low, env.action_space.high]).all()),
-                unfit=unfit,
+                unfit={noise.noise: reason for noise, reason in reasons.items() if reason},
             )
     except Exception as error:
         raise Refused(in_a_line(error, env_id)) from error
@@ -114,7 +112,8 @@ def time_steps(env, time_limit, deadline, clock):
 def why_unfit(env, configuration, time_limit, deadline):
     """Return why noises cannot act in an environment, or ""; after the deadline none is played."""
     try:
-        noisy_env = configuration.wrap(env)
+        with warnings.catch_warnings(action="ignore"):  # of what is said below
+            noisy_env = configuration.wrap(env)
     except ValueError as error:
         return " ".join(str(error).split())
     for wrapper in noisy.noise_wrappers(noisy_env).values():
@@ -190,10 +189,16 @@ def number_of_tests(run):
     """Return how often a run tests its policy."""
     frequency = run.options["eval-frequency"]
     if frequency is None:
-        text = Path(__file__).parents[1].joinpath(run.script).read_text()
-        most = int(re.search(r"^EVAL_FREQUENCY = ([\d_]+)", text, re.MULTILINE)[1])
+        most = constant(run.script, "EVAL_FREQUENCY")
         frequency = max(1, min(most, run.total_timesteps // 10))
     return math.ceil(run.total_timesteps / frequency) if frequency else 1
+
+
+@functools.cache
+def constant(script, name):
+    """Return a whole number that a script defines, from its text: importing it takes seconds."""
+    text = (PROJECT / script).read_text()
+    return int(re.search(rf"^{name} = ([\d_]+)", text, re.MULTILINE)[1])
 
 
 def cost(args, done, todo):

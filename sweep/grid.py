@@ -50,6 +50,8 @@ CHOOSE_NOISES = [
     "RandomUniformScaleReward(0.5, 1.5)",
     "RandomEarlyTermination(50)",
     "RandomNormalNoisyAction(0.1)",
+    "RandomActionDelay(0, 2)",
+    "RandomDynamics(0.7, 1.3)",
 ]
 CHOOSE_RATES = [0.05, 1.0]
 # The paper shows bars for several beta and names none of them: these are ours.

@@ -181,7 +181,7 @@ def test_the_simulation_confirms_by_the_test():
     assert np.mean(found != verdicts) <= 0.05
 
 
-@pytest.mark.parametrize("noises", [16, 90])
+@pytest.mark.parametrize("noises", [20, 90])
 def test_the_default_finds_and_confirms_what_docs_say(noises):
     sizes = schedule(noises, 3 * noises)
     found = [simulate_choose.simulate(noises, sizes, 25, gain, trials=4000) for gain in (1, 1.5)]
@@ -459,8 +459,8 @@ def test_the_default_noises_and_those_of_the_paper(tmp_path):
         [choice] = choose.choices(args)
         return choice.state.noises
 
-    assert len(tried()) == 16 and {noise.noise_rate for noise in tried()} == {"0.05", "1.00"}
-    assert len({noise.noise for noise in tried()}) == 8
+    assert len(tried()) == 20 and {noise.noise_rate for noise in tried()} == {"0.05", "1.00"}
+    assert len({noise.noise for noise in tried()}) == 10
     assert not any(noise.noise == "RandomNormalNoisyObservation(1.0)" for noise in tried())
     assert [str(noise) for noise in tried("--noise-rates 0.2")] == [
         f"{noise.noise} at 0.2" for noise in tried()[::2]
@@ -477,7 +477,7 @@ def test_an_excluded_noise_is_no_other_choice(tmp_path):
         stub_run.train([choice.runs[run].script, *choice.runs[run].arguments])
     excluded = f"{words} | --exclude | RandomEarlyTermination(50)@1"
     [choice] = choose.choices(arguments(excluded, tmp_path))
-    assert len(choice.returns) == 15
+    assert len(choice.returns) == 19
 
 
 def test_what_the_confirmation_can_show(tmp_path):

@@ -1,9 +1,11 @@
 """What a plan asks the environment: who can be trained in it, with which noise, and how fast."""
 
+import contextlib
 import json
 import re
 
 import pytest
+import toy_envs
 from views import view
 
 from noisy_wrappers import BASELINE, Configuration
@@ -54,6 +56,15 @@ def test_an_environment_that_is_too_slow_is_timed_by_fewer_steps(monkeypatch, tm
     assert ask("toy_envs:Slow-v0", [Configuration.read([SCALE], [1.0])]).timed_steps == 1
 
 
+@pytest.mark.parametrize("env", ["Count", "OneReset"])
+def test_an_environment_is_closed(env, monkeypatch):
+    closed = []
+    monkeypatch.setattr(toy_envs.Count, "close", lambda self: closed.append(env))
+    with contextlib.suppress(environment.Refused):
+        ask(f"toy_envs:{env}-v0")
+    assert closed
+
+
 def test_resets_count_in_proportion(monkeypatch):
     class Clock:
         """An environment and its action space, and the time that they take."""
@@ -79,7 +90,7 @@ def test_resets_count_in_proportion(monkeypatch):
 
 def test_without_a_time_limit_a_test_is_as_long_as_an_episode():
     assert ask("toy_envs:NoLimit-v0").episode_steps == 20
-    assert ask("toy_envs:Endless-v0").episode_steps == environment.TIME_LIMIT
+    assert ask("toy_envs:Endless-v0").episode_steps == 10_000
 
 
 @pytest.mark.parametrize(
@@ -117,14 +128,15 @@ def test_everything_that_is_wrong_is_said_at_once():
 
 def test_noises_that_cannot_act_are_left_out_or_refused(tmp_path):
     shown = choose("CategoryObservation", "--runs-dir", tmp_path)
-    assert shown.code == 0 and shown.out.count("\n") == 8  # reward and action noise at two rates
+    assert shown.code == 0 and shown.out.count("\n") == 10  # rewards, actions, delays at two rates
     [line] = [line for line in shown.err.splitlines() if "left out" in line]
     assert line.startswith(
         "toy_envs:CategoryObservation-v0: left out, because they cannot act there"
     )
     assert line.count("cannot perturb categories") == 1 and f"{SCALE}, " in line
     assert f"; {LATE} (an episode has at most 8 steps)" in line
-    assert " of 8 noises" in shown.err
+    assert re.search(r"; RandomDynamics\(0\.7, 1\.3\) \([^()]*MuJoCo", line)
+    assert " of 10 noises" in shown.err
     named = ["--noises", LATE, "RandomNormalNoisyReward(1.0)", "--noise-rates", "1"]
     shown = choose("Tiny", *named, "--runs-dir", tmp_path)
     assert (shown.code, shown.out) == (2, "")
@@ -186,14 +198,15 @@ def test_runs_at_a_time(executor, jobs, hosts, expected, monkeypatch):
 
 def test_a_plan_says_what_it_will_decide(tmp_path):
     shown = choose("Slow", "--runs-dir", tmp_path)
-    speed, question, first, total, reach, place = shown.err.splitlines()
+    speed, left_out, question, first, total, reach, place = shown.err.splitlines()
+    assert "RandomDynamics" in left_out
     milliseconds = float(re.fullmatch(r"toy_envs:Slow-v0: ([\d.]+) ms a step", speed)[1])
-    assert question.startswith("PPO on toy_envs:Slow-v0: is the best of 16 noises better than no ")
-    assert first.startswith("PPO on toy_envs:Slow-v0, round 1 of 4: 16 of 16 noises, seed 1")
-    hours = re.search(r"96 runs in all, .*, about ([\d,]+) core-hours are left, ([\d.,]+) h", total)
+    assert question.startswith("PPO on toy_envs:Slow-v0: is the best of 18 noises better than no ")
+    assert first.startswith("PPO on toy_envs:Slow-v0, round 1 of 5: 18 of 18 noises, seed 1")
+    hours = re.search(r"99 runs in all, .*, about ([\d,]+) core-hours are left, ([\d.,]+) h", total)
     hours, clock = (float(text.replace(",", "")) for text in hours.groups())
     # with 20 tests of ten episodes of 100 steps, and learning
-    assert hours == pytest.approx(96 * (1.02e6 * milliseconds / 1000 + 114) / 3600, rel=0.03)
+    assert hours == pytest.approx(99 * (1.02e6 * milliseconds / 1000 + 114) / 3600, rel=0.06)
     assert clock == pytest.approx(hours / 2, rel=0.02)
     assert reach.startswith("25 fresh seeds confirm a true gain of 0.8 standard deviations")
     assert place == f"runs, logs and the verdict are stored in {tmp_path}"
@@ -228,12 +241,12 @@ def test_any_dry_run_says_what_it_costs_and_finished_runs_tell_better(tmp_path):
 
 def test_a_status_makes_no_environment(tmp_path, monkeypatch):
     words = ["--runs-dir", tmp_path, "--noise-rates", "1"]
-    assert "of 8 noises" in choose("Tiny", *words, view_name="status").out
-    assert "of 7 noises" in choose("Tiny", *words).err and not list(tmp_path.iterdir())
+    assert "of 10 noises" in choose("Tiny", *words, view_name="status").out
+    assert "of 8 noises" in choose("Tiny", *words).err and not list(tmp_path.iterdir())
     assert choose("Tiny", *words, view_name="list").code == 0
     monkeypatch.setattr(environment, "ask", None)
     shown = choose("Tiny", *words, view_name="status").out
-    assert "7 of 7 noises" in shown and "core-hours are left" in shown
+    assert "8 of 8 noises" in shown and "core-hours are left" in shown
 
 
 def test_what_cannot_be_read_is_asked_again(tmp_path):

@@ -50,7 +50,7 @@ def bad_parameters():
             for bad in BAD_NUMBERS:
                 yield name, 0.1, (0.5,), {"loc": bad}, "loc", bad
     yield "RandomDynamics", 0.1, (-0.1, 1.0), {}, "low", -0.1
-    for bad in ["body_masss", "body_invweight0", "opt", 3]:
+    for bad in ["body_masss", "body_invweight0", "body_parentid", "opt", 3]:
         yield "RandomDynamics", 0.1, (0.5, 1.0), {"fields": ("body_mass", bad)}, "fields", bad
     for bad in [(), None, 5]:
         yield "RandomDynamics", 0.1, (0.5, 1.0), {"fields": bad}, "fields", bad
