@@ -46,6 +46,8 @@ Options of choose
   --exclude "NOISE@RATE"   noises to leave out, for example because they always fail
   --budget N               about how many runs the search may take (default: 3 for each noise)
   --confirm N              fresh seeds for the final comparison (default: 25)
+  --metric success_rate    choose by the rate of success (default: return), where the info of an
+                           episode's last step has is_success or success
 
 Executor options
   --dry-run             print the commands of the remaining runs, and what they cost: for that, the

@@ -18,6 +18,7 @@ import csv
 import fcntl
 import importlib
 import itertools
+import math
 import multiprocessing
 import os
 import signal
@@ -55,6 +56,7 @@ from noisy_wrappers import (
     canonical_env_id,
     make_noisy,
     noise_slug,
+    outcome,
     rounded,
     seed_globals,
     seeded_globals,
@@ -240,13 +242,13 @@ def with_place(error):
 
 
 def play(run, noises, rates, args):
-    """Play episodes; return their true returns and lengths, [(return, length), ...]."""
+    """Play episodes; return what play_episodes does."""
     with load(run) as (env, policy):
         return play_episodes(make_noisy(env, noises, rates), policy, args.episodes, args.seed)
 
 
 def draw(run, noises, rates, args):
-    """Play an episode in a window or into a video: (return, length), or in words why it cannot."""
+    """Play an episode in a window or into a video: its result, or in words why it cannot."""
     try:
         if args.video:
             return record(run, noises, rates, args)
@@ -258,7 +260,7 @@ def draw(run, noises, rates, args):
 
 
 def record(run, noises, rates, args):
-    """Play one episode into a video; return (return, length)."""
+    """Play one episode into a video; return its result."""
     name = f"{run.folder.name}__{noise_slug(noises, rates) or 'clean'}.mp4"
     with tempfile.TemporaryDirectory(dir=args.video, prefix=".") as temporary:
         folder = Path(temporary, "video")  # a new one: RecordVideo warns of one that exists
@@ -275,7 +277,10 @@ def record(run, noises, rates, args):
 
 
 def play_episodes(env, policy, number, seed):
-    """Play episodes; return [(true return, length), ...]."""
+    """Play episodes; return [(true return, length), ...].
+
+    Where the environment tells success, 1 or 0 follows.
+    """
     results = []
     for episode in range(number):
         with seeded_globals(seed + episode):
@@ -284,7 +289,9 @@ def play_episodes(env, policy, number, seed):
             while not (terminated or truncated):
                 observation, _, terminated, truncated, info = env.step(policy(observation))
         record = info["episode"]  # the return is a sum of numbers or of arrays
-        results.append((np.asarray(record["r"]).item(), int(record["l"])))
+        success = outcome(info)
+        told = () if math.isnan(success) else (int(success),)
+        results.append((np.asarray(record["r"]).item(), int(record["l"]), *told))
     return results
 
 
@@ -307,13 +314,17 @@ def play_all(play, tasks, args):
 
 
 def read_stored(run):
-    """Read robustness.csv: {(noise, noise rate): [(return, length), ...]}. Raises UnusableError."""
+    """Read robustness.csv: {(noise, noise rate): what play_episodes returns}.
+
+    Raises UnusableError.
+    """
     path = run.folder / "robustness.csv"
     stored = {}
     try:
         text = path.read_text("utf-8") if path.exists() else ""
         for row in csv.DictReader(text.splitlines()):
-            result = float(row["episodic_return"]), int(row["episodic_length"])
+            told = (int(row["success"]),) if row.get("success") else ()
+            result = (float(row["episodic_return"]), int(row["episodic_length"]), *told)
             stored.setdefault((row["noise"], row["noise_rate"]), []).append(result)
     except (OSError, ValueError, KeyError, TypeError, OverflowError, csv.Error) as error:
         text = f"robustness.csv: {in_words(error)}; delete that file to play everything again"
@@ -340,7 +351,8 @@ def write_stored(run, stored):
     try:
         with open(temporary, "w", encoding="utf-8") as file:
             writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(ROBUSTNESS_COLUMNS)
+            told = any(len(result) > 2 for results in stored.values() for result in results)
+            writer.writerow([*ROBUSTNESS_COLUMNS, "success"] if told else ROBUSTNESS_COLUMNS)
             for key, results in stored.items():
                 writer.writerows([*key, i, *result] for i, result in enumerate(results))
             file.flush()
@@ -384,12 +396,20 @@ def print_table(runs, conditions, stored, episodes):
 
 
 def mean_return(seeds, key, episodes):
-    """Spell the mean return under a condition, and its standard deviation if there are seeds."""
-    means = [np.mean(seed[key][:episodes], axis=0)[0] for seed in seeds]
+    """Spell the mean return under a condition, and its standard deviation if there are seeds.
+
+    Behind it is the rate of success, where the environment tells it.
+    """
+    played = [seed[key][:episodes] for seed in seeds]
+    means = [np.mean([result[0] for result in results]) for results in played]
+    solved = ""
+    if any(len(result) > 2 for results in played for result in results):
+        rates = [np.mean([result[2:] == (1,) for result in results]) for results in played]
+        solved = f", {100 * np.mean(rates):.0f} % solved"
     if len(means) == 1:
-        return rounded(means[0])
+        return rounded(means[0]) + solved
     spread = np.std(means, ddof=1)
-    return f"{rounded(np.mean(means), spread)} ± {rounded(spread, spread)}"
+    return f"{rounded(np.mean(means), spread)} ± {rounded(spread, spread)}{solved}"
 
 
 def works(code):
@@ -432,7 +452,7 @@ def show(runs, conditions, args):
         if isinstance(result, str):
             failures.append(f"{name}: {result}")
             continue
-        episodic_return, length = result
+        episodic_return, length, *_ = result
         print(f"{name}: return {rounded(episodic_return)}, {length} steps")
     for failure in failures:
         print(f"error: cannot draw {failure}", file=sys.stderr)

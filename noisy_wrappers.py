@@ -37,11 +37,12 @@ import os
 import random
 import re
 import signal
+import subprocess
 import sys
 import traceback
 import zlib
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -93,6 +94,8 @@ __all__ = [
     "noise_slug",
     "noise_statistics",
     "noise_wrappers",
+    "note_versions",
+    "outcome",
     "parse_noise",
     "rate_order",
     "refusals",
@@ -105,6 +108,7 @@ __all__ = [
     "set_progress",
     "signatures",
     "split_noises",
+    "success_rate",
 ]
 
 Env = gym.Env[Any, Any]
@@ -2060,6 +2064,56 @@ def seeded_globals(seed: int) -> Iterator[None]:
         np.random.set_state(numpy)
         if torch:
             torch.set_rng_state(pytorch)
+
+
+def outcome(info: Mapping[str, Any]) -> float:
+    """Return from the info of an episode's last step whether the task was solved.
+
+    That is 1.0 or 0.0 by ``is_success`` or ``success``, the names that Gymnasium-Robotics,
+    Meta-World and Stable-Baselines3 use, and NaN where the environment says nothing.
+
+    >>> outcome({"is_success": np.float32(1)}), outcome({"success": False}), outcome({})
+    (1.0, 0.0, nan)
+    """
+    for name in ("is_success", "success"):
+        if np.size(info.get(name)) == 1 and np.asarray(info.get(name)).dtype.kind in "biuf":
+            return float(np.asarray(info[name]).item() > 0)
+    return math.nan
+
+
+def success_rate(outcomes: Iterable[float]) -> dict[str, float]:
+    """Return the rate of success of episodes by its name; nothing if no :func:`outcome` is known.
+
+    An episode of which the environment says nothing, unlike others, was no success.
+
+    >>> success_rate([1.0, 0.0, math.nan, 0.0]), success_rate([math.nan])
+    ({'success_rate': 0.25}, {})
+    """
+    values = np.asarray(list(outcomes))
+    return {} if np.isnan(values).all() else {"success_rate": float((values > 0).mean())}
+
+
+def note_versions(config: dict[str, Any], matmul_precision: str) -> list[str]:
+    """Note in a run's configuration which versions it uses; say what changed since it began.
+
+    Noted are the versions of Python and of the main packages, the commit of this folder, and the
+    precision of float32 products. Of what changed, all values are kept: ``"2.12.0, 2.13.0"``.
+    """
+    describe = 'git describe --always --dirty --abbrev=40 --exclude="*"'
+    folder = Path(__file__).parent
+    git = subprocess.run(describe, shell=True, cwd=folder, capture_output=True, text=True)
+    now = {"matmul_precision": matmul_precision, "git_commit": git.stdout.strip() or None}
+    modules = [sys.modules.get(name) for name in ("torch", "gymnasium", "mujoco", "numpy")]
+    versions = {module.__name__: module.__version__ for module in modules if module}
+    versions["python"] = sys.version.split()[0]
+    changes = []
+    for old, new in ((config, now), (config.setdefault("versions", {}), versions)):
+        for name, value in new.items():
+            used = str(old.setdefault(name, value))
+            if str(value) not in used.split(", "):
+                changes.append(f"{name} is {value} now; this run had {used} so far")
+                old[name] = f"{used}, {value}"
+    return changes
 
 
 def reset_worker_signals() -> None:

@@ -17,11 +17,11 @@ import json
 import math
 import os
 import signal
-import subprocess
 import sys
 import tempfile
 import time
 import zipfile
+from collections import deque
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -50,7 +50,7 @@ EVAL_FREQUENCY = 10_000  # default of --eval-frequency; at most a tenth of the r
 class Args:
     """Command-line arguments; the algorithm's are those of CleanRL and the paper (Appendix A.2)."""
 
-    env_id: str = "HalfCheetah-v5"  # Gymnasium environment: Name-v0, or module:Name-v0
+    env_id: str = "HalfCheetah-v5"  # RUN: Gymnasium environment, Name-v0, or module:Name-v0
     seed: int = 1  # seed of everything that is random
     total_timesteps: int = 1_000_000  # environment steps to train for
     max_episode_steps: int | None = None  # time limit of an episode; None: the environment's own
@@ -58,19 +58,19 @@ class Args:
     runs_dir: str = "runs"  # folder in which the run's own folder is made
     overwrite: bool = False  # delete the files in the run's folder and start again
     checkpoint_frequency: int = 50_000  # environment steps between two checkpoints
-    noise: tuple[str, ...] = ()  # noises of the training environment; the baseline has none
+    noise: tuple[str, ...] = ()  # NOISE: noises of the training environment; the baseline has none
     noise_rate: tuple[float | str, ...] = ()  # probability of each noise; 1.0:0.0 falls linearly
+    eval_episodes: int = 10  # TESTS: episodes in each test
     eval_frequency: int | None = None  # steps between tests; None: up to 10,000; 0: only at the end
-    eval_episodes: int = 10  # episodes in each test
 
-    cuda: bool = False  # train on a GPU (not tested on one yet); these networks are small
+    cuda: bool = False  # SPEED: train on a GPU (not tested on one yet); these networks are small
     torch_threads: int = 1  # CPU threads; runs in parallel gain more than extra threads
     compile: bool = True  # compile the updates; needs a C++ compiler
     # precision of float32 products, raised to highest where another would cost accuracy; with bf16
     # the updates are computed in bfloat16, even if this costs accuracy
-    matmul_precision: Literal["highest", "high", "medium", "bf16"] = "medium"
+    matmul_precision: Literal["highest", "medium", "bf16"] = "medium"
 
-    buffer_size: int = 1_000_000  # transitions in the replay buffer
+    buffer_size: int = 1_000_000  # ALGORITHM: transitions in the replay buffer
     gamma: float = 0.99  # discount factor
     tau: float = 0.005  # target smoothing coefficient
     batch_size: int = 256  # transitions in a minibatch
@@ -335,7 +335,7 @@ def learn(args, env, test_env, stop):
 
         # NEXT EPISODE
         if terminated or truncated:
-            run.log_episode(global_step, info["episode"])
+            run.log_episode(global_step, info)
             if done:
                 break
             stopping = stop()
@@ -447,18 +447,19 @@ def train(args, stop=lambda: False):
 
 
 def evaluate(policy, env, episodes, stop=lambda: False):
-    """Play test episodes from fixed initial states -> (N, 2): returns, lengths; None if stopped."""
+    """Play test episodes -> (N, 3): returns, lengths, noisy.outcome; None if stopped."""
     long = env.spec.max_episode_steps >= STEP_LIMIT  # there, and only there, stop() ends a test
-    results = np.zeros((episodes, 2))
+    results = np.zeros((episodes, 3))
     for episode in range(episodes):
         with noisy.seeded_globals(TEST_SEED + episode):
             observation, _ = env.reset(seed=TEST_SEED + episode)
             terminated = truncated = False
             while not (terminated or truncated):
-                observation, reward, terminated, truncated, _ = env.step(policy(observation))
-                results[episode] += reward, 1
+                observation, reward, terminated, truncated, info = env.step(policy(observation))
+                results[episode, :2] += reward, 1
                 if long and stop():
                     return None
+            results[episode, 2] = noisy.outcome(info)
     return results
 
 
@@ -508,6 +509,7 @@ class Run:
         self.folder = noisy.run_folder(args.runs_dir, *configuration)
         self.args, self.start = args, time.monotonic() - 1e-6  # not 0 s ago: clocks may stand still
         self.noise, self.returns = noisy.noise_wrappers(env), env.get_wrapper_attr("return_queue")
+        self.outcomes = deque(maxlen=100)  # of the last training episodes
         if self.folder.is_symlink():
             fail(f"{self.folder} is a link: remove it, or choose another --exp-name or --runs-dir")
         in_use = fail_on(BlockingIOError, f"{self.folder} is in use by another process")
@@ -531,33 +533,18 @@ class Run:
             self.config = {"algorithm": algorithm, "args": asdict(args), "versions": {}}
         if self.is_finished:
             with self._reading(result):
-                self.mean = json.loads(result.read_text())["final_return_mean"]
+                self.result = json.loads(result.read_text())
             self.checkpoint.unlink(missing_ok=True)
             self._say_finished()
         else:
-            noises = zip(args.noise, args.noise_rate, strict=True)
-            noises = " + ".join(f"{noise} at {rate}" for noise, rate in noises)
+            noises = " + ".join(map("{} at {}".format, args.noise, args.noise_rate))
             begun = f"{algorithm} on {args.env_id} | noise: {noises or 'none (baseline)'}"
             begun += f" | seed {args.seed} | {args.total_timesteps:,} steps"
             say(f"{begun} | {'cuda' if args.cuda else 'cpu'} | {self.folder}")
-            self._note_versions(precision)
+            for change in noisy.note_versions(self.config, precision):
+                say(change)
             if args.compile:
                 prepare_compiler()
-
-    def _note_versions(self, precision):
-        describe = 'git describe --always --dirty --abbrev=40 --exclude="*"'
-        here = Path(__file__).parent
-        git = subprocess.run(describe, shell=True, cwd=here, capture_output=True, text=True)
-        now = {"matmul_precision": precision, "git_commit": git.stdout.strip() or None}
-        modules = [sys.modules.get(name) for name in ("torch", "gymnasium", "mujoco", "numpy")]
-        versions = {module.__name__: module.__version__ for module in modules if module}
-        versions["python"] = sys.version.split()[0]
-        for old, new in ((self.config, now), (self.config.setdefault("versions", {}), versions)):
-            for name, value in new.items():
-                used = str(old.setdefault(name, value))
-                if str(value) not in used.split(", "):  # changed since the run began: keep both
-                    say(f"{name} is {value} now; this run had {used} so far")
-                    old[name] = f"{used}, {value}"
 
     def _old_config(self):
         path = self.folder / "config.json"
@@ -566,9 +553,7 @@ class Run:
             old = {name: config["args"].get(name) for name in asdict(self.args)}
         if self.args.eval_frequency is None:
             self.args.eval_frequency = old["eval_frequency"]
-        new = asdict(self.args)
-        for name in noisy.MAY_DIFFER_IN_A_RUN:
-            del new[name]
+        new = {k: v for k, v in asdict(self.args).items() if k not in noisy.MAY_DIFFER_IN_A_RUN}
         differ = [f"{name} {old[name]}, not {new[name]}" for name in new if old[name] != new[name]]
         if differ:
             advice = "choose another --exp-name or --runs-dir; --overwrite deletes that run"
@@ -596,20 +581,18 @@ class Run:
         if step == 0:
             table = "".join(f"|{name}|{value}|\n" for name, value in asdict(self.args).items())
             self.writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + table)
-            # for the table HPARAMS: what tells runs apart, and settings that are not the default
+            # for the table HPARAMS: what tells runs apart, and what they achieved
             columns = {name: getattr(self.args, name) for name in ("env_id", "exp_name", "seed")}
             columns["noise"] = " + ".join(self.args.noise) or "none"
             columns["noise_rate"] = " + ".join(map(str, self.args.noise_rate)) or "none"
-            for name, value in asdict(self.args).items():
-                if name not in noisy.MAY_DIFFER_IN_A_TABLE and value != getattr(Args, name):
-                    columns.setdefault(name, value)
-            # Without an experiment of its own (hparams()[0]), TensorBoard shows all runs' columns
-            self.writer.file_writer.add_summary(hparams(columns, {})[1])
-        self.saved_step, self.printed, self.last_test = step, time.monotonic(), ""
+            metrics = "eval/episodic_return_mean", "eval/success_rate", "charts/episodic_return"
+            for summary in hparams(columns, dict.fromkeys(metrics, 0))[:2]:
+                self.writer.file_writer.add_summary(summary)
         self.first_step, self.first_time = step, time.monotonic() - 1e-6
-        self.bar = tqdm(
-            total=self.args.total_timesteps, initial=step, file=sys.stdout, disable=None
-        )
+        self.printed, self.saved_step = self.first_time, step
+        self.learning, self.last_test = None, ""
+        total = self.args.total_timesteps
+        self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None)
         return step
 
     def _load(self):
@@ -624,6 +607,7 @@ class Run:
             part.load_state_dict(state)
         torch.set_rng_state(checkpoint["torch"])
         self.eval_csv = checkpoint["eval_csv"]
+        self.outcomes.extend(checkpoint.get("outcomes", []))
         self.start = time.monotonic() - checkpoint["seconds"]
         return checkpoint["step"], checkpoint["events"]
 
@@ -638,6 +622,7 @@ class Run:
             "state": [part.state_dict() for part in self.state],
             "torch": torch.get_rng_state(),
             "eval_csv": self.eval_csv,
+            "outcomes": list(self.outcomes),
             "events": {path.name: path.stat().st_size for path in self.folder.glob(self.EVENTS)},
             "seconds": time.monotonic() - self.start,
         }
@@ -645,7 +630,13 @@ class Run:
         self.saved_step = step
 
     def log(self, step, **groups):
-        """Log numbers as group/name to TensorBoard; show the progress."""
+        """Log numbers as group/name to TensorBoard, and the speed; show the progress."""
+        now = time.monotonic()
+        if "losses" in groups and self.learning:
+            sps = (step - self.learning[0]) / (now - self.learning[1])
+            groups["charts"] = groups.get("charts", {}) | {"SPS": sps}
+        elif "losses" in groups:  # the first ones: the time until now went into compiling
+            self.learning = step, now - 1e-6
         tags = {f"{g}/{n}": float(x) for g, values in groups.items() for n, x in values.items()}
         if not all(map(math.isfinite, tags.values())):
             reason = f"step {step}: training diverged, some values are not finite: {tags}"
@@ -656,30 +647,39 @@ class Run:
         step = max(step, self.bar.n)  # PPO logs a test under the step at which it fell due
         self.bar.update(step - self.bar.n)
         self.bar.n = step  # update() does nothing where there is no terminal
-        taken, now = step - self.first_step, time.monotonic()
+        taken = step - self.first_step
         if self.bar.disable and taken and now - self.printed > 10:
-            total, sps = self.args.total_timesteps, taken / (now - self.first_time)
+            total, sps = self.bar.total, taken / (now - self.first_time)
             eta = tqdm.format_interval((total - step) / sps)
             # sweep/__main__.py reads this line
             say(f"step={step}/{total} sps={sps:.0f} {self.last_test}eta={eta}")
             self.printed = now
 
-    def log_episode(self, step, episode):
-        """Log a training episode as RecordEpisodeStatistics saw it, and the speed."""
-        charts = {"episodic_return": episode["r"], "episodic_length": episode["l"]}
-        self.log(step, charts=charts | {"SPS": step / (time.monotonic() - self.start)})
+    def log_episode(self, step, info):
+        """Log a training episode as the info of its last step tells it."""
+        self.outcomes.append(noisy.outcome(info))
+        charts = {"episodic_return": info["episode"]["r"], "episodic_length": info["episode"]["l"]}
+        self.log(step, charts=charts | noisy.success_rate(self.outcomes))
 
     def log_test(self, step, results):
-        """Log the (N, 2) returns and lengths of a test that fell due at a step."""
-        for i, (episodic_return, length) in enumerate(results.tolist()):
-            self.eval_csv += f"{step},{i},{episodic_return},{length:.0f}\n"
+        """Log the (N, 3) returns, lengths and outcomes of a test that fell due at a step."""
+        told = ",success\n" in self.eval_csv  # by the environment, in an earlier test
+        success = noisy.success_rate(np.nan_to_num(results[:, 2]) if told else results[:, 2])
+        if success and not told:  # earlier tests, of which it said nothing, were no success
+            self.eval_csv = self.eval_csv.replace("\n", ",0\n").replace(",0", ",success", 1)
+        for i, (episodic_return, length, outcome) in enumerate(results.tolist()):
+            column = f",{outcome == 1:d}" if success else ""
+            self.eval_csv += f"{step},{i},{episodic_return},{length:.0f}{column}\n"
         self._write("eval.csv", self.eval_csv)
-        self.mean, length = results.mean(0)
-        self.std = results[:, 0].std(ddof=1) if len(results) > 1 else 0.0
-        self.last_test, self.printed = f"eval_return={self.mean:.1f} ", -math.inf  # print it now
+        mean, length, _ = results.mean(0)
+        std = results[:, 0].std(ddof=1) if len(results) > 1 else 0.0
+        self.result = {"final_return_mean": mean, "final_return_std": std}
+        self.result |= {f"final_{name}": rate for name, rate in success.items()}
+        self.last_test, self.printed = f"eval_return={noisy.rounded(mean, std)} ", -math.inf
+        self.last_test += "".join(f"{name}={rate:.2f} " for name, rate in success.items())
         self.bar.set_description_str(self.last_test)
-        values = {"return_mean": self.mean, "return_std": self.std, "length_mean": length}
-        self.log(step, eval={f"episodic_{name}": x for name, x in values.items()})
+        values = {"return_mean": mean, "return_std": std, "length_mean": length}
+        self.log(step, eval={f"episodic_{name}": x for name, x in values.items()} | success)
 
     def finish(self, step, policy):
         """Write policy.pt and, last of all, result.json; the checkpoint has served."""
@@ -687,9 +687,7 @@ class Run:
         with self._writing("events.*"):
             self.writer.file_writer.add_summary(hparams({}, {})[2])  # HPARAMS: success
             self.writer.close()
-        result = {
-            "final_return_mean": self.mean,
-            "final_return_std": self.std,
+        self.result |= {
             "final_return_n": self.args.eval_episodes,
             "total_timesteps": self.args.total_timesteps,
             "trained_timesteps": step,  # PPO: whole rollouts
@@ -700,13 +698,16 @@ class Run:
             "noise_applied": {n: [w.times_applied, w.opportunities] for n, w in self.noise.items()},
         }
         self._write("policy.pt", policy)
-        self._write("result.json", json.dumps(result, indent=2) + "\n")
+        self._write("result.json", json.dumps(self.result, indent=2) + "\n")
         self.checkpoint.unlink(missing_ok=True)
         self.bar.close()
         self._say_finished()
 
     def _say_finished(self):
-        say(f"{self.folder} is finished: mean test return {self.mean:.1f}")
+        mean, std = self.result["final_return_mean"], self.result["final_return_std"]
+        text = f"{self.folder} is finished: mean test return {noisy.rounded(mean, std)}"
+        rate = self.result.get("final_success_rate")
+        say(text if rate is None else f"{text}, success rate {rate:.2f}")
         say(f"See its curves with: tensorboard --logdir {self.args.runs_dir}")
 
     def _reading(self, path):
@@ -744,9 +745,8 @@ if __name__ == "__main__":
             os.write(1, told)
 
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        if (
-            number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN
-        ):  # as nohup sets it
+        under_nohup = number == signal.SIGHUP and signal.getsignal(number) == signal.SIG_IGN
+        if not under_nohup:
             signal.signal(number, stop_run)
     os.register_at_fork(after_in_child=noisy.reset_worker_signals)
     sys.path.append(os.getcwd())  # for what the module of --env-id module:Name-v0 imports

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from tabulate import tabulate
 
-from analysis.runs import script_name
+from analysis.runs import SUCCESS, script_name
 from analysis.verdicts import percent
 from noisy_wrappers import rate_order, rounded
 
@@ -30,6 +30,14 @@ class Table:
     only_csv: tuple = ()  # columns that would make the table wider than a page
     view: pd.DataFrame | None = None  # what people read, if that is not the frame
     rates_beside: bool = False  # a column for each noise rate, with mean, std and n in its cells
+
+
+def in_metric(text, metric):
+    """Write of success rates what was written of returns, if they are the metric of a Study."""
+    if metric != SUCCESS:
+        return text
+    text = text.replace("test return\n(sum of rewards per episode)", "test success rate (%)")
+    return text.replace("return", "success rate")
 
 
 def slug(text):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from analysis.runs import STUDY, rows_of
-from analysis.statistics import LEVEL, percent_of
+from analysis.statistics import LEVEL
 from noisy_wrappers import BASELINE
 
 DRAWS = 10_000
@@ -98,7 +98,7 @@ def luck_of_study(study):
     rng = np.random.default_rng(0)
     configs = [config for config in study.returns if config != BASELINE]
     draws = np.full((len(study.environments), len(configs), DRAWS), np.nan)
-    percents = np.array([percent_of(1.0, returns) for returns in study.final(BASELINE).T])
+    percents = np.array([study.percent_of(1.0, e) for e in range(len(study.environments))])
     for e in range(len(study.environments)):
         samples = [study.final(config)[:, e] for config in (BASELINE, *configs)]
         samples = [sample[np.isfinite(sample)] for sample in samples]

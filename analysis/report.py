@@ -23,6 +23,7 @@ SECTIONS = {
     "consistent": "Consistent noise",
     "consistently_worse": "Consistently worse",
     "luck": "Luck",
+    "success": "Success",
     "statistics": "Statistics",
     "parameters": "Parameters",
     "interactions": "Two noises together",

@@ -80,7 +80,7 @@ def read_episodes(path):
     """Read one file: a dict of Configuration -> returns of its episodes. Raises ValueError."""
     text = {"noise": str, "noise_rate": str}
     table = pd.read_csv(path, dtype=text, keep_default_na=False)
-    if list(table.columns) != ROBUSTNESS_COLUMNS:
+    if list(table.columns) not in (ROBUSTNESS_COLUMNS, [*ROBUSTNESS_COLUMNS, "success"]):
         raise ValueError("unexpected header")
     returns = pd.to_numeric(table["episodic_return"])
     if not np.isfinite(returns).all() or not len(returns):

@@ -7,6 +7,7 @@ command computes from the finished runs where each choice stands.
 import csv
 import fcntl
 import itertools
+import math
 import os
 import sys
 from statistics import fmean
@@ -14,8 +15,9 @@ from typing import NamedTuple
 
 from analysis.errors import fail
 from analysis.folders import CONFIRMATION, SEARCH, flat_choice, read_config
-from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED, read_run
+from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED, SUCCESS, read_run
 from analysis.statistics import detectable_shift, holm
+from analysis.verdicts import POINTS
 from noisy_wrappers import BASELINE, Configuration, rounded
 from sweep import halving
 from sweep.environment import ask_all, remember, remembered, run_seconds, time_left, wall_time
@@ -35,6 +37,7 @@ class Choice(NamedTuple):
     returns: dict[tuple[Configuration, int], float]  # of those that are finished
     spread: float  # standard deviation over seeds of the search's last tests; NaN if unknown
     run_seconds: float | None  # about what a run takes, if anything tells
+    metric: str = "return"  # or "success rate": then `returns` has rates of success in percent
 
 
 def choices(args, ask=False, keep=False):
@@ -89,7 +92,8 @@ def follow(args, algorithm, env_id, environment):
     last_seed = sum(seeds for _, seeds in schedule)
     if last_seed >= FIRST_CONFIRMATION_SEED:
         fail(f"--budget {budget} is too large: the best noises would run with {last_seed} seeds")
-    runs, returns, last_tests = {}, {}, {}
+    runs, returns, last_tests, different = {}, {}, {}, set()
+    metric = args.metric.replace("_", " ")
     while True:
         state = halving.advance(noises, budget, args.confirm, returns)
         phase = SEARCH if len(state.rounds) < len(schedule) else CONFIRMATION
@@ -99,16 +103,26 @@ def follow(args, algorithm, env_id, environment):
             check_place(run)
             if result(run)[0]:
                 run, row = with_row(run)
+                tests = tests_of(run, row, metric) if row else ()
+                different |= set(tests)
                 if row and phase == CONFIRMATION:
-                    finished[noise, seed] = row["returns"][-1]
+                    finished[noise, seed] = tests[-1]
                 elif row:
-                    finished[noise, seed] = halving.score(row["steps"], row["returns"])
-                    last_tests.setdefault(noise, []).append(row["returns"][-1])
+                    finished[noise, seed] = halving.score(row["steps"], tests)
+                    last_tests.setdefault(noise, []).append(tests[-1])
             runs[noise, seed] = run
         if not finished:
             break
         returns |= finished
     check_frequencies(runs[key] for key in returns)
+    if len(different) == 1 and (state.rounds or not state.due):
+        fail(
+            f"{algorithm.upper()} on {env_id}: all {len(returns)} runs have a {metric} of "
+            f"{rounded(*different)} in every test: nothing was learned in "
+            f"{args.total_timesteps:,} steps, so further runs would say nothing about noise; "
+            "train for longer, or leave this out",
+            code=1,
+        )
     taken = [taken for taken in map(wall_time, map(runs.get, returns)) if taken]
     seconds = fmean(taken) if taken else None
     if environment and not taken:
@@ -124,6 +138,7 @@ def follow(args, algorithm, env_id, environment):
         returns=returns,
         spread=halving.spread(last_tests.values()),
         run_seconds=seconds,
+        metric=metric,
     )
 
 
@@ -166,6 +181,15 @@ def with_row(run):
         return run, row
     damage = f"{run.folder}/{row['reason']}; move its folder away to run it again"
     return run._replace(damage=damage), None
+
+
+def tests_of(run, row, metric):
+    """Return the results of a run's tests (tests,), or exit if the environment tells no success."""
+    if metric != SUCCESS:
+        return row["returns"]
+    if row["success_rates"] is None:
+        fail(f"--metric success_rate: {run.kind[1]} tells no `is_success` or `success`")
+    return row["success_rates"]
 
 
 def check_frequencies(runs):
@@ -248,8 +272,8 @@ def reach(choice, verdicts):
         return ""
     shift = gain * choice.spread
     return (
-        f"{choice.name}: {seeds} about {rounded(shift, shift)} ({gain:.1f} standard deviations of "
-        f"the last tests in the search) {power}"
+        f"{choice.name}: {seeds} about {rounded(shift, shift)}{unit(choice)} ({gain:.1f} standard "
+        f"deviations of the last tests in the search) {power}"
     )
 
 
@@ -279,7 +303,7 @@ def standing(found, args):
     for choice in found:
         yield describe(choice)
         if choice.state.due and choice.state.rounds:
-            yield f"  mean return after round {len(choice.state.rounds)}:"
+            yield f"  mean {choice.metric} after round {len(choice.state.rounds)}:"
             scores = choice.state.rounds[-1].scores
             for noise in sorted(choice.state.noises, key=scores.get, reverse=True):
                 yield f"  {rounded(scores[noise]):>10}  {noise}"
@@ -318,12 +342,20 @@ def rows(found):
     return result
 
 
+def unit(choice):
+    """Return what stands behind a difference."""
+    return POINTS if choice.metric == SUCCESS else ""
+
+
 def judged(found):
     """Return each finished choice's comparison, and its p corrected for all of them."""
     comparisons = []
     for choice in found:
         [winner] = choice.state.noises
-        comparisons.append(halving.compare(winner, choice.state.seeds, choice.returns))
+        comparison = halving.compare(winner, choice.state.seeds, choice.returns)
+        if choice.metric == SUCCESS:
+            comparison = comparison._replace(difference_percent=math.nan)  # never percent of a rate
+        comparisons.append(comparison)
     corrected = holm([comparison.p for comparison in comparisons])
     return list(zip(comparisons, corrected, strict=True))
 
@@ -333,7 +365,7 @@ def verdicts(found, judgements):
     for choice, (comparison, p) in zip(found, judgements, strict=True):
         noises = choice.schedule[0][0] if choice.schedule else 1
         [winner] = choice.state.noises
-        yield halving.sentence(choice.name, winner, noises, comparison, p, len(found))
+        yield halving.sentence(choice.name, winner, noises, comparison, p, len(found), unit(choice))
 
 
 def obstacle(choice):

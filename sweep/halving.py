@@ -151,14 +151,15 @@ def helps(comparison, p_corrected):
     return significant(p_corrected) and comparison.t > 0
 
 
-def sentence(name, winner, noises, comparison, p_corrected, verdicts):
+def sentence(name, winner, noises, comparison, p_corrected, verdicts, unit=""):
     """Say in one plain sentence what came out.
 
     name: the algorithm and the environment. noises: how many were searched. verdicts: for how many
-    verdicts p is corrected.
+    verdicts p is corrected. unit: of the difference.
     """
     start = f"{name}:"
-    evidence = f"{comparison.n} fresh seeds, {difference(comparison)}, p {p_value(comparison.p)}"
+    evidence = f"{comparison.n} fresh seeds, {difference(comparison, unit)}"
+    evidence += f", p {p_value(comparison.p)}"
     evidence += smallest(comparison) + corrected(p_corrected, verdicts, "verdict")
     end = f".{borderline(comparison)}"
     if helps(comparison, p_corrected):
@@ -171,7 +172,9 @@ def sentence(name, winner, noises, comparison, p_corrected, verdicts):
         return f"{start}, is worse than no noise: {evidence}{end}"
     if comparison.detectable > 0:
         found = rounded(comparison.detectable, spread_of(comparison))
-        evidence += f"; with {comparison.n} seeds a difference of {found} would have been seen"
+        evidence += (
+            f"; with {comparison.n} seeds a difference of {found}{unit} would have been seen"
+        )
         evidence += " (80 % power before the correction)" if verdicts > 1 else " (80 % power)"
     return f"{start}: {evidence}{end}"
 

@@ -201,6 +201,31 @@ class Talks(Count):
         return super().reset(**kwargs)
 
 
+class Solves(Count):
+    """Tells whether it is solved: in two of five episodes, or from the fifth on.
+
+    `only` tells it only where it is solved, as some do.
+    """
+
+    resets = 0
+
+    def __init__(self, key, kind, only=False):
+        super().__init__()
+        self.key, self.kind, self.only = key, kind, only
+
+    def reset(self, **kwargs):
+        observation, info = super().reset(**kwargs)
+        self.resets += 1
+        self.solved = self.resets >= 5 if self.only else self.np_random.random() < 0.4
+        return observation, info
+
+    def step(self, action):
+        *rest, info = super().step(action)
+        if self.solved or not self.only:
+            info[self.key] = self.kind(self.solved)
+        return *rest, info
+
+
 def register(name, entry_point, steps, **kwargs):
     gym.register(f"{name}-v0", entry_point, max_episode_steps=steps, kwargs=kwargs)
 
@@ -235,3 +260,6 @@ register("TextReward", TextReward, 8)
 register("Slow", Slow, 100)
 register("OneReset", OneReset, 8)
 register("Talks", Talks, 8)
+register("IsSuccess", Solves, 8, key="is_success", kind=np.bool_)
+register("Success", Solves, 8, key="success", kind=int)
+register("SuccessOnly", Solves, 8, key="is_success", kind=np.float32, only=True)

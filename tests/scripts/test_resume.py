@@ -465,10 +465,11 @@ INERT = {"format", "run", "seconds"}
 INERT |= {"events"}  # of TensorBoard, which the tests of kills compare
 INERT |= {"python", "numpy"}  # Hopper draws none of the global numbers; test_hostile.py tests them
 INERT |= {"RandomMixupObservation.noise"}  # mixup draws none
+INERT |= {"outcomes"}  # Hopper tells no success: test_success_survives_an_interruption
 INERT |= {"RandomEarlyTermination_2.gate", "RandomEarlyTermination_2.noise"}  # always the same
 
 
-FIELDS_OF_THE_RUN = ("format", "run", "step", "torch", "eval_csv", "events", "seconds")
+FIELDS_OF_THE_RUN = ["format", "run", "step", "torch", "eval_csv", "outcomes", "events", "seconds"]
 
 
 def paths(algorithm):
@@ -832,6 +833,24 @@ def test_a_finished_run_says_so_and_changes_nothing(algorithm, alone, tmp_path):
         before = files(path)
     assert run(algorithm, words).code == 0
     assert files(path) == before
+
+
+@one_script
+def test_success_survives_an_interruption(algorithm, tmp_path):
+    small = {"env_id": "toy_envs:IsSuccess-v0", "noise": NOISE[3:4], "rates": RATES[3:4]}
+    found = []
+    for name, stops in (("whole", []), ("stopped", [LATE])):
+        words = options(algorithm, tmp_path / name, **small)
+        for episodes in stops:
+            assert not train(algorithm, words, episodes)
+        assert train(algorithm, words)
+        [path] = (tmp_path / name).iterdir()
+        events = EventAccumulator(str(path)).Reload()
+        curves = [events.Scalars(tag) for tag in ("charts/success_rate", "eval/success_rate")]
+        curves = [[(event.step, event.value) for event in curve] for curve in curves]
+        found.append((curves, (path / "eval.csv").read_text()))
+    assert found[0] == found[1]
+    assert len(found[0][0][0]) > LATE
 
 
 @pytest.mark.slow

@@ -385,6 +385,58 @@ def test_two_algorithms_and_environments_at_once(tmp_path):
         assert float(line["score"]) == pytest.approx(fmean(wanted))
 
 
+THREE = "RandomMixupObservation(0.5) | RandomDropoutObservation(0.9)"
+THREE = f"--noise-rates | 1 | --confirm | 5 | --noises | {A} | {THREE}"
+
+
+def test_a_noise_is_chosen_by_the_rate_of_success(tmp_path):
+    env_id = "toy_envs:IsSuccess-v0"
+    text = f"--algos | ppo | --envs | {env_id} | --metric | success_rate | {THREE}"
+    args = arguments(text, tmp_path)
+    batches(args)
+    [verdict] = conclude(args, tmp_path)
+    lines = read(tmp_path / "choice.csv")
+    rates = {}
+    for line in lines[-2:]:
+        noise = Configuration.parse(line["noise"], line["noise_rate"])
+        last = [
+            stub_run.episodes_of("ppo", env_id, *noise.texts, seed)[-1]
+            for seed in range(1001, 1006)
+        ]
+        rates[noise] = 100 * np.mean(np.array(last) > 100)
+        assert float(line["score"]) == pytest.approx(rates[noise])
+    gain = rates.pop(noise) - rates.pop(BASELINE)
+    found = re.search(
+        r"5 fresh seeds, ([-+][\d.]+) \[.*\] percentage points of success, p", verdict
+    )
+    assert float(found[1]) == pytest.approx(gain, abs=0.5) and abs(gain) > 5
+    assert "(80 %" in verdict or " %" not in verdict  # never percent of a rate
+    returns = arguments(f"--algos | ppo | --envs | {env_id} | {THREE}", tmp_path)
+    assert "percentage points" not in conclude(returns, tmp_path)[0]
+
+
+def test_choose_by_success_needs_an_environment_that_tells_it(tmp_path, capsys):
+    text = f"--algos | ppo | --envs | Pendulum-v1 | --metric | success_rate | {THREE}"
+    with pytest.raises(SystemExit) as exit_:
+        batches(arguments(text, tmp_path))
+    assert exit_.value.code == 2
+    told = "error: --metric success_rate: Pendulum-v1 tells no `is_success` or `success`\n"
+    assert capsys.readouterr().err == told
+
+
+def test_choose_stops_where_nothing_was_learned(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(stub_run, "episodes_of", lambda *run: [[-50.0] * 10] * 10)
+    args = arguments(f"--algos | ppo | --envs | Pendulum-v1 | {THREE}", tmp_path)
+    with pytest.raises(SystemExit) as exit_:
+        batches(args)
+    assert exit_.value.code == 1
+    assert len(list(tmp_path.glob("*/*__*"))) == 6  # after the first round: two seeds of three
+    told = (
+        "PPO on Pendulum-v1: all 6 runs have a return of -50.00 in every test: nothing was learned "
+    )
+    assert f"error: {told}in 1,000 steps" in capsys.readouterr().err
+
+
 def test_the_readme_says_what_it_takes_by_default(tmp_path):
     text = " ".join((Path(__file__).parents[2] / "README.md").read_text().split())
     pattern = r"takes (\d+) runs of a .*: about (\d+) core-hours with PPO and (\d+) with SAC in a"

@@ -251,7 +251,7 @@ def test_the_grid_reads_options_as_the_scripts_do(algorithm):
     script = import_module(f"{algorithm}_continuous_noisy")
     for words in (
         "",
-        "--gamma 0.5 --eval_episodes=3 --no-compile --matmul_precision high",
+        "--gamma 0.5 --eval_episodes=3 --no-compile --matmul_precision medium",
         "--gamma=.5 --gamma 1 --cuda --no_overwrite --max-episode-steps 1_000",
         "--max-episode-steps None --gamma -inf --torch-threads=2",
     ):
