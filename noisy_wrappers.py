@@ -58,7 +58,7 @@ from gymnasium.envs.registration import (
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 __all__ = [
     "BASELINE",
