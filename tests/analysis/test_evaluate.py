@@ -375,7 +375,8 @@ def test_all_of_a_folder_with_logs_and_an_analysis(runs, capsys):
         means.append(
             np.mean([float(r["episodic_return"]) for r in rows if r["noise_rate"] == "0.5"])
         )
-    assert table[4][6] == f"{np.mean(means):.1f} ± {np.std(means, ddof=1):.1f}"
+    spread = np.std(means, ddof=1)
+    assert table[4][6] == f"{rounded(np.mean(means), spread)} ± {rounded(spread, spread)}"
     before = files(runs)
     main(Args((runs,), (OBSERVATION,), (0.5, 1.0), episodes=3))  # the folder stands for its runs
     assert capsys.readouterr().out == result.out
@@ -419,7 +420,7 @@ def test_videos(runs, tmp_path):
         assert len(video) == int(row["episodic_length"]) + 1  # the reset's, and one per step
         assert video.shape[1:] == (480, 480, 3)
         assert video[0].std() > 10 and np.abs(video[0].astype(int) - video[-1]).max() > 50
-    assert f"return {float(row['episodic_return']):.1f}, " in result.stdout
+    assert f"return {rounded(float(row['episodic_return']))}, " in result.stdout
 
 
 def test_videos_of_runs_of_one_name(runs, tmp_path, capsys):
