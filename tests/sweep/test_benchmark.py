@@ -577,6 +577,7 @@ def test_status_for_a_reader_that_stops_early(tmp_path):
     assert (done.returncode, done.stderr) == (0, b"")
 
 
+@pytest.mark.slow
 def test_a_damaged_result_fails_its_run_and_stops_no_other(tmp_path, stub):
     """The kinds of damage are in test_damage.py."""
     grid = ["baseline", "--algos", "sac", "--envs", "Hopper-v5", "--seeds", "1-2"]
@@ -667,6 +668,7 @@ def small_disk(tmp_path):
     subprocess.run(["umount", "--lazy", tmp_path], check=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("state", ["full", "full later", "read-only"])
 def test_a_disk_that_takes_nothing_is_named(state, small_disk, stub):
     runs, env = small_disk / "runs", stub
@@ -697,6 +699,7 @@ def test_a_disk_that_takes_nothing_is_named(state, small_disk, stub):
 # NAMES OF FOLDERS
 
 
+@pytest.mark.slow
 def test_names_of_folders(tmp_path, stub):
     """Through a link to benchmark.sh, into a folder whose name is not UTF-8; with a home folder."""
     (tmp_path / "bench").symlink_to(ROOT / "benchmark.sh")
