@@ -26,24 +26,14 @@ lint: $(BIN)/.dev
 	for script in benchmark.sh sweep/executors.sh .ci/run; do bash -n $$script || exit; done
 	$(BIN)/shellcheck --external-sources --check-sourced benchmark.sh .ci/run
 
-# What one command can make again, from the runs in results/data. Only what the pages show is kept
-# in git; results/report has everything.
-results: $(BIN)/.run
-	$(BIN)/python analyze.py --runs-dir results/data/runs --out results/report --compare results/paper
-	cp results/report/*.csv results/tables
-	cp results/report/curves_PPO_RandomEarlyTermination_50.svg results/figures
-	$(BIN)/python results/pages/readme.py
-	$(BIN)/python results/pages/further_tables.py
-	$(BIN)/python results/pages/baselines.py
-	$(BIN)/python results/pages/ablation.py
-	$(BIN)/python results/pages/reconstruction.py
-	$(BIN)/python results/pages/data_readme.py
-	$(BIN)/python results/pages/future_work.py
-	$(BIN)/python results/pages/robustness.py
-	$(BIN)/python results/pages/precision.py
+# The tables that results/study computes from results/data, and the tables in the pages. Those of a
+# finished study were computed once, at the commit that results/tables/README.md names.
+results: $(BIN)/.dev
+	$(BIN)/python -m results.study
+	$(BIN)/python -m cogapp -r -P -I . -p "from results.study.show import table" results/*.md results/*/README.md
 
 clean:
-	rm -rf .venv runs/demo results/report
+	rm -rf .venv runs/demo
 
 $(BIN)/python:
 	$(PYTHON) -m venv .venv

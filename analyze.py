@@ -19,24 +19,30 @@ import subprocess
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
-from analysis.effects import ENDS
 from analysis.errors import fail, take_over_terminal
-from analysis.figures import NARROW, figures, write_figure
+from analysis.figures import figures, reword, write_figure
 from analysis.folders import is_run
-from analysis.formatting import text_table, wrapped, write_table
+from analysis.formatting import in_metric, text_table, wrapped, write_table
 from analysis.paper import read_paper
 from analysis.report import write_report
 from analysis.robustness import read_robustness, robustness_sentences, robustness_tables
-from analysis.runs import left_out, make_studies, read_choice, read_runs
-from analysis.tables import family_notes, make_tables, table_of
-from analysis.verdicts import clear_first, headlines, sentences, tally
+from analysis.runs import SUCCESS, left_out, make_studies, read_choice, read_runs
+from analysis.tables import (
+    family_notes,
+    make_tables,
+    success_table,
+    table_of,
+    unlearned_notes,
+)
+from analysis.verdicts import POINTS, clear_first, headlines, sentences, tally
 
 # Columns that a terminal may have room for, the most important ones first
-BEST_IN_SHORT = ["algorithm, environment", "noise", "noise_rate", *ENDS, "p_adjusted", "n"]
-BEST_IN_SHORT += ["luck_95_percent", "p_luck_of_best", "baseline_mean", "baseline_std"]
+BEST_IN_SHORT = ["algorithm, environment", "noise", "noise_rate", "difference", "p_adjusted", "n"]
+BEST_IN_SHORT += ["luck_95", "p_luck_of_best", "baseline_mean", "baseline_std"]
 BEST_IN_SHORT += ["noisy_mean", "noisy_std"]
 MISSING_IN_SHORT = ["status", "reason", "seeds", "environment", "noise", "noise_rate", "run"]
 
@@ -51,6 +57,8 @@ class Args:
     """where the tables, the figures and report.html go; by default RUNS_DIR/results"""
     compare: Path | None = None
     """a folder with the paper's tables as csv (results/paper): adds compare_* tables"""
+    metric: Literal["return", "success_rate"] = "return"
+    """what the verdicts judge by: final test returns, or rates of success in percent"""
 
 
 def output_folder(args):
@@ -113,12 +121,13 @@ def write_results(out, verdicts, tables, studies, overview, problems, notes):
     out.mkdir(parents=True, exist_ok=True)
     for table in tables.values():
         write_table(out, table)
-    drawn, names = [], {*tables}
-    for name, figure, caption in figures(studies, tables):
-        write_figure(out, name, figure)
-        names.add(name)
-        if not name.endswith(NARROW):
-            drawn.append((name, caption))
+    drawn = list(figures(studies, tables))
+    names = {*tables}
+    for drawing in drawn:
+        if drawing.kind != "robustness":  # which is about returns
+            reword(drawing, studies[0].metric)
+        write_figure(out, drawing)
+        names |= {drawing.name, drawing.narrow_name}
     write_report(out, verdicts, tables, drawn, overview, problems, notes)
     return names
 
@@ -170,7 +179,8 @@ def main(args):
 
     Return the exit status: 1 where a run's files are damaged.
     """
-    args = Args(*(path and path.expanduser() for path in (args.runs_dir, args.out, args.compare)))
+    paths = {name: getattr(args, name) for name in ("runs_dir", "out", "compare")}
+    args = replace(args, **{name: path and path.expanduser() for name, path in paths.items()})
     if not args.runs_dir.is_dir():
         fail(f"no folder {args.runs_dir}")
     try:
@@ -183,19 +193,29 @@ def main(args):
     missing, number = left_out(runs)
     counts = ", ".join(f"{n} {status}" for status, n in number.items())
     problems = f"Runs left out: {sum(number.values())} ({counts})." if number else ""
-    studies, notes = make_studies(runs)
+    metric = args.metric.replace("_", " ")
+    studies, notes = make_studies(runs, metric)
+    if not studies and make_studies(runs)[0]:
+        fail("--metric success_rate: no environment here tells it, in `is_success` or `success`")
     if not studies:
         if len(missing):
             print_left_out(table_of("missing", missing), terminal_width())
         no_finished_run(args.runs_dir)
     robustness, unreadable = read_robustness(args.runs_dir, runs)
     notes += unreadable
-    tables = make_tables(studies, paper) | robustness_tables(robustness)
+    tables = {
+        name: replace(table, caption=in_metric(table.caption, metric))
+        for name, table in make_tables(studies, paper).items()
+    }
+    if metric != SUCCESS:
+        tables |= success_table(make_studies(runs, SUCCESS)[0])
+    tables |= robustness_tables(robustness)
     tables["missing"] = table_of("missing", missing)
     if choice is not None:
         tables["choice"] = table_of("choice", choice)
-    verdicts = sentences(studies, tables["statistics"].frame)
-    notes = family_notes(tables["statistics"].frame) + notes
+    unit = POINTS if metric == SUCCESS else ""
+    verdicts = sentences(tables["statistics"].frame, unit)
+    notes = unlearned_notes(studies) + family_notes(tables["statistics"].frame) + notes
     overview = overview_of(runs, studies)
     try:
         names = write_results(out, verdicts, tables, studies, overview, problems, notes)

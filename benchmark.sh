@@ -40,15 +40,18 @@ Grid options replace a preset's values
              runs/demo)
 
 Options of choose
-  --noises paper           the paper's 15 noises at 6 rates: 318 runs. The default is 8 noises at
-                           rates 0.05 and 1.0, in 96 runs (docs/sweeps.md lists them). Both confirm
+  --noises paper           the paper's 15 noises at 6 rates: 318 runs. The default is 10 noises at
+                           rates 0.05 and 1.0, in 105 runs (docs/sweeps.md lists them). Both confirm
                            a true gain of 1.5 standard deviations in 9 of 10 cases
   --exclude "NOISE@RATE"   noises to leave out, for example because they always fail
   --budget N               about how many runs the search may take (default: 3 for each noise)
   --confirm N              fresh seeds for the final comparison (default: 25)
+  --metric success_rate    choose by the rate of success (default: return), where the info of an
+                           episode's last step has is_success or success
 
 Executor options
-  --dry-run             print the commands of the remaining runs and start nothing
+  --dry-run             print the commands of the remaining runs, and what they cost: for that, the
+                        environments are timed; start nothing
   --executor local      (default) runs side by side on this machine
   --executor parallel   GNU parallel, on this machine or over ssh
   --executor slurm      job arrays; submits and returns
@@ -104,7 +107,7 @@ while [ $# -gt 0 ]; do
       option=${1#--}
       printf -v "${option//-/_}" %s "$2"
       shift 2 ;;
-    --dry-run) dry_run=1 && shift ;;
+    --dry-run) dry_run=dry-run && shift ;;
     --wait) wait=1 && shift ;;
     -h | --help) usage || true; exit ;;
     --) grid+=("$@") && break ;;
@@ -133,7 +136,10 @@ print(*[name for name in sys.argv[1:] if not u.find_spec(name)], sep=', ')" \
 [ -z "$lacking" ] ||
   fail "'$PYTHON' lacks $lacking: set PYTHON, or install requirements.txt into .venv"
 
-show() { "$PYTHON" -m sweep "$1" "$caller" ${grid[@]+"${grid[@]}"}; }
+show() {
+  SWEEP_EXECUTOR=$executor SWEEP_JOBS=$jobs SWEEP_HOSTS=$sshlogin OMP_NUM_THREADS=1 \
+    "$PYTHON" -m sweep "$1" "$caller" ${grid[@]+"${grid[@]}"}
+}
 if [ $view = status ]; then
   show status
   exit
@@ -142,7 +148,7 @@ fi
 # sets `lines`, all runs; and `todo`, those that are to do and were not yet tried. LC_ALL=C: folders
 # may have names that are not UTF-8
 list_todo() {
-  lines=$(show list) || exit $?
+  lines=$(show "${dry_run:-list}") || exit $?
   todo=$(LC_ALL=C awk -F'\t' -v OFS='\t' '$2 == "todo" {print $1, $3}' <<<"$lines" |
     LC_ALL=C grep -vxFf <(printf '%s\n' "$tried") || true)
   count=$(LC_ALL=C grep -c . <<<"$todo" || true)

@@ -18,6 +18,7 @@ import csv
 import fcntl
 import importlib
 import itertools
+import math
 import multiprocessing
 import os
 import signal
@@ -26,7 +27,7 @@ import sys
 import tempfile
 import traceback
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import closing
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -55,6 +56,10 @@ from noisy_wrappers import (
     canonical_env_id,
     make_noisy,
     noise_slug,
+    outcome,
+    rounded,
+    seed_globals,
+    seeded_globals,
     split_noises,
 )
 
@@ -146,8 +151,12 @@ def read_conditions(args):
     return conditions
 
 
+@contextmanager
 def load(run, render_mode=None):
-    """Return a run's clean environment and its policy, NumPy to NumPy. Raises UnusableError."""
+    """Yield a run's clean environment, closed at the end, and its policy, NumPy to NumPy.
+
+    Raises UnusableError.
+    """
     refuse_foreign_module(run)
     script = importlib.import_module(script_name(run.algorithm))
     try:
@@ -156,12 +165,14 @@ def load(run, render_mode=None):
         raise UnusableError(error) from None
     steps = run.settings.get("max_episode_steps")
     drawn = {"render_mode": render_mode} if render_mode else {}  # not every class takes it
-    env = script.make_env(run.environment, max_episode_steps=steps, **drawn)
-    try:
-        return env, script.load_policy(run.folder, env)
-    except Exception as error:  # a damaged file may raise anything
-        reason = f"policy.pt is not a policy for {run.environment}: {in_words(error)}"
-        raise UnusableError(reason) from None
+    seed_globals(Args.seed)  # as every episode does: the constructor may draw, too
+    with script.make_env(run.environment, max_episode_steps=steps, **drawn) as env:
+        try:
+            policy = script.load_policy(run.folder, env)
+        except Exception as error:  # a damaged file may raise anything
+            reason = f"policy.pt is not a policy for {run.environment}: {in_words(error)}"
+            raise UnusableError(reason) from None
+        yield env, policy
 
 
 def folders_of_runs(run):
@@ -203,8 +214,7 @@ def check_runs(runs, conditions, bad, storing):
     stored = {}
     for run in runs:
         try:
-            env, _ = load(run)
-            with closing(env):
+            with load(run) as (env, _):
                 for noises, rates in conditions.values():
                     make_noisy(env, noises, rates)
             stored[run] = read_stored(run) if storing else {}
@@ -232,46 +242,56 @@ def with_place(error):
 
 
 def play(run, noises, rates, args):
-    """Play episodes; return their true returns and lengths, [(return, length), ...]."""
-    env, policy = load(run)
-    return play_episodes(make_noisy(env, noises, rates), policy, args.episodes, args.seed)
+    """Play episodes; return what play_episodes does."""
+    with load(run) as (env, policy):
+        return play_episodes(make_noisy(env, noises, rates), policy, args.episodes, args.seed)
 
 
 def draw(run, noises, rates, args):
-    """Play an episode in a window or into a video: (return, length), or in words why it cannot."""
+    """Play an episode in a window or into a video: its result, or in words why it cannot."""
     try:
         if args.video:
             return record(run, noises, rates, args)
-        env, policy = load(run, "human")
-        [result] = play_episodes(make_noisy(env, noises, rates), policy, 1, args.seed)
-        return result
+        with load(run, "human") as (env, policy):
+            [result] = play_episodes(make_noisy(env, noises, rates), policy, 1, args.seed)
+            return result
     except Exception as error:  # of any library that draws, or of the environment
         return with_place(error)
 
 
 def record(run, noises, rates, args):
-    """Play one episode into a video; return (return, length)."""
+    """Play one episode into a video; return its result."""
     name = f"{run.folder.name}__{noise_slug(noises, rates) or 'clean'}.mp4"
     with tempfile.TemporaryDirectory(dir=args.video, prefix=".") as temporary:
         folder = Path(temporary, "video")  # a new one: RecordVideo warns of one that exists
-        env, policy = load(run, "rgb_array")
-        env = RecordVideo(env, str(folder), episode_trigger=lambda episode: True)
-        [result] = play_episodes(make_noisy(env, noises, rates), policy, 1, args.seed)
+        with load(run, "rgb_array") as (env, policy):
+            env = make_noisy(env, noises, rates)
+            video = RecordVideo(env, str(folder), episode_trigger=lambda episode: True)
+            try:
+                [result] = play_episodes(video, policy, 1, args.seed)
+            finally:
+                if video.recording:
+                    video.stop_recording()
         (folder / "rl-video-episode-0.mp4").replace(args.video / name)
     return result
 
 
 def play_episodes(env, policy, number, seed):
-    """Play episodes and close the environment; return [(true return, length), ...]."""
+    """Play episodes; return [(true return, length), ...].
+
+    Where the environment tells success, 1 or 0 follows.
+    """
     results = []
-    with closing(env):
-        for episode in range(number):
+    for episode in range(number):
+        with seeded_globals(seed + episode):
             observation, _ = env.reset(seed=seed + episode)
             terminated = truncated = False
             while not (terminated or truncated):
                 observation, _, terminated, truncated, info = env.step(policy(observation))
-            record = info["episode"]  # the return is a sum of numbers or of arrays
-            results.append((np.asarray(record["r"]).item(), int(record["l"])))
+        record = info["episode"]  # the return is a sum of numbers or of arrays
+        success = outcome(info)
+        told = () if math.isnan(success) else (int(success),)
+        results.append((np.asarray(record["r"]).item(), int(record["l"]), *told))
     return results
 
 
@@ -294,13 +314,17 @@ def play_all(play, tasks, args):
 
 
 def read_stored(run):
-    """Read robustness.csv: {(noise, noise rate): [(return, length), ...]}. Raises UnusableError."""
+    """Read robustness.csv: {(noise, noise rate): what play_episodes returns}.
+
+    Raises UnusableError.
+    """
     path = run.folder / "robustness.csv"
     stored = {}
     try:
         text = path.read_text("utf-8") if path.exists() else ""
         for row in csv.DictReader(text.splitlines()):
-            result = float(row["episodic_return"]), int(row["episodic_length"])
+            told = (int(row["success"]),) if row.get("success") else ()
+            result = (float(row["episodic_return"]), int(row["episodic_length"]), *told)
             stored.setdefault((row["noise"], row["noise_rate"]), []).append(result)
     except (OSError, ValueError, KeyError, TypeError, OverflowError, csv.Error) as error:
         text = f"robustness.csv: {in_words(error)}; delete that file to play everything again"
@@ -327,7 +351,8 @@ def write_stored(run, stored):
     try:
         with open(temporary, "w", encoding="utf-8") as file:
             writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(ROBUSTNESS_COLUMNS)
+            told = any(len(result) > 2 for results in stored.values() for result in results)
+            writer.writerow([*ROBUSTNESS_COLUMNS, "success"] if told else ROBUSTNESS_COLUMNS)
             for key, results in stored.items():
                 writer.writerows([*key, i, *result] for i, result in enumerate(results))
             file.flush()
@@ -371,10 +396,20 @@ def print_table(runs, conditions, stored, episodes):
 
 
 def mean_return(seeds, key, episodes):
-    """Spell the mean return under a condition, and its standard deviation if there are seeds."""
-    means = [np.mean(seed[key][:episodes], axis=0)[0] for seed in seeds]
-    spread = f" ± {np.std(means, ddof=1):.1f}" if len(means) > 1 else ""
-    return f"{np.mean(means):.1f}{spread}"
+    """Spell the mean return under a condition, and its standard deviation if there are seeds.
+
+    Behind it is the rate of success, where the environment tells it.
+    """
+    played = [seed[key][:episodes] for seed in seeds]
+    means = [np.mean([result[0] for result in results]) for results in played]
+    solved = ""
+    if any(len(result) > 2 for results in played for result in results):
+        rates = [np.mean([result[2:] == (1,) for result in results]) for results in played]
+        solved = f", {100 * np.mean(rates):.0f} % solved"
+    if len(means) == 1:
+        return rounded(means[0]) + solved
+    spread = np.std(means, ddof=1)
+    return f"{rounded(np.mean(means), spread)} ± {rounded(spread, spread)}{solved}"
 
 
 def works(code):
@@ -417,8 +452,8 @@ def show(runs, conditions, args):
         if isinstance(result, str):
             failures.append(f"{name}: {result}")
             continue
-        episodic_return, length = result
-        print(f"{name}: return {episodic_return:.1f}, {length} steps")
+        episodic_return, length, *_ = result
+        print(f"{name}: return {rounded(episodic_return)}, {length} steps")
     for failure in failures:
         print(f"error: cannot draw {failure}", file=sys.stderr)
     return bool(failures)

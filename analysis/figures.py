@@ -1,5 +1,6 @@
 """The figures of analyze.py."""
 
+from dataclasses import dataclass
 from itertools import product
 
 import matplotlib
@@ -7,59 +8,69 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.text import Text
 
-from analysis.effects import (
+from analysis.effects import effects_caption, effects_figure
+from analysis.formatting import in_metric, slug
+from analysis.runs import STUDY, rows_of, study_name
+from analysis.style import (
     COLORS,
     DIVERGING,
+    HEIGHT,
     NARROW_WIDTH,
+    STYLE,
     UNCLEAR,
     WIDTH,
     WIDTHS,
     broken,
-    cut_at,
-    effects_caption,
-    effects_figure,
+    color_limit,
     ink_on,
+    line_style,
 )
-from analysis.formatting import slug
-from analysis.runs import STUDY, rows_of, study_name
-from analysis.verdicts import seeds_of
-from noisy_wrappers import BASELINE, rate_order
+from analysis.verdicts import percent, seeds_of
+from noisy_wrappers import BASELINE, rate_order, rounded
 
-STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
-STYLE["svg.hashsalt"] = "noisy"  # equal figures are equal files
-STYLE["pdf.fonttype"] = 42  # TrueType: ICML and GECCO refuse a paper with Type 3 fonts
-STYLE["text.parse_math"] = False  # names of experiments are no formulas
-STYLE["axes.titley"] = 1.0  # above the axes, without a search for labels that are in the way
 matplotlib.rcParams.update(STYLE)
-HEIGHT = 3.6  # inches, at least
-NARROW = "_narrow"  # ends the names of figures for narrow windows
-viridis = matplotlib.colormaps["viridis"]  # ordered by lightness, so it reads in grey
+
+
+@dataclass
+class Drawing:
+    """A figure with what the report needs to know of it."""
+
+    kind: str  # effects, best_curves, curves, parameters or robustness
+    label: str  # what sets it apart from others of its kind
+    figure: Figure
+    caption: str
+    narrow: Figure | None = None  # the same for narrow windows, where there are many panels
+
+    @property
+    def name(self):
+        """The name of its files."""
+        return f"{self.kind}_{slug(self.label)}"
+
+    @property
+    def narrow_name(self):
+        """The name of the file of the narrow figure."""
+        return f"{self.name}_narrow"
 
 
 def figures(studies, tables):
-    """Yield (name, figure, caption) for every figure, in the order of the report.
-
-    The first figures are made twice where they have many panels, the second one for telephones.
-    """
+    """Yield a Drawing for every figure, in the order of the report."""
     statistics = tables["statistics"].frame
     for study in studies:
-        tested = statistics[rows_of(statistics, study.key) & statistics["p"].notna()]
+        compared = statistics[rows_of(statistics, study.key) & statistics["verdict"].notna()]
         summary = tables[f"summary_{study.algorithm}"].frame
         summary = summary[rows_of(summary, study.key)]
-        if tested["improvement_iqm_percent"].notna().any():
-            name, caption = f"effects_{slug(study.name)}", effects_caption(study, tested)
-            yield name, effects_figure(tested), caption
-            if tested["environment"].nunique() > 1:
-                yield name + NARROW, effects_figure(tested, narrow=True), caption
+        if len(compared):
+            drawing = Drawing("effects", study.name, None, effects_caption(study, compared))
+            yield in_both_widths(drawing, compared["environment"], effects_figure, compared)
         best = tables["best"].frame
         best = best[rows_of(best, study.key)]
         noises = sorted({config.noise for config in study.returns if not config.is_baseline})
         if len(best) and len(study.returns) > 2:
-            name, caption = f"best_curves_{slug(study.name)}", best_curves_caption(study)
-            yield name, best_curves_figure(study, best, tested), caption
-            if len(best) > 1:
-                yield name + NARROW, best_curves_figure(study, best, tested, narrow=True), caption
+            drawing = Drawing("best_curves", study.name, None, best_curves_caption(study))
+            what = best_curves_figure, study, best, compared
+            yield in_both_widths(drawing, best["environment"], *what)
         for noise in noises or [""]:
             yield curves_figure(study, noise)
         single = [config for config in study.returns if len(config.noises) == 1]
@@ -69,6 +80,23 @@ def figures(studies, tables):
                 yield ablation_figure(study, summary, wrapper, variants)
     if "robustness" in tables:
         yield from robustness_figures(tables["robustness"].frame)
+
+
+def reword(drawing, metric):
+    """Write of success rates, if they are the metric of a Study."""
+    drawing.caption = in_metric(drawing.caption, metric)
+    for figure in filter(None, (drawing.figure, drawing.narrow)):
+        for text in figure.findobj(Text):
+            text.set_text(in_metric(text.get_text(), metric))
+    return drawing
+
+
+def in_both_widths(drawing, environments, draw, *what):
+    """Complete a Drawing with draw(*what), narrow as well if there are several environments."""
+    drawing.figure = draw(*what)
+    if environments.nunique() > 1:
+        drawing.narrow = draw(*what, narrow=True)
+    return drawing
 
 
 def span(numbers):
@@ -188,7 +216,7 @@ def curves_figure(study, noise):
     add_legend()
     title = f"{study.name}, {noise or 'no noise'}"
     caption = f"{title}: learning curves, mean over n seeds, shaded \u00b1 one standard deviation."
-    return f"curves_{slug(title)}", fig, caption
+    return Drawing("curves", title, fig, caption)
 
 
 def ablation_figure(study, summary, wrapper, noises):
@@ -219,7 +247,7 @@ def ablation_figure(study, summary, wrapper, noises):
     add_legend()
     caption = f"{study.name}, {wrapper}: final test return by parameters and noise rate. "
     caption += "Bars: mean over n seeds, whiskers \u00b1 one standard deviation; dotted: no noise."
-    return f"parameters_{slug(study.name)}_{wrapper}", fig, caption
+    return Drawing("parameters", f"{study.name} {wrapper}", fig, caption)
 
 
 def bars(ax, place, rows, width, **look):
@@ -228,13 +256,14 @@ def bars(ax, place, rows, width, **look):
     ax.bar(place, rows["mean"], width, edgecolor="black", linewidth=0.6, **whiskers, **look)
 
 
-def heatmap(grid, framed=None, below=0.9):
-    """Draw percentages (rows x columns), with the number in each cell: return figure, axes, limit.
+def heatmap(grid, label, form, framed=None, below=0.9):
+    """Draw numbers (rows x columns), each in its cell as form(number): return figure, axes, limit.
 
-    The colours fit the data and end at \u00b1 `limit` %, which is at most 100. `framed` marks
-    cells (as `grid`, of bool); `below` is the space in inches for the names of the columns.
+    The colours fit the data and end at \u00b1 `limit`, which for percent is at most 100; `label`
+    names their unit. `framed` marks cells (as `grid`, of bool); `below` is the space in inches for
+    the names of the columns.
     """
-    limit = cut_at(grid.to_numpy())
+    limit = color_limit(grid, 100 if label == "percent" else np.inf)
     rows, columns = ([broken(name) for name in names] for names in (grid.index, grid.columns))
     lines = max(name.count("\n") for name in rows) + 1
     longest = max(len(line) for name in rows for line in name.split("\n"))
@@ -248,7 +277,7 @@ def heatmap(grid, framed=None, below=0.9):
     for (i, j), value in np.ndenumerate(grid.to_numpy()):
         if np.isfinite(value):
             ink = ink_on(value, limit)
-            ax.text(j, i, f"{round(value):+d}", ha="center", va="center", color=ink, fontsize=8)
+            ax.text(j, i, form(value), ha="center", va="center", color=ink, fontsize=8)
         if framed is not None and framed.iat[i, j]:
             box = Rectangle((j - 0.46, i - 0.46), 0.92, 0.92, fill=False, edgecolor="black", lw=1.5)
             ax.add_patch(box)
@@ -256,15 +285,15 @@ def heatmap(grid, framed=None, below=0.9):
     ax.set_yticks(range(len(rows)), rows)
     bar = fig.add_axes([(left + wide + 0.2) / WIDTH, below / height, 0.15 / WIDTH, high / height])
     clipped = np.nanmax(np.abs(grid.to_numpy())) > limit
-    fig.colorbar(image, cax=bar, extend="both" if clipped else "neither", label="percent")
+    fig.colorbar(image, cax=bar, extend="both" if clipped else "neither", label=label)
     return fig, ax, limit
 
 
 def robustness_figures(table):
-    """Yield (name, figure, caption) for every figure of robustness: heatmaps, then curves."""
+    """Yield a Drawing for every figure of robustness: heatmaps, then curves."""
     for (*study, environment), rows in table.groupby([*STUDY, "environment"]):
         clean = rows[(rows["noise"] == "") & (rows["test_noise"] == "")]["mean"]
-        if len(clean) and clean.iloc[0] != 0 and len(rows) > 1:
+        if len(clean) and len(rows) > 1:
             yield robustness_heatmap(study_name(*study), environment, rows, clean.iloc[0])
     for (*study, noise), rows in table.groupby([*STUDY, "test_noise"]):
         of_one_noise = pd.to_numeric(rows["test_rate"], errors="coerce").notna().all()
@@ -274,14 +303,17 @@ def robustness_figures(table):
 
 
 def robustness_heatmap(algorithm, environment, rows, clean):
-    """Draw training configuration x test condition: the score 100 (R - C) / |C| of every cell."""
+    """Draw training configuration x test condition: the score of every cell.
+
+    That is 100 (R - C) / |C|, or R - C where the clean return C has no percentages.
+    """
     trained = rows["noise"].where(rows["noise"] != "", "no noise") + ", " + rows["noise_rate"]
     tested = rows["test_noise"].where(rows["test_noise"] != "", "clean") + ", " + rows["test_rate"]
-    score = 100 * (rows["mean"] - clean) / abs(clean)
+    in_percent = rows["score_percent"].notna().all()
     cells = rows.assign(
         trained=trained.str.replace("no noise, 0.00", "no noise"),
         tested=tested.str.replace("clean, 0.00", "clean"),
-        score=score,
+        score=rows["score_percent"] if in_percent else rows["mean"] - clean,
         same=rows["tested_on"] == "the same noise",
     )
     # Rows and columns stand in the order of the table, which is that of noises and rates.
@@ -289,19 +321,25 @@ def robustness_heatmap(algorithm, environment, rows, clean):
     axes = {"index": "trained", "columns": "tested"}
     grid = cells.pivot(**axes, values="score").reindex(**order)
     same = cells.pivot(**axes, values="same").reindex(**order).eq(True)
+    label, form = "difference in return", rounded
+    if in_percent:
+        label, form = "percent", lambda value: percent(value).removesuffix(" %")
     longest = max(map(len, grid.columns))
-    fig, ax, limit = heatmap(grid, same, below=0.7 + 0.05 * longest)
+    fig, ax, limit = heatmap(grid, label, form, same, below=0.7 + 0.05 * longest)
     ax.tick_params(axis="x", rotation=35)
-    for label in ax.get_xticklabels():
-        label.set(ha="right", rotation_mode="anchor")
+    for text in ax.get_xticklabels():
+        text.set(ha="right", rotation_mode="anchor")
     ax.set_title(f"{algorithm} on {environment}: trained with (rows), tested with (columns)")
     caption = (
         f"{algorithm} on {environment} (seeds: {span(rows['n'])}): mean return under the noise "
     )
     caption += "of the column, of policies trained with the noise of the row, as its difference "
-    caption += "from the clean return of policies trained without noise, in percent of that. "
-    caption += f"Framed: tested on the noise of training. The colours end at \u00b1 {limit} %."
-    return f"robustness_heatmap_{slug(algorithm)}_{slug(environment)}", fig, caption
+    caption += "from the clean return of policies trained without noise"
+    caption += (
+        ", in percent of that. " if in_percent else ", which is not clearly unequal to zero. "
+    )
+    caption += f"Framed: tested on the noise of training. The colours end at \u00b1 {limit:.3g}."
+    return Drawing("robustness", f"heatmap {algorithm} {environment}", fig, caption)
 
 
 def robustness_curves(algorithm, noise, rows):
@@ -328,22 +366,17 @@ def robustness_curves(algorithm, noise, rows):
     add_legend()
     caption = f"{algorithm}, tested with {noise}: mean return over seeds against the rate, shaded "
     caption += "\u00b1 one standard deviation; one line for each noise in training."
-    return f"robustness_curves_{slug(algorithm)}_{slug(noise)}", fig, caption
+    return Drawing("robustness", f"curves {algorithm} {noise}", fig, caption)
 
 
-def line_style(i, number):
-    """Return colour, line and marker of line i of so many; the first is the baseline, in black."""
-    color = viridis(0.7 * (i - 1) / max(1, number - 2)) if i else "black"
-    return color, ["-", "--", "-.", ":"][i % 4], ["", "o", "s", "^", "D", "v", "P", "X"][i % 8]
-
-
-def write_figure(out, name, fig):
+def write_figure(out, drawing):
     """Write {name}.svg, and .pdf for LaTeX, without dates: equal figures are equal files.
 
     A narrow figure is for the report only, so it is no .pdf.
     """
-    fig.savefig(out / f"{name}.svg", metadata={"Date": None})
-    if name.endswith(NARROW):
-        return
+    fig = drawing.figure
+    fig.savefig(out / f"{drawing.name}.svg", metadata={"Date": None})
     fig.set_layout_engine("none")  # the layout is done
-    fig.savefig(out / f"{name}.pdf", metadata={"CreationDate": None})
+    fig.savefig(out / f"{drawing.name}.pdf", metadata={"CreationDate": None})
+    if drawing.narrow:
+        drawing.narrow.savefig(out / f"{drawing.narrow_name}.svg", metadata={"Date": None})

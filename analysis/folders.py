@@ -118,7 +118,7 @@ def read_config(folder):
         number("max_episode_steps", 1)
     noises, rates = args.get("noise"), args.get("noise_rate")
     try:
-        configuration = Configuration.read(noises, rates)
+        configuration = Configuration.read(noises, rates, stored=True)
     except (ValueError, TypeError, KeyError) as error:
         reason = str(error).partition("\n")[0]
         named = f"noise {shortened(noises)} at {shortened(rates)}"

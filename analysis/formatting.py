@@ -5,14 +5,16 @@ import textwrap
 import zlib
 from dataclasses import dataclass, field
 
+import numpy as np
 import pandas as pd
 from tabulate import tabulate
 
-from analysis.runs import script_name
-from noisy_wrappers import rate_order
+from analysis.runs import SUCCESS, script_name
+from analysis.verdicts import percent
+from noisy_wrappers import rate_order, rounded
 
-# Formats of numbers. z: no "-0"
-TENTH, WHOLE, PLAIN, SHARE, P_VALUE = "z,.1f", "z,.0f", "g", ".2f", ".2g"
+# Formats of numbers that have no spread. z: no "-0"
+TENTH, WHOLE, PLAIN, SHARE, P_VALUE = "z,.1f", "z,.0f", "g", "z.2f", ".2g"
 
 
 @dataclass(frozen=True)
@@ -23,11 +25,19 @@ class Table:
     frame: pd.DataFrame  # all columns, as in the csv
     caption: str  # at most two lines
     section: str  # of the report: a key of report.SECTIONS
-    formats: dict = field(default_factory=dict)  # column -> format of its numbers; others TENTH
-    how: str = ""  # how the numbers are computed
+    formats: dict = field(default_factory=dict)  # column -> format of numbers; others: see text_of
+    note: str = ""  # what to know about these rows
     only_csv: tuple = ()  # columns that would make the table wider than a page
     view: pd.DataFrame | None = None  # what people read, if that is not the frame
     rates_beside: bool = False  # a column for each noise rate, with mean, std and n in its cells
+
+
+def in_metric(text, metric):
+    """Write of success rates what was written of returns, if they are the metric of a Study."""
+    if metric != SUCCESS:
+        return text
+    text = text.replace("test return\n(sum of rewards per episode)", "test success rate (%)")
+    return text.replace("return", "success rate")
 
 
 def slug(text):
@@ -43,26 +53,53 @@ MERGED = {
     "mean": ("mean", "std"),
     "average improvement %": ("average_improvement_percent", "std_improvement_percent"),
     "IQM": ("iqm", "iqm_low", "iqm_high"),
-    "improvement (IQM) %": ("improvement_iqm_percent", "improvement_low", "improvement_high"),
+    "IQM change %": ("iqm_change_percent", "iqm_change_low", "iqm_change_high"),
     "interaction": ("interaction", "interaction_low", "interaction_high"),
     "interaction %": ("interaction_percent", "percent_low", "percent_high"),
     "difference": ("difference", "difference_low", "difference_high"),
     "P(improvement)": ("probability_of_improvement", "probability_low", "probability_high"),
-    "luck 95 % (p)": ("luck_95_percent", "p_luck_of_best"),
+    "luck 95 % (p)": ("luck_95", "p_luck_of_best"),
 }
 for _name in ("score", "worst_score", "cvar_score"):
-    MERGED[f"{_name} (baseline)"] = (_name, f"baseline_{_name}")
+    MERGED[f"{_name} % (baseline)"] = (f"{_name}_percent", f"baseline_{_name}_percent")
 for _name in ("mean", "average improvement %"):
     MERGED[f"paper: {_name}"] = tuple(f"paper_{column}" for column in MERGED[_name])
 
 
-def spelled(name, value, form):
-    """Spell one value of the column `name`; a value that does not exist is a dash."""
+def spreads(frame):
+    """Return what each number of a table may be off by: column -> Series, where that is known."""
+    found = {}
+    for name, parts in MERGED.items():
+        if parts[-1] in frame and not name.endswith(")"):
+            numbers = frame[list(parts)].astype(float)
+            spread = numbers[parts[1]]
+            if len(parts) == 3:
+                spread = (numbers[parts[2]] - numbers[parts[1]]) / 2
+            if name == "difference" and "pooled_std" in frame:
+                spread = spread.fillna(frame["pooled_std"])
+            found |= dict.fromkeys(parts, spread)
+    if "difference" in found:
+        found["detectable"] = found["difference"]
+    if "baseline_std" in found and "noisy_std" in found:
+        found["luck_95"] = np.fmax(found["baseline_std"], found["noisy_std"])
+    return found
+
+
+def text_of(name, value, form, spread=None):
+    """Return one value of the column `name` as text; a value that does not exist is a dash.
+
+    The paper's numbers have the paper's one decimal, all others the digits that their spread
+    deserves.
+    """
     if pd.isna(value):
         return "\u2013"
     if isinstance(value, str):
         return value or ("no noise" if name == "noise" else "\u2013")
-    return f"{value:{form}}"
+    if form or name.startswith("paper_"):
+        return f"{value:{form or TENTH}}"
+    if name.endswith("_percent") and spread is None:
+        return percent(value, sign="").removesuffix(" %")
+    return rounded(value, spread)
 
 
 def merged(name, parts, table, text):
@@ -88,7 +125,8 @@ def title(column):
 def shown(table):
     """Return a table as a person reads it: all text, related columns in one.
 
-    The phase is shown where a row has any, and exp_name where one is not its script's; a row of all
+    The phase and environments without percent are shown where a row has any, and exp_name where one
+    is not its script's; a row of all
     environments says so.
     """
     frame = table.frame if table.view is None else table.view
@@ -98,13 +136,14 @@ def shown(table):
     if "exp_name" in frame:
         names = [script_name(str(algorithm)) for algorithm in frame["algorithm"]]
         frame["exp_name"] = frame["exp_name"].mask(frame["exp_name"] == names, "")
-    for name in ("exp_name", "phase"):
+    for name in ("exp_name", "phase", "without_percent"):
         if name in frame and (frame[name].isna() | frame[name].eq("")).all():
             frame = frame.drop(columns=name)
-    cells = {
-        name: [spelled(name, value, table.formats.get(name, TENTH)) for value in frame[name]]
-        for name in frame
-    }
+    known, cells = spreads(frame), {}
+    for name in frame:
+        pairs = zip(frame[name], known.get(name, [None] * len(frame)), strict=True)
+        form = table.formats.get(name)
+        cells[name] = [text_of(name, value, form, spread) for value, spread in pairs]
     text = pd.DataFrame(cells, dtype=object)
     if "n_baseline_most" in text:  # over several environments: "10 to 50"
         most = text.pop("n_baseline_most")
@@ -149,8 +188,8 @@ def write_table(out, table):
     text = shown(table)
     cells = text.map(lambda cell: cell.replace("|", r"\|").replace("<", "&lt;"))
     markdown = tabulate(cells.values, text.columns, tablefmt="pipe", disable_numparse=True)
-    how = f"\n{table.how}\n" if table.how else ""
-    (out / f"{table.name}.md").write_text(f"{table.caption}\n\n{markdown}\n{how}", "utf-8")
+    note = f"\n{table.note}\n" if table.note else ""
+    (out / f"{table.name}.md").write_text(f"{table.caption}\n\n{markdown}\n{note}", "utf-8")
     latex = tabulate(text.values, text.columns, tablefmt="latex_longtable", disable_numparse=True)
     escaped = re.sub(r"([%&_#])", r"\\\1", table.caption)
     escaped = escaped.replace("|", r"\textbar{}").replace("\n", " ")

@@ -10,44 +10,35 @@ from dataclasses import dataclass
 import numpy as np
 
 from analysis.runs import STUDY, rows_of
+from analysis.statistics import LEVEL
 from noisy_wrappers import BASELINE
 
 DRAWS = 10_000
 SEEDS_TO_RESAMPLE = 20  # with fewer seeds of the baseline, returns are taken as normal
 CONSISTENT_PERCENT = 80  # of the environments, as in the paper
-LUCKY = 0.05
-# Seeds -> percent of simulated studies of 90 configurations whose best has P(luck) <= LUCKY: where
-# none does anything but a fifth of the runs end around a second, higher peak (normal returns: 5 %);
-# and where one has a true gain of 1, 1.5 and 2 standard deviations. First of analyze.py's own
-# tables, then of the paper's, from which only the baseline's standard deviation is known
-# (tests/analysis/test_luck.py, 2,000 studies each).
-FALSE_ALARMS = {5: 8, 10: 8}
-POWER_OF_BEST = {5: (10, 27, 55), 10: (24, 67, 93)}
-FALSE_ALARMS_IN_THE_PAPER = {5: 20, 10: 15}
-POWER_IN_THE_PAPER = {5: (7, 13, 26), 10: (15, 41, 74)}
 
 
 @dataclass
 class Luck:
     """What DRAWS sweeps of an algorithm show in which no noise does anything."""
 
-    best: dict  # environment -> (draws,) the highest improvement in percent
+    best: dict  # environment -> (draws,) the highest difference, in units of the return
     configurations: int  # how many there are in two or more environments
-    highest: np.ndarray  # (draws,) the highest average improvement of any of them
+    highest: np.ndarray  # (draws,) the highest average improvement of any of them, in percent
     lowest: np.ndarray  # (draws,) the lowest one
     consistent: np.ndarray  # (draws,) how many of them count as consistent
     consistently_worse: np.ndarray  # (draws,) how many are worse in every environment
 
 
-def draw_improvements(mean, std, df, n_baseline, n_noisy, rng, seeds=()):
-    """Draw the improvements of configurations that do nothing, in percent of |mean|.
+def draw_differences(std, df, n_baseline, n_noisy, rng, seeds=()):
+    """Draw the differences of configurations that do nothing from their baseline.
 
     The standard deviation `std` was estimated with `df` degrees of freedom, so each draw has its
     own, std sqrt(df / chi2_df). For a single configuration this is Student's t-test. Returns are
     normal, or have the shape of the baseline's `seeds` if there are SEEDS_TO_RESAMPLE or more.
 
-    mean, std, df, n_baseline: numbers; n_noisy (configs,), 0 where there is no run
-    -> (configs x draws), NaN where there is no run.
+    std, df, n_baseline: numbers; n_noisy (configs,), 0 where there is no run
+    -> (configs x draws) in units of std, NaN where there is no run.
     """
     spread = std * np.sqrt(df / rng.chisquare(df, DRAWS))
     resample = len(seeds) >= SEEDS_TO_RESAMPLE and np.ptp(seeds) > 0
@@ -60,11 +51,11 @@ def draw_improvements(mean, std, df, n_baseline, n_noisy, rng, seeds=()):
         return rng.standard_normal(DRAWS) / np.sqrt(n)
 
     baseline = mean_of(n_baseline)
-    improvements = np.full((len(n_noisy), DRAWS), np.nan)
+    differences = np.full((len(n_noisy), DRAWS), np.nan)
     for i, n in enumerate(n_noisy):
         if n > 0:
-            improvements[i] = 100 * spread * (mean_of(n) - baseline) / abs(mean)
-    return improvements
+            differences[i] = spread * (mean_of(n) - baseline)
+    return differences
 
 
 def pooled_std(samples):
@@ -74,8 +65,12 @@ def pooled_std(samples):
     return np.sqrt(squares / max(1, df)), df
 
 
-def summarize(environments, draws):
-    """Make a Luck of improvements (envs x configs x draws) that are NaN where there is no run."""
+def summarize(environments, draws, percents):
+    """Make a Luck of differences (envs x configs x draws) that are NaN where there is no run.
+
+    percents (envs,): what a difference of 1 is in percent of the baseline, NaN where percentages
+    mean nothing.
+    """
     tried = np.isfinite(draws[..., 0])
     best = {
         name: values[here].max(axis=0)
@@ -84,15 +79,17 @@ def summarize(environments, draws):
     }
     several = tried.sum(axis=0) > 1
     draws, number = draws[:, several], tried[:, several].sum(axis=0)[:, None]
-    average = np.nansum(draws, axis=0) / number
-    percent = 100 * (draws >= 0).sum(axis=0) / number  # NaN >= 0 is false
+    share = 100 * (draws >= 0).sum(axis=0) / number  # NaN >= 0 is false
+    improvements = draws * percents[:, None, None]
+    averaged = np.isfinite(improvements[..., 0]).sum(axis=0)[:, None]
+    average = np.nansum(improvements, axis=0) / np.where(averaged, averaged, np.nan)
     return Luck(
         best=best,
         configurations=int(several.sum()),
-        highest=average.max(axis=0, initial=-np.inf),
-        lowest=average.min(axis=0, initial=np.inf),
-        consistent=(percent >= CONSISTENT_PERCENT).sum(axis=0),
-        consistently_worse=(percent == 0).sum(axis=0),
+        highest=np.fmax.reduce(average, axis=0, initial=-np.inf),
+        lowest=np.fmin.reduce(average, axis=0, initial=np.inf),
+        consistent=(share >= CONSISTENT_PERCENT).sum(axis=0),
+        consistently_worse=(share == 0).sum(axis=0),
     )
 
 
@@ -101,17 +98,16 @@ def luck_of_study(study):
     rng = np.random.default_rng(0)
     configs = [config for config in study.returns if config != BASELINE]
     draws = np.full((len(study.environments), len(configs), DRAWS), np.nan)
+    percents = np.array([study.percent_of(1.0, e) for e in range(len(study.environments))])
     for e in range(len(study.environments)):
         samples = [study.final(config)[:, e] for config in (BASELINE, *configs)]
         samples = [sample[np.isfinite(sample)] for sample in samples]
         baseline, noisy = samples[0], samples[1:]
         std, df = pooled_std(samples)
-        if len(baseline) and baseline.mean() != 0 and df > 0:
+        if len(baseline) and df > 0:
             n_noisy = [len(sample) for sample in noisy]
-            draws[e] = draw_improvements(
-                baseline.mean(), std, df, len(baseline), n_noisy, rng, baseline
-            )
-    return summarize(study.environments, draws)
+            draws[e] = draw_differences(std, df, len(baseline), n_noisy, rng, baseline)
+    return summarize(study.environments, draws, percents)
 
 
 def luck_of_paper(best, seeds, configurations):
@@ -127,17 +123,21 @@ def luck_of_paper(best, seeds, configurations):
     for key, rows in best.groupby(STUDY):
         rng, n = np.random.default_rng(0), seeds[key[0]]
         draws = [
-            draw_improvements(
-                row.baseline_mean, row.baseline_std, n - 1, n, configurations * [n], rng
-            )
-            for row in rows.itertuples()
+            draw_differences(std, n - 1, n, configurations * [n], rng)
+            for std in rows["baseline_std"]
         ]
-        lucks[key] = summarize(list(rows["environment"]), np.stack(draws))
+        percents = 100 / rows["baseline_mean"].abs().to_numpy()
+        lucks[key] = summarize(list(rows["environment"]), np.stack(draws), percents)
     return lucks
 
 
-def p_value(draws, observed):
-    """P(a draw is as high as `observed`), the observation counted as a draw: never zero."""
+def p_of_luck(draws, observed):
+    """P(a draw is as high as `observed`), the observation counted as a draw: never zero.
+
+    NaN where nothing was observed: no environment has percentages.
+    """
+    if np.isnan(observed):
+        return np.nan
     return (1 + (draws >= observed).sum()) / (1 + len(draws))
 
 
@@ -146,13 +146,13 @@ def add_luck_of_best(best, lucks):
 
     lucks: a dict of what the columns STUDY have -> Luck.
     """
-    best = best.assign(luck_median_percent=np.nan, luck_95_percent=np.nan, p_luck=np.nan)
+    best = best.assign(luck_median=np.nan, luck_95=np.nan, p_luck=np.nan)
     for row in best.itertuples():
         draws = lucks[row.algorithm, row.exp_name, row.phase].best.get(row.environment)
         if draws is not None:
-            best.loc[row.Index, "luck_median_percent"] = np.median(draws)
-            best.loc[row.Index, "luck_95_percent"] = np.quantile(draws, 0.95)
-            best.loc[row.Index, "p_luck"] = p_value(draws, row.improvement_percent)
+            best.loc[row.Index, "luck_median"] = np.median(draws)
+            best.loc[row.Index, "luck_95"] = np.quantile(draws, 0.95)
+            best.loc[row.Index, "p_luck"] = p_of_luck(draws, row.difference)
     return best
 
 
@@ -164,9 +164,9 @@ def add_luck_of_consistent(good, bad, lucks):
     """
     columns = [*STUDY, "average_improvement_percent"]
     rows = good[columns].itertuples(index=False)
-    good = good.assign(p_luck=[p_value(lucks[*key].highest, value) for *key, value in rows])
+    good = good.assign(p_luck=[p_of_luck(lucks[*key].highest, value) for *key, value in rows])
     rows = bad[columns].itertuples(index=False)
-    bad = bad.assign(p_luck=[p_value(-lucks[*key].lowest, -value) for *key, value in rows])
+    bad = bad.assign(p_luck=[p_of_luck(-lucks[*key].lowest, -value) for *key, value in rows])
     return good, bad
 
 
@@ -182,7 +182,7 @@ def luck_rows(lucks, best, good, bad):
         if len(p_best) == 0:
             continue
         row = dict(zip(STUDY, key, strict=True)) | {"environments": len(p_best)}
-        row |= {"best_beyond_luck": (p_best <= LUCKY).sum(), "configurations": luck.configurations}
+        row |= {"best_beyond_luck": (p_best <= LEVEL).sum(), "configurations": luck.configurations}
         if luck.configurations:
             row |= count_row("consistent", p_good, luck.consistent)
             row |= count_row("consistently_worse", p_bad, luck.consistently_worse)
@@ -195,6 +195,6 @@ def count_row(name, p, draws):
         name: len(p),
         f"{name}_by_luck": draws.mean(),
         f"{name}_by_luck_95": np.quantile(draws, 0.95),
-        f"p_{name}": p_value(draws, len(p)),
-        f"{name}_beyond_luck": (p <= LUCKY).sum(),
+        f"p_{name}": p_of_luck(draws, len(p)),
+        f"{name}_beyond_luck": (p <= LEVEL).sum(),
     }

@@ -22,7 +22,7 @@ PAPER_FILES = {
     "consistently_worse": "consistently_worse.csv",
     "early_performance": "early_performance*.csv",  # one for each algorithm
 }
-LUCK = ("luck_median_percent", "luck_95_percent", "p_luck")
+LUCK = ("luck_median", "luck_95", "p_luck")
 FINAL = ("mean", "std", "n")
 AVERAGE = ("average_improvement_percent", "std_improvement_percent", "environments")
 
@@ -78,6 +78,7 @@ def compare_tables(paper, lengths, summary, best, consistency, good, bad, early)
 def with_luck(paper):
     """Add to the paper's tables what luck alone would show, and return its table of luck, too."""
     best, good, bad = (paper[name] for name in ("best", "consistent", "consistently_worse"))
+    best = best.assign(difference=best["noisy_mean"] - best["baseline_mean"])
     lucks = luck_of_paper(best, PAPER_SEEDS, PAPER_CONFIGURATIONS)
     best = add_luck_of_best(best, lucks)
     good, bad = add_luck_of_consistent(good, bad, lucks)

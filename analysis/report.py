@@ -4,13 +4,13 @@ Figures that the page shows folded are files beside it; all else is in the page.
 """
 
 import base64
+import os
 import re
 from pathlib import Path
 
 import jinja2
 from markupsafe import Markup, escape
 
-from analysis.figures import NARROW
 from analysis.formatting import shown
 from analysis.robustness import robustness_sentences
 from analysis.runs import AVERAGED
@@ -23,6 +23,7 @@ SECTIONS = {
     "consistent": "Consistent noise",
     "consistently_worse": "Consistently worse",
     "luck": "Luck",
+    "success": "Success",
     "statistics": "Statistics",
     "parameters": "Parameters",
     "interactions": "Two noises together",
@@ -30,14 +31,15 @@ SECTIONS = {
     "summary": "All results",
     "missing": "Runs left out",
 }
-FIGURES_OF = {"best": "early_performance", "curves": "early_performance"}
+FIGURES_OF = {"best_curves": "early_performance", "curves": "early_performance"}
 FOLDED = ("curves", "parameters")  # where there are several: one for each noise
 ROWS = 15  # a longer table is folded
+DOCS = Path(__file__).parents[1] / "docs/statistics.md"  # how all numbers are computed
 
 
 def breakable(text):
     """Mark where a browser may break a cell: a noise between its words, but never a number."""
-    if re.match("-?[0-9]", text):
+    if re.match("[-+]?[0-9]", text):
         text = text.replace(" \u00b1 ", "\u00a0\u00b1\u00a0").replace(", ", ",\u00a0")
         whole = Markup('<span class="whole">{}</span>')  # a browser would break "1e-05"
         parts = [whole.format(part) if "e-" in part else part for part in text.split(" ")]
@@ -53,7 +55,8 @@ def source(path):
 def sections_of(out, tables, drawn):
     """Arrange the tables and figures as the page shows them; a section without any is left out.
 
-    Return the figures of the effects, which are in no section, and a list of dicts.
+    drawn: every Drawing. Return the figures of the effects, which are in no section, and a list of
+    dicts.
     """
     sections = {
         key: {"id": key, "title": title, "said": [], "tables": [], "figures": [], "folded": []}
@@ -64,22 +67,22 @@ def sections_of(out, tables, drawn):
         if len(table.frame):
             text = shown(table)
             text = text.loc[:, (text != "\u2013").any()]  # a column of dashes says nothing
-            entry = {"name": table.name, "caption": table.caption, "how": table.how}
+            entry = {"name": table.name, "caption": table.caption, "note": table.note}
             entry |= {"columns": text.columns, "rows": text.values.tolist()}
             sections[table.section]["tables"].append(entry)
     if "robustness_score" in tables:
         said = robustness_sentences(tables["robustness_score"].frame)
         sections["robustness"]["said"] = list(said)
-    kinds = [name.split("_")[0] for name, _ in drawn]
-    for kind, (name, caption) in zip(kinds, drawn, strict=True):
-        section = sections.get(FIGURES_OF.get(kind, kind))
-        if kind in FOLDED and kinds.count(kind) > 1:
-            section["folded"].append({"src": f"{name}.svg", "caption": caption})
+    kinds = [drawing.kind for drawing in drawn]
+    for drawing in drawn:
+        section = sections.get(FIGURES_OF.get(drawing.kind, drawing.kind))
+        file, caption = f"{drawing.name}.svg", drawing.caption
+        if drawing.kind in FOLDED and kinds.count(drawing.kind) > 1:
+            section["folded"].append({"src": file, "caption": caption})
             continue
-        entry = {"src": source(out / f"{name}.svg"), "caption": caption}
-        narrow = out / f"{name}{NARROW}.svg"
-        if narrow.exists():
-            entry["narrow"] = source(narrow)
+        entry = {"src": source(out / file), "caption": caption}
+        if drawing.narrow:
+            entry["narrow"] = source(out / f"{drawing.narrow_name}.svg")
         (effects if section is None else section["figures"]).append(entry)
     shown_ones = [s for s in sections.values() if s["tables"] or s["figures"] or s["folded"]]
     return effects, shown_ones
@@ -93,9 +96,6 @@ def write_report(out, verdicts, tables, drawn, overview, problems, notes):
     pages.filters["breakable"] = breakable
     effects, sections = sections_of(out, tables, drawn)
     first, rest = clear_first(verdicts)
-    names_of = {}  # text -> the tables that it explains
-    for table in (table for section in sections for table in section["tables"] if table["how"]):
-        names_of.setdefault(table["how"], []).append(table["name"])
     averaged = [note for note in notes if AVERAGED in note]  # these change no verdict
     html = pages.get_template("report.html.jinja").render(
         effects=effects,
@@ -103,9 +103,9 @@ def write_report(out, verdicts, tables, drawn, overview, problems, notes):
         first=first.to_dict("records"),
         rest=rest.to_dict("records"),
         rest_tally=tally(rest["verdict"]),
-        together=(rest["scope"] == "all").any(),
+        with_all=(rest["scope"] == "all").any(),
         sections=sections,
-        names_of=names_of,
+        docs=os.path.relpath(DOCS, out),
         most_rows=ROWS,
         overview=overview,
         problems=problems,

@@ -3,13 +3,11 @@
 evaluate.py writes these files. The unit of replication is the seed: a run's value under a test
 condition is the mean over its episodes there.
 
-The primary figure is the score on noise that was not in training: 100 (R - C) / |C|, where R is a
-run's mean return under a condition and C the mean clean return of the policies trained without
-noise in that environment, averaged equally over the conditions. A condition counts if it is not
-clean, none of its wrappers was in training, and none is reward noise or early termination, which
-change no policy's behaviour in a test. It is compared with the score of the policies trained
-without noise under the same conditions, by the exact test of the mean win rate over
-environments, with Holm's correction over the training configurations of an algorithm.
+The primary figure is the return under noise that was not in training, averaged equally over the
+conditions. A condition counts if it is not clean, none of its wrappers was in training, and none is
+reward noise or early termination, which change no policy's behaviour in a test. It is compared with
+that of the policies trained without noise under the same conditions, by the test of all verdicts
+(statistics.compare), with Holm's correction over the training configurations of an algorithm.
 """
 
 from pathlib import Path
@@ -19,61 +17,40 @@ import pandas as pd
 
 from analysis.formatting import P_VALUE, SHARE, WHOLE, Table
 from analysis.runs import KEYS, ROBUSTNESS_COLUMNS, STUDY, study_name
-from analysis.statistics import (
-    DETECTABLE,
-    LEVEL,
-    contrast,
-    holm,
-    improvement_percent,
-    mann_whitney,
-    mean_std,
-    probability_of_improvement,
+from analysis.statistics import compare, holm, mean_std, percent_of
+from analysis.verdicts import (
+    borderline,
+    counted,
+    difference,
+    p_value,
+    percent,
+    significant,
+    spread_of,
 )
-from analysis.verdicts import counted, p_value
-from noisy_wrappers import BASELINE, WRAPPERS, Configuration
+from noisy_wrappers import BASELINE, WRAPPERS, Configuration, rounded
 
 FILES = ("robustness.csv", "robustness.csv.gz")
 CONDITION = ["test_noise", "test_rate"]
 CLEAN = BASELINE  # a condition of a test is a Configuration, too
 RUN_COLUMNS = [*KEYS, "configuration", "seed", *CONDITION, "condition", "mean", "cvar"]
-COLUMNS = [*KEYS, *CONDITION, "tested_on", "n", "mean", "std", "change_percent", "cvar"]
-SCORE_COLUMNS = [*STUDY, "scope", "environment", "noise", "noise_rate", "n", "n_baseline"]
-SCORE_COLUMNS += ["conditions", "score", "baseline_score"]
-SCORE_COLUMNS += ["difference", "difference_low", "difference_high"]
-SCORE_COLUMNS += ["win_rate", "p", "p_holm"]
-SCORE_COLUMNS += ["smallest_p", "detectable"]
-SCORE_COLUMNS += ["clean_change_percent", "cvar_score", "baseline_cvar_score"]
-SCORE_COLUMNS += ["worst_score", "baseline_worst_score", "worst_condition"]
+COLUMNS = [*KEYS, *CONDITION, "tested_on", "n", "mean", "std", "difference", "change_percent"]
+COLUMNS += ["cvar", "score_percent"]
+_SCORE_COLUMNS = """scope environment noise noise_rate n n_baseline conditions difference
+    difference_low difference_high difference_percent effect_size p p_holm detectable score_percent
+    baseline_score_percent clean_change_percent cvar_score_percent baseline_cvar_score_percent
+    worst_score_percent baseline_worst_score_percent worst_condition t pooled_std smallest_p"""
+SCORE_COLUMNS = [*STUDY, *_SCORE_COLUMNS.split()]
 FORMATS = dict.fromkeys(("n", "n_baseline", "conditions"), WHOLE)
-FORMATS |= dict.fromkeys(("p", "p_holm", "smallest_p"), P_VALUE) | {"win_rate": SHARE}
-
-CAPTIONS = {
-    "robustness_score": """Primary figure of robustness: the score on noise that was not in
-training, of policies trained with noise and without.""",
+FORMATS |= dict.fromkeys(("p", "p_holm", "smallest_p"), P_VALUE)
+FORMATS |= dict.fromkeys(("effect_size", "t"), SHARE)
+ONLY_CSV = {"robustness_score": ("t", "pooled_std", "smallest_p"), "robustness": ("score_percent",)}
+CAPTIONS = {  # at most two lines in the report; docs/statistics.md says how they are computed
+    "robustness_score": """Primary figure of robustness: the mean return under noise that was not in
+training, of policies trained with noise and without. Scores: relative to the clean return.""",
     "robustness": """Return under every test condition: mean \u00b1 standard deviation over n seeds,
-and change against the policies trained without noise.""",
+and difference from the policies trained without noise.""",
 }
-HOW = {
-    "robustness_score": """Score: 100 (R - C) / |C|, averaged equally over the test conditions that
-are not clean and have no wrapper of the training (and neither reward noise nor early termination),
-where R is the mean return of a run under a condition and C the mean clean return of the policies
-trained without noise. Baseline score: the same of the policies trained without noise, under the
-same conditions. [ ]: 95 % interval (Welch, Satterthwaite). Win rate: how often a policy has a
-higher score than one trained without noise, averaged over environments. p: its exact two-sided
-test, in one environment Mann and Whitney's; it decides where the interval says otherwise. Holm:
-corrected for the training configurations of an algorithm; smallest p: what these numbers of seeds
-could reach at most; detectable: the difference that they find with 80 % power, for normal scores.
-Rows of one environment are secondary where there is one of all. Clean change: how much better or
-worse the policies are without any noise, so that a better policy is not taken for a more robust
-one. Worst: the lowest score under one condition. CVaR: the score of the worst tenth of the episodes
-of each seed.""",
-    "robustness": """Change: against the policies trained without noise under the same condition.
-Tested on: clean; the same noise as in training; the same wrapper with other parameters or another
-rate; new noise. CVaR: mean of the worst tenth of a seed's episodes, then over seeds.""",
-}
-CAPTIONS, HOW = (
-    {name: " ".join(text.split()) for name, text in texts.items()} for texts in (CAPTIONS, HOW)
-)
+CAPTIONS = {name: " ".join(text.split()) for name, text in CAPTIONS.items()}
 
 
 def read_robustness(runs_dir, runs):
@@ -94,8 +71,8 @@ def read_robustness(runs_dir, runs):
             continue
         keys = [getattr(run, name) for name in (*KEYS, "configuration", "seed")]
         for condition, returns in episodes.items():
-            spelled = condition.noise, condition.noise_rate
-            rows.append((*keys, *spelled, condition, returns.mean(), cvar(returns)))
+            texts = condition.noise, condition.noise_rate
+            rows.append((*keys, *texts, condition, returns.mean(), cvar(returns)))
     return pd.DataFrame(rows, columns=RUN_COLUMNS), notes
 
 
@@ -103,7 +80,7 @@ def read_episodes(path):
     """Read one file: a dict of Configuration -> returns of its episodes. Raises ValueError."""
     text = {"noise": str, "noise_rate": str}
     table = pd.read_csv(path, dtype=text, keep_default_na=False)
-    if list(table.columns) != ROBUSTNESS_COLUMNS:
+    if list(table.columns) not in (ROBUSTNESS_COLUMNS, [*ROBUSTNESS_COLUMNS, "success"]):
         raise ValueError("unexpected header")
     returns = pd.to_numeric(table["episodic_return"])
     if not np.isfinite(returns).all() or not len(returns):
@@ -111,7 +88,8 @@ def read_episodes(path):
     groups = returns.groupby([table["noise"], table["noise_rate"]], sort=False)
     found = {Configuration.parse(*key): group.to_numpy(float) for key, group in groups}
     for name in set().union(*(condition.wrappers for condition in found)) - WRAPPERS.keys():
-        raise ValueError(f"unknown noise {name!r}")
+        if ":" not in name:  # else one of the user's own
+            raise ValueError(f"unknown noise {name!r}")
     return found
 
 
@@ -122,14 +100,10 @@ def cvar(returns):
 
 def is_unseen(condition, config):
     """Tell whether a test condition counts in the score of a training configuration."""
-    changes_behaviour = not condition.kinds & {"reward", "dynamics"}
+    ends = "RandomEarlyTermination" in condition.wrappers
+    changes_behaviour = "reward" not in condition.kinds and not ends
     new = set(condition.wrappers).isdisjoint(config.wrappers)
     return not condition.is_baseline and changes_behaviour and new
-
-
-def is_seen(condition, config):
-    """Tell whether a test condition consists of wrappers that were in training."""
-    return not condition.is_baseline and set(condition.wrappers) <= set(config.wrappers)
 
 
 def tested_on(condition, config):
@@ -152,7 +126,7 @@ def by_run(runs, config, value):
 def condition_rows(runs):
     """Yield one row per training configuration and test condition, in each environment."""
     for key, group in runs.groupby([*STUDY, "environment"]):
-        baseline = by_run(group, BASELINE, "mean").mean()
+        baseline = by_run(group, BASELINE, "mean")
         for config in sorted(set(group["configuration"])):
             means, cvars = by_run(group, config, "mean"), by_run(group, config, "cvar")
             for condition in sorted(means.columns):
@@ -162,57 +136,58 @@ def condition_rows(runs):
                 row |= {"tested_on": tested_on(condition, config), "n": n, "mean": mean, "std": std}
                 row["cvar"] = cvars[condition].mean()
                 if config != BASELINE and condition in baseline:
-                    row["change_percent"] = improvement_percent(mean, baseline[condition])
+                    alone = baseline[condition].to_numpy()
+                    row["difference"] = mean - np.nanmean(alone)
+                    row["change_percent"] = percent_of(row["difference"], alone)
+                if CLEAN in baseline:
+                    clean = baseline[CLEAN].to_numpy()
+                    row["score_percent"] = percent_of(mean - np.nanmean(clean), clean)
                 yield row
 
 
-def environment_scores(runs, config, counts):
+def environment_scores(runs, config):
     """Score a configuration and the baseline in one environment, or return None.
 
-    runs: those of one study and environment. counts(condition, config) tells which conditions
-    count. The result is a dict with arrays: `x` (seeds) and `y` (baseline seeds) are scores,
-    `x_cvar` and `y_cvar` the same of the worst tenth of the episodes, `clean` (seeds) is the change
-    of the clean return in percent; `x_conditions` and `y_conditions` are Series with the mean score
-    under each condition.
+    runs: those of one study and environment. The result is a dict: `x` (seeds) and `y` (baseline
+    seeds) are mean returns over the conditions; in percent of the clean return C of the baseline,
+    NaN where that has no percentages, are `percent` (what a difference of 1 is), `scores`,
+    `cvar_scores` (of the worst tenth of the episodes) and `worst_scores` (under each condition),
+    pairs of x and y, and `clean_change`.
     """
     x, y = by_run(runs, config, "mean"), by_run(runs, BASELINE, "mean")
     if x.empty or y.empty or CLEAN not in x or CLEAN not in y:
         return None
     shared = x.columns.intersection(y.columns)
     whole = [c for c in shared if x[c].notna().all() and y[c].notna().all()]
-    conditions = [condition for condition in whole if counts(condition, config)]
-    clean = y[CLEAN].mean()
-    if not conditions or clean == 0:
+    conditions = [condition for condition in whole if is_unseen(condition, config)]
+    if not conditions:
         return None
+    clean, percent = y[CLEAN].mean(), percent_of(1.0, y[CLEAN].to_numpy())
 
-    def score(values):
-        return improvement_percent(values[conditions], clean)
+    def scores(tables):
+        return [(table[conditions].mean() - clean) * percent for table in tables]
 
-    x_cvar = by_run(runs, config, "cvar")
-    y_cvar = by_run(runs, BASELINE, "cvar")
+    cvars = by_run(runs, config, "cvar"), by_run(runs, BASELINE, "cvar")
     return {
-        "x": score(x).mean(axis=1).to_numpy(),
-        "y": score(y).mean(axis=1).to_numpy(),
-        "x_cvar": score(x_cvar).mean(axis=1).to_numpy(),
-        "y_cvar": score(y_cvar).mean(axis=1).to_numpy(),
-        "clean": improvement_percent(x[CLEAN].dropna().to_numpy(), clean),
-        "x_conditions": score(x).mean(),
-        "y_conditions": score(y).mean(),
+        "x": x[conditions].mean(axis=1).to_numpy(),
+        "y": y[conditions].mean(axis=1).to_numpy(),
+        "percent": percent,
+        "scores": [score.mean() for score in scores((x, y))],
+        "cvar_scores": [score.mean() for score in scores(cvars)],
+        "worst_scores": scores((x, y)),
+        "clean_change": (x[CLEAN].mean() - clean) * percent,
     }
 
 
-def score_rows(runs, counts=is_unseen):
-    """Yield the score of every configuration with noise: over all environments, then in each.
-
-    counts(condition, config) tells whether a test condition counts for a training configuration.
-    """
+def score_rows(runs):
+    """Yield the score of every configuration with noise: over all environments, then in each."""
     for study, group in runs.groupby(STUDY):
         for config in sorted(set(group["configuration"])):
             if config == BASELINE:
                 continue
             scores = {}
             for environment, same in group.groupby("environment"):
-                found = environment_scores(same, config, counts)
+                found = environment_scores(same, config)
                 if found:
                     scores[environment] = found
             if len(scores) > 1:
@@ -224,47 +199,33 @@ def score_rows(runs, counts=is_unseen):
 def score_row(study, scope, environment, config, scores):
     """Return one row of scores; environments count equally, whatever their number of seeds."""
     found = list(scores.values())
-    cells = [part["x"] for part in found] + [part["y"] for part in found]
-    weights = [1 / len(found)] * len(found) + [-1 / len(found)] * len(found)
-    difference, error, low, high = contrast(cells, weights)
     x, y = (stacked(part[name] for part in found) for name in ("x", "y"))
-    p, smallest_p = mann_whitney(x, y)
-    win_rate, _, _ = probability_of_improvement(x, y)
-    worst = {
-        (name, condition): value
-        for name, part in scores.items()
-        for condition, value in part["x_conditions"].items()
-    }
-    worst_place, worst_condition = min(worst, key=worst.get)
+    comparison = compare(x, y)._asdict()
+    percents = [part["percent"] * (part["x"].mean() - part["y"].mean()) for part in found]
+    worst, worst_of_baseline = {}, []
+    for name, part in scores.items():
+        own, baseline = part["worst_scores"]
+        worst |= {(name, condition): value for condition, value in own.items()}
+        worst_of_baseline.append(baseline.min())
+    worst_place, condition = min(worst, key=worst.get)
     where = f" on {worst_place}" if scope == "all" else ""
-
-    def average(name):
-        return np.mean([np.mean(part[name]) for part in found])
-
-    return {
-        **dict(zip(STUDY, study, strict=True)),
-        "scope": scope,
-        "environment": environment,
-        "noise": config.noise,
-        "noise_rate": config.noise_rate,
-        "n": min(len(part["x"]) for part in found),
-        "n_baseline": min(len(part["y"]) for part in found),
-        "conditions": min(len(part["x_conditions"]) for part in found),
-        "score": average("x"),
-        "baseline_score": average("y"),
-        "difference": difference,
-        "difference_low": low,
-        "difference_high": high,
-        "win_rate": win_rate,
-        "p": p,
-        "smallest_p": smallest_p,
-        "detectable": DETECTABLE * error,
-        "clean_change_percent": average("clean"),
-        "worst_score": min(worst.values()),
-        "baseline_worst_score": min(part["y_conditions"].min() for part in found),
-        "worst_condition": f"{worst_condition.noise} at {worst_condition.noise_rate}{where}",
-        "cvar_score": average("x_cvar"),
-        "baseline_cvar_score": average("y_cvar"),
+    known = np.isfinite(percents).all()  # what has no percentages cannot be ranked or averaged
+    score, baseline_score = np.mean([part["scores"] for part in found], axis=0)
+    cvar_score, baseline_cvar_score = np.mean([part["cvar_scores"] for part in found], axis=0)
+    row = dict(zip(STUDY, study, strict=True)) | comparison
+    row |= {"scope": scope, "environment": environment}
+    row |= {"noise": config.noise, "noise_rate": config.noise_rate}
+    return row | {
+        "conditions": min(len(part["worst_scores"][0]) for part in found),
+        "difference_percent": np.mean(percents),
+        "score_percent": score,
+        "baseline_score_percent": baseline_score,
+        "clean_change_percent": np.mean([part["clean_change"] for part in found]),
+        "cvar_score_percent": cvar_score,
+        "baseline_cvar_score_percent": baseline_cvar_score,
+        "worst_score_percent": worst[worst_place, condition] if known else np.nan,
+        "baseline_worst_score_percent": min(worst_of_baseline) if known else np.nan,
+        "worst_condition": f"{condition.noise} at {condition.noise_rate}{where}" if known else "",
     }
 
 
@@ -279,9 +240,9 @@ def stacked(samples):
 
 def primary(scores):
     """Return which rows of scores are primary: of all environments, or of the only one."""
-    together = (scores["scope"] == "all").astype(bool)
+    of_all = (scores["scope"] == "all").astype(bool)
     keys = [*STUDY, "noise", "noise_rate"]
-    return together | ~together.groupby([scores[name] for name in keys]).transform("any")
+    return of_all | ~of_all.groupby([scores[name] for name in keys]).transform("any")
 
 
 def robustness_tables(runs):
@@ -290,15 +251,11 @@ def robustness_tables(runs):
         return {}
     table = pd.DataFrame(condition_rows(runs), columns=COLUMNS)
     scores = pd.DataFrame(score_rows(runs), columns=SCORE_COLUMNS)
-    for _, family in scores[primary(scores)].groupby(STUDY):
+    for _, family in scores[primary(scores) & scores["p"].notna()].groupby(STUDY):
         scores.loc[family.index, "p_holm"] = holm(family["p"].to_numpy(float))
-    tables = {"robustness_score": scores, "robustness": table}
-    only_csv = {"robustness_score": ("smallest_p",)}
     return {
-        name: Table(
-            name, frame, CAPTIONS[name], "robustness", FORMATS, HOW[name], only_csv.get(name, ())
-        )
-        for name, frame in tables.items()
+        name: Table(name, frame, CAPTIONS[name], "robustness", FORMATS, only_csv=ONLY_CSV[name])
+        for name, frame in (("robustness_score", scores), ("robustness", table))
     }
 
 
@@ -307,19 +264,22 @@ def robustness_sentences(scores):
     for row in scores[primary(scores)].itertuples():
         where = row.environment or "all environments together"
         study = study_name(row.algorithm, row.exp_name, row.phase)
-        verdict = "no clear difference in robustness to new noise"
-        if row.p <= LEVEL:
-            more = "more" if row.win_rate > 0.5 else "less"
-            verdict = f"{'' if row.p_holm <= LEVEL else 'perhaps '}{more} robust to new noise"
-        limit = ""
-        if row.smallest_p > LEVEL:
+        start = f"{study} on {where}, trained with {row.noise} at rate {row.noise_rate}"
+        evidence, limit = difference(row), ""
+        if pd.isna(row.p):
+            verdict = "too few seeds for a test of robustness to new noise"
+        elif significant(row.p):
+            more = "more" if row.t > 0 else "less"
+            verdict = f"{'' if significant(row.p_holm) else 'perhaps '}{more} robust to new noise"
+        else:
+            verdict = "no clear difference in robustness to new noise"
+        if pd.notna(row.p):
+            evidence += f", p {p_value(row.p)}, Holm {p_value(row.p_holm).removeprefix('= ')}"
+        if not significant(row.smallest_p):
             limit = f"; {counted(row.n, 'seed')} against {row.n_baseline} cannot show any"
-        elif row.p > LEVEL and row.detectable > 0:
-            limit = f"; a difference of {row.detectable:.0f} would have been seen (80 % power)"
-        corrected = p_value(row.p_holm).removeprefix("= ")
-        yield (
-            f"{study} on {where}, trained with {row.noise} at rate {row.noise_rate}: "
-            f"{verdict} (score {row.score:.0f} against {row.baseline_score:.0f} without noise in "
-            f"training, p {p_value(row.p)}, Holm {corrected}; clean return "
-            f"{row.clean_change_percent:+.0f} %){limit}."
-        )
+        elif not significant(row.p) and row.detectable > 0:
+            found = rounded(row.detectable, spread_of(row))
+            limit = f"; a difference of {found} would have been seen (80 % power)"
+        if pd.notna(row.clean_change_percent):
+            evidence += f"; clean return {percent(row.clean_change_percent)}"
+        yield f"{start}: {verdict} ({evidence}){limit}.{borderline(row)}"

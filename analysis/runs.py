@@ -29,13 +29,15 @@ from analysis.folders import (
     read_result,
     runs_of,
 )
+from analysis.statistics import percent_of
 from noisy_wrappers import BASELINE, Configuration
 
 STUDY = ["algorithm", "exp_name", "phase"]  # the columns that name a study: see study_name
 KEYS = [*STUDY, "environment", "noise", "noise_rate"]
-EVAL_HEADER = "step,episode,episodic_return,episodic_length\n"
+SUCCESS = "success rate"  # what a Study may have in place of returns
+EVAL_COLUMNS = ["step", "episode", "episodic_return", "episodic_length"]
 RUN_COLUMNS = ["run", "status", "reason", *KEYS, "configuration", "seed", "total"]
-RUN_COLUMNS += ["settings", "versions", "steps", "returns"]
+RUN_COLUMNS += ["settings", "versions", "steps", "returns", "success_rates"]
 CHOICE_COLUMNS = ["algorithm", "environment", "phase", "round", "noise", "noise_rate"]
 CHOICE_COLUMNS += ["seeds", "score", "survives"]
 ROBUSTNESS_COLUMNS = ["noise", "noise_rate", "episode", "episodic_return", "episodic_length"]
@@ -60,8 +62,9 @@ def rows_of(table, key):
 
 
 def read_evaluations(folder, episodes, total):
-    """Read eval.csv: the evaluation steps and the mean return over the episodes of each.
+    """Read eval.csv: the steps of the tests, their mean returns, and their rates of success.
 
+    Rates are in percent of the episodes, or None for an environment that does not tell success.
     Raises DamageError unless every evaluation is whole, in order, and the last is at step `total`.
     """
     try:
@@ -73,21 +76,24 @@ def read_evaluations(folder, episodes, total):
 
 def evaluations(text, episodes, total):
     """Read the text of an eval.csv for read_evaluations."""
-    if not text.startswith(EVAL_HEADER):
+    names = text.partition("\n")[0].split(",")
+    if names not in (EVAL_COLUMNS, [*EVAL_COLUMNS, "success"]):
         raise ValueError("unexpected header")
     if not text.endswith("\n"):
         raise ValueError("the last line is half-written")
-    if len(text) == len(EVAL_HEADER):
+    if text.count("\n") == 1:
         raise ValueError("no evaluation")
     rows = np.loadtxt(io.StringIO(text), delimiter=",", skiprows=1, ndmin=2, comments=None)
-    if rows.shape[1] != 4 or len(rows) % episodes or not np.isfinite(rows).all():
+    if rows.shape[1] != len(names) or len(rows) % episodes or not np.isfinite(rows).all():
         raise ValueError("incomplete or non-numeric lines")
-    step, episode, episodic_return, _ = np.moveaxis(rows.reshape(-1, episodes, 4), 2, 0)
+    table = np.moveaxis(rows.reshape(-1, episodes, len(names)), 2, 0)
+    step, episode, episodic_return, _, *success = table
     if (episode != np.arange(episodes)).any() or (step != step[:, :1]).any():
         raise ValueError("an evaluation is incomplete")
     if (np.diff(step[:, 0]) <= 0).any() or step[-1, 0] != total:
         raise ValueError(f"steps do not ascend to {total}")
-    return step[:, 0].astype(int), episodic_return.mean(axis=1)
+    rates = 100 * success[0].mean(axis=1) if success else None
+    return step[:, 0].astype(int), episodic_return.mean(axis=1), rates
 
 
 def read_run(folder):
@@ -104,10 +110,11 @@ def read_run(folder):
         if result is None:
             reason = f"no result.json; {progress(folder)}"
             return row | {"status": "unfinished", "reason": reason}
-        steps, returns = read_evaluations(folder, config["episodes"], config["total"])
+        steps, returns, rates = read_evaluations(folder, config["episodes"], config["total"])
         if not np.isclose(returns[-1], result["final_return_mean"], rtol=1e-3, atol=1e-3):
             raise DamageError("eval.csv and result.json disagree on the final return")
-        return row | {"status": "finished", "steps": steps, "returns": returns}
+        values = {"steps": steps, "returns": returns, "success_rates": rates}
+        return row | {"status": "finished"} | values
     except DamageError as error:
         return row | {"status": "corrupt", "reason": str(error)}
 
@@ -326,6 +333,7 @@ class Study:
     seeds: list
     steps: np.ndarray  # the evaluation steps that all runs share
     returns: dict  # Configuration -> array (steps x seeds x envs), NaN where there is no run
+    metric: str = "return"  # or "success rate": then `returns` has rates of success in percent
 
     @property
     def key(self):
@@ -337,15 +345,38 @@ class Study:
         """Its name for people."""
         return study_name(*self.key)
 
+    def percent_of(self, difference, e):
+        """Return a difference in percent of the baseline's mean in an environment, if it has any.
+
+        A rate of success has none: differences of rates are in percentage points.
+        """
+        if self.metric == SUCCESS:
+            return difference * np.nan
+        return percent_of(difference, self.final(BASELINE)[:, e])
+
+    def unlearned(self):
+        """Return the environments where all tests of two or more runs are equal: {name: value}."""
+        found = {}
+        for e, env in enumerate(self.environments):
+            tests = np.concatenate([values[..., e] for values in self.returns.values()], axis=1)
+            tests = tests[:, np.isfinite(tests[-1])]
+            if tests.shape[1] > 1 and (tests == tests[0, 0]).all():
+                found[env] = tests[0, 0]
+        return found
+
     def final(self, config):
         """Return the (seeds x envs) array of final test returns."""
         return self.returns[config][-1]
 
 
-def make_studies(runs):
-    """Arrange the finished runs into a list of Study, and list in words what had to be cut."""
+def make_studies(runs, metric="return"):
+    """Arrange the finished runs into a list of Study, and list in words what had to be cut.
+
+    metric: what is compared, "return" or "success rate"; of the latter, only runs that tell it.
+    """
     studies, notes = [], []
-    finished = runs[runs["status"] == "finished"]
+    column = "success_rates" if metric == SUCCESS else "returns"
+    finished = runs[(runs["status"] == "finished") & runs[column].notna()]
     for key, group in finished.groupby(STUDY):
         name = study_name(*key)
         grids = list({steps.tobytes(): steps for steps in group["steps"]}.values())
@@ -363,8 +394,8 @@ def make_studies(runs):
         for run in group.itertuples():
             place = seeds.index(run.seed), envs.index(run.environment)
             shared = np.isin(run.steps, grid)
-            returns[run.configuration][:, *place] = run.returns[shared]
-        study = Study(*key, envs, seeds, grid, returns)
+            returns[run.configuration][:, *place] = getattr(run, column)[shared]
+        study = Study(*key, envs, seeds, grid, returns, metric)
         for env, values in zip(envs, study.final(BASELINE).T, strict=True):
             if np.isnan(values).all() and study.phase != "search":
                 notes.append(f"{name}: no finished baseline on {env}, so no improvement there")

@@ -1,34 +1,37 @@
-"""Statistics for few seeds: pure functions on (seeds x environments) arrays of final returns.
+"""Statistics for few seeds: pure functions of final returns; docs/statistics.md explains them.
 
-NaN marks a run that does not exist. IQM and probability of improvement are those of Agarwal et al.
-(2021), https://arxiv.org/abs/2108.13264.
+Samples are arrays (seeds,) of one environment or (seeds x environments); NaN marks a run that does
+not exist. IQM and probability of improvement are those of Agarwal et al. (2021),
+https://arxiv.org/abs/2108.13264.
 """
 
-from functools import cache, reduce
-from math import ceil, comb, inf, isnan, lcm, nan, pi, prod, sqrt
+from functools import cache, lru_cache, reduce
+from itertools import combinations
+from math import ceil, comb, copysign, inf, isnan, nan, prod, sqrt
 from statistics import NormalDist
+from typing import NamedTuple
 
 import numpy as np
-import scipy  # scipy.stats, which takes most of a second, is imported when it is first used
+import scipy
 
 LEVEL, POWER = 0.05, 0.8
 normal_quantile = NormalDist().inv_cdf
 # A test at this level finds an effect of so many standard errors with this power.
 DETECTABLE = normal_quantile(1 - LEVEL / 2) + normal_quantile(POWER)
-MIN_SEEDS = 3  # with fewer there is no interval
+# With fewer seeds there is no interval of an IQM; of the probability of improvement, which for 3
+# against 3 would exclude 0.5 where p = 0.1; of a difference of means, which for 4 against 4 would
+# say something else than p in 16 % of cases (5 seeds: 5 %).
+SEEDS_FOR_IQM, SEEDS_FOR_PROBABILITY, SEEDS_FOR_INTERVAL = 3, 4, 5
 RESAMPLES = 2000
-PERMUTATIONS = 100_000  # where a null distribution has more than MOST_VALUES
-MOST_VALUES = 20_000
-# Seeds -> percent of simulated samples whose 95 % interval holds the true IQM: the worst of normal
-# and skewed returns and of returns of which 20 % lie in a low peak; and the worst where 40 % do
-# (tests/test_statistics.py::test_coverage, 500 samples each).
-COVERAGE = {3: 94, 5: 96, 10: 95, 20: 95}
-COVERAGE_OF_MIXTURES = {3: 75, 5: 85, 10: 89, 20: 86}
+MOST_PARTITIONS = 20_000  # where there are more, a test draws RANDOM_PARTITIONS
+RANDOM_PARTITIONS = 99_999
 
 
 def columns(scores):
-    """Split a (seeds x envs) array into one array per environment, without the missing runs."""
-    return [column[np.isfinite(column)] for column in np.asarray(scores, float).T]
+    """Split a sample into one array per environment, without the missing runs."""
+    scores = np.asarray(scores, float)
+    scores = scores[:, None] if scores.ndim == 1 else scores
+    return [column[np.isfinite(column)] for column in scores.T]
 
 
 def mean_std(values):
@@ -39,10 +42,20 @@ def mean_std(values):
     return mean, values.std(ddof=1) if len(values) > 1 else np.nan, len(values)
 
 
-def improvement_percent(noisy, baseline):
-    """100 (noisy - baseline) / |baseline|: positive is better, for negative returns too."""
-    scale = np.where(np.equal(baseline, 0), np.nan, np.abs(baseline))
-    return 100 * (noisy - baseline) / scale
+def percent_of(difference, baseline):
+    """100 difference / |mean of the baseline|, or NaN where a percentage would mean nothing.
+
+    That is where the mean is not clearly unequal to zero: its 95 % interval (Student's t) includes
+    zero, or, with fewer than three seeds, the returns have not all one sign. baseline (seeds,).
+    """
+    baseline = baseline[np.isfinite(baseline)]
+    n, mean = len(baseline), baseline.mean() if len(baseline) else 0.0
+    if n < 3:
+        clear = n > 0 and (np.all(baseline > 0) or np.all(baseline < 0))
+    else:
+        half = scipy.special.stdtrit(n - 1, 0.975) * baseline.std(ddof=1) / sqrt(n)
+        clear = abs(mean) > half
+    return 100 * difference / abs(mean) if clear else difference * nan
 
 
 def iqm(scores):
@@ -62,7 +75,7 @@ def bootstrap_iqm(scores, baseline=None, resamples=RESAMPLES):
     """IQM over seeds and environments with its 95 % interval.
 
     With a baseline it is the IQM of the scores minus that of the baseline, both in percent of the
-    baseline's mean in each environment: zero where the two are alike, skewed or not.
+    baseline's IQM in each environment.
 
     The interval is iqm +- t_{0.975, df} sqrt(sum of v). There is one v for each sample (the seeds
     of one environment, with noise or without): n / (n - 1) times the variance of the IQM when
@@ -74,9 +87,8 @@ def bootstrap_iqm(scores, baseline=None, resamples=RESAMPLES):
     rng = np.random.default_rng(0)
 
     def improvement(x, y):
-        means = [cell.mean(axis=-1, keepdims=True) for cell in y]
-        pairs = zip(x, means, strict=True)
-        return iqm(np.concatenate([improvement_percent(*pair) for pair in pairs], axis=-1))
+        pairs = [(a, np.asarray(iqm(b))[..., None]) for a, b in zip(x, y, strict=True)]
+        return iqm(np.concatenate([100 * (a - middle) / abs(middle) for a, middle in pairs], -1))
 
     def estimate(cells):
         x, y = cells[: len(noisy)], cells[len(noisy) :]
@@ -86,7 +98,7 @@ def bootstrap_iqm(scores, baseline=None, resamples=RESAMPLES):
     cells = noisy + ([] if baseline is None else columns(baseline))
     value = estimate(cells)
     n = np.array([len(cell) for cell in cells])
-    if n.min() < MIN_SEEDS:
+    if n.min() < SEEDS_FOR_IQM:
         return value, np.nan, np.nan
     observed = [np.broadcast_to(cell, (resamples, len(cell))) for cell in cells]
     variances = np.empty(len(cells))
@@ -98,7 +110,7 @@ def bootstrap_iqm(scores, baseline=None, resamples=RESAMPLES):
     if variance == 0:  # all seeds alike
         return value, value, value
     df = variance**2 / (variances**2 / (n - 1)).sum()
-    half = scipy.stats.t.ppf(0.975, df) * np.sqrt(variance)
+    half = scipy.special.stdtrit(df, 0.975) * np.sqrt(variance)
     return value, value - half, value + half
 
 
@@ -133,7 +145,7 @@ def probability_of_improvement(x, y):
     """
     x, y = columns(x), columns(y)
     rates = np.array([wins(a, b) / (len(a) * len(b)) for a, b in zip(x, y, strict=True)])
-    if min(map(len, x + y)) < MIN_SEEDS:
+    if min(map(len, x + y)) < SEEDS_FOR_PROBABILITY:
         return rates.mean(), np.nan, np.nan
     limits = [newcombe_interval(p, len(a), len(b)) for p, a, b in zip(rates, x, y, strict=True)]
     below, above = np.abs(rates[:, None] - limits).T
@@ -141,75 +153,143 @@ def probability_of_improvement(x, y):
     return p, p - np.hypot.reduce(below) / len(x), p + np.hypot.reduce(above) / len(x)
 
 
-@cache
-def mann_whitney_null(n, m):
-    """Probabilities of U = 0 ... n m when all orders of n + m values are equally likely."""
-    if n == 0 or m == 0:
-        return np.ones(1)
-    null = np.zeros(n * m + 1)  # the largest value belongs to x (it wins m pairs) or to y
-    null[m:] += n / (n + m) * mann_whitney_null(n - 1, m)
-    null[: n * (m - 1) + 1] += m / (n + m) * mann_whitney_null(n, m - 1)
-    return null
+@lru_cache(maxsize=4)  # one may take 50 MB
+def partitions(n, m):
+    """Return ways to divide n + m values: rows of 1 (first sample) and 0, the actual one first.
 
-
-@cache
-def win_rate_null(sizes):
-    """Probabilities of the mean win rate over environments when all orders are equally likely.
-
-    sizes: (n, m) of each environment -> probabilities of 0 ... `unit`, unit: a mean win rate is one
-    of these numbers divided by `unit`. Win rates are U / (n m); the least common multiple of all
-    n m makes them whole. (None, unit) if there are more than MOST_VALUES.
+    All of them, or, where there are more than MOST_PARTITIONS, RANDOM_PARTITIONS after the actual
+    one, from seed 0.
     """
-    scale = lcm(*(n * m for n, m in sizes))
-    unit = scale * len(sizes)
-    if unit > MOST_VALUES:
-        return None, unit
-    stretched = []
-    for n, m in sizes:
-        null = np.zeros(scale + 1)
-        null[:: scale // (n * m)] = mann_whitney_null(n, m)
-        stretched.append(null)
-    return reduce(np.convolve, stretched), unit
+    if comb(n + m, n) <= MOST_PARTITIONS:
+        chosen = list(combinations(range(n + m), n))
+        rows = np.zeros((len(chosen), n + m))
+        np.put_along_axis(rows, np.array(chosen), 1, axis=1)
+        return rows
+    return random_partitions(n, m, RANDOM_PARTITIONS, np.random.default_rng(0))
 
 
-@cache
-def permuted_win_rates(sizes):
-    """Draw the mean win rate of PERMUTATIONS random orders, with a fixed seed.
+def random_partitions(n, m, number, rng):
+    """Return the actual division of n + m values and a number of random ones; see partitions."""
+    rows = np.zeros((1 + number, n + m))
+    rows[:, :n] = 1
+    rows[1:] = rng.permuted(rows[1:], axis=1)
+    return rows
 
-    sizes: (n, m) of each environment -> (PERMUTATIONS,).
+
+def welch_t(values, chosen):
+    """Welch's t of many comparisons, each under many partitions of its values.
+
+    t is 0 where the means are equal, and infinite where they differ and only the spread is 0.
+
+    values (n + m, comparisons), chosen (partitions, n + m) -> (partitions, comparisons).
     """
-    rng = np.random.default_rng(0)
-    rates = [
-        rng.choice(n * m + 1, PERMUTATIONS, p=mann_whitney_null(n, m)) / (n * m) for n, m in sizes
-    ]
-    return np.mean(rates, axis=0)
+    n = chosen[0].sum()
+    m = len(values) - n
+    mean, scale = values.mean(axis=0), values.std(axis=0)
+    values = (values - mean) / np.where(scale > 1e-12 * abs(mean), scale, inf)
+    sums, squares = chosen @ values, chosen @ values**2
+    others = (values**2).sum(axis=0) - squares
+    difference = sums * (1 / n + 1 / m)  # because the sum of all values is 0
+    variance = (squares - sums**2 / n) / (n - 1) / n + (others - sums**2 / m) / (m - 1) / m
+    error = np.sqrt(np.maximum(variance, 0))
+    difference[abs(difference) < 1e-9] = 0  # rounding errors, in standard deviations of all values
+    error[error < 1e-6] = 0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.nan_to_num(difference / error, nan=0, posinf=inf, neginf=-inf)
 
 
-def mann_whitney(x, y):
-    """Exact two-sided test of the mean win rate over environments: p, and the smallest possible p.
+@np.errstate(invalid="ignore")  # inf - inf
+def permutation_t(x, y):
+    """Two-sided permutation test with Welch's t, over environments with the mean of their t.
 
-    Every environment counts alike, whatever its number of seeds, and the direction is that of
-    probability_of_improvement, which is the same statistic. In one environment this is Mann and
-    Whitney's test. Where there are too many possible values p is from PERMUTATIONS random orders.
+    Exact where the two distributions are equal, and for many seeds valid where only the means are
+    (Janssen, 1997, https://doi.org/10.1016/S0167-7152(97)00043-6; Chung and Romano, 2013,
+    https://doi.org/10.1214/13-AOS1090). The runs of each environment are divided on their own.
 
-    x (seeds x envs), y (seeds x envs) -> p, smallest p.
+    x, y: samples of the same environments -> t, p, the smallest p that is possible with so many
+    seeds; t and p are NaN where an environment has fewer than two seeds on a side.
     """
     pairs = list(zip(columns(x), columns(y), strict=True))
-    sizes = tuple((len(a), len(b)) for a, b in pairs)
-    smallest = 2 / prod(comb(n + m, n) for n, m in sizes)
-    rate = np.mean([wins(a, b) / (len(a) * len(b)) for a, b in pairs])
-    null, unit = win_rate_null(sizes)
-    if null is None:
-        drawn = permuted_win_rates(sizes)
-        below = (1 + (drawn <= rate + 1e-12).sum()) / (1 + PERMUTATIONS)
-        above = (1 + (drawn >= rate - 1e-12).sum()) / (1 + PERMUTATIONS)
-        smallest = max(smallest, 2 / (1 + PERMUTATIONS))
+    sizes = [(len(a), len(b)) for a, b in pairs]
+    if min(map(min, sizes)) < 2:
+        return nan, nan, 1.0
+    ways = prod(comb(n + m, n) for n, m in sizes)
+    ts = [
+        welch_t(np.concatenate(pair)[:, None], partitions(*size))[:, 0]
+        for pair, size in zip(pairs, sizes, strict=True)
+    ]
+    if ways <= MOST_PARTITIONS:
+        null = reduce(lambda a, b: np.add.outer(a, b).ravel(), ts)
+    elif len(ts) == 1:
+        [null] = ts
     else:
-        place = round(float(rate) * unit, 6)
-        possible = np.flatnonzero(null)  # between two of them, where runs are tied: the milder one
-        below = null[: possible[np.searchsorted(possible, place)] + 1].sum()
-        above = null[possible[np.searchsorted(possible, place, side="right") - 1] :].sum()
-    return min(1.0, 2 * min(below, above)), min(1.0, smallest)
+        rng = np.random.default_rng(0)
+        null = sum(np.append(t[0], drawn(t, rng)) for t in ts)
+    null = np.nan_to_num(null, nan=0, posinf=inf, neginf=-inf)
+    above, below = tails(null)
+    smallest = 2 / min(ways, 1 + RANDOM_PARTITIONS)
+    return null[0] / len(pairs), min(1.0, 2 * min(above, below)), min(1.0, smallest)
+
+
+def drawn(t, rng):
+    """Draw RANDOM_PARTITIONS of one environment's t, in another order than in the others."""
+    if len(t) > RANDOM_PARTITIONS:  # they are random, after the actual one
+        return rng.permutation(t[1:])
+    return rng.choice(t, RANDOM_PARTITIONS)
+
+
+def tails(null):
+    """Return the shares of t (partitions, ...) that are at least, and at most, the first one."""
+    # equal up to rounding is equal
+    margin = 1e-9 * np.where(np.isfinite(null[0]), abs(null[0]), 0)
+    return (null >= null[0] - margin).mean(axis=0), (null <= null[0] + margin).mean(axis=0)
+
+
+class Comparison(NamedTuple):
+    """Runs with noise against runs without: all that a verdict says. NaN where there is nothing."""
+
+    environments: int
+    n: int  # seeds with noise, in the environment that has fewest
+    n_baseline: int
+    n_baseline_most: int
+    difference: float  # of the means, in units of the return; in one environment
+    difference_low: float  # its 95 % interval
+    difference_high: float
+    difference_percent: float  # of |mean without noise|; over environments the mean
+    effect_size: float  # the difference in pooled_std; over environments the mean
+    pooled_std: float  # sqrt((variance with noise + variance without) / 2)
+    t: float  # Welch's; over environments the mean
+    p: float
+    smallest_p: float  # that is possible with these numbers of seeds
+    detectable: float  # difference that these seeds find with 80 % power, before a correction
+    seeds_needed: float  # on each side, to find the observed difference with 80 % power
+
+
+def compare(x, y):
+    """Compare the means of two samples x and y of the same environments."""
+    xs, ys = columns(x), columns(y)
+    pairs = list(zip(xs, ys, strict=True))
+    differences = [a.mean() - b.mean() for a, b in pairs]
+    stds = [sqrt((mean_std(a)[1] ** 2 + mean_std(b)[1] ** 2) / 2) for a, b in pairs]
+    effects = [
+        difference / std if std else copysign(inf, difference) if difference else 0.0
+        for difference, std in zip(differences, stds, strict=True)
+    ]
+    percents = [percent_of(d, baseline) for d, baseline in zip(differences, ys, strict=True)]
+    with np.errstate(invalid="ignore"):
+        effect = np.mean(effects)  # of inf and -inf there is none
+    difference = low = high = std = detectable = needed = nan
+    n, m = min(map(len, xs)), min(map(len, ys))
+    if len(pairs) == 1:
+        difference, error, low, high = contrast([xs[0], ys[0]], [1, -1])
+        if min(n, m) < SEEDS_FOR_INTERVAL:
+            low = high = nan
+        std, needed = stds[0], seeds_needed(round(abs(effect), 3))
+        detectable = detectable_shift(n, m) * error / sqrt(1 / n + 1 / m)
+    t, p, smallest_p = permutation_t(x, y)
+    sizes = len(pairs), n, m, max(map(len, ys))
+    found = difference, low, high, np.mean(percents), effect, std
+    return Comparison(*sizes, *found, t, p, smallest_p, detectable, needed)
 
 
 def leave_one_seed_out(finals):
@@ -244,13 +324,13 @@ def contrast(cells, weights):
     """Weighted sum of the means of independent samples, with its standard error and 95 % interval.
 
     Student's t with Satterthwaite's degrees of freedom: each sample has a variance of its own.
-    cells: arrays (n_i), weights: numbers -> estimate, standard error, low, high; without an
-    interval where a sample has fewer than MIN_SEEDS.
+    cells: arrays (n_i), weights: numbers -> estimate, standard error, low, high; NaN where a sample
+    has fewer than two values.
     """
     estimate = sum(weight * np.mean(cell) for cell, weight in zip(cells, weights, strict=True))
     sizes = np.array([len(cell) for cell in cells])
-    if sizes.min() < MIN_SEEDS:
-        return estimate, np.nan, np.nan, np.nan
+    if sizes.min() < 2:
+        return estimate, nan, nan, nan
     variances = np.array([np.var(cell, ddof=1) for cell in cells])
     if not variances.any():
         return estimate, 0.0, estimate, estimate
@@ -265,7 +345,7 @@ def satterthwaite(variances, sizes):
     """
     total = np.sum(variances, axis=0)
     freedom = total**2 / np.sum(np.square(variances) / (sizes - 1), axis=0)
-    return np.sqrt(total), np.sqrt(total) * scipy.stats.t.ppf(0.975, freedom)
+    return np.sqrt(total), np.sqrt(total) * scipy.special.stdtrit(freedom, 0.975)
 
 
 def holm(p):
@@ -278,113 +358,43 @@ def holm(p):
 # -------------------------------------------------------------------------------------------- power
 
 
-def normal_shift(n, m, level=LEVEL):
-    """Return the shift that n against m seeds find with 80 % power, for many seeds.
-
-    In standard deviations, for normal returns. Noether (1987),
-    https://doi.org/10.1080/01621459.1987.10478478.
-    """
-    errors = normal_quantile(1 - level / 2) + normal_quantile(POWER)
-    return errors * sqrt((1 / n + 1 / m) * pi / 3)
-
-
-# simulated_shift(n, n, 0.05) for n = 4, 5, ... 30, because each takes up to half a second
-SHIFTS = (
-    2.880862450382901,
-    2.312949896173857,
-    1.9279458212032476,
-    1.771853031134289,
-    1.5534433245274863,
-    1.504862163115294,
-    1.3978390998062058,
-    1.3037013547958693,
-    1.2516792232735203,
-    1.1971269819745425,
-    1.1287642871586079,
-    1.110028389468349,
-    1.0643220362675698,
-    1.0210327153193397,
-    0.9975291599418932,
-    0.9616221484366039,
-    0.9371047049525144,
-    0.9098650224369204,
-    0.8890197044192255,
-    0.8673265723381766,
-    0.8522793466267378,
-    0.8290939050900458,
-    0.8154541471750474,
-    0.8020434089788901,
-    0.7835182554211101,
-    0.7690933946536513,
-    0.7548621930126792,
-)
-
-
 @cache
 def detectable_shift(n, m, level=LEVEL):
     """Return the shift that n against m seeds find with 80 % power, or NaN if there is none.
 
-    In standard deviations, for normal returns and the exact two-sided Mann-Whitney test at this
-    level. For few seeds it is simulated.
+    In standard deviations, for normal returns of equal spread, by the noncentral t distribution;
+    simulated where the test has so few partitions that its p is a coarse number.
     """
-    if n * m > 900:
-        return normal_shift(n, m, level)
-    if n == m >= 4 and level == LEVEL:
-        return SHIFTS[n - 4]
-    return simulated_shift(n, m, level)
+    smallest_p = 2 / comb(n + m, n) if n + m < 1000 else 0.0
+    if min(n, m) < 2 or smallest_p > level:
+        return nan
+    if 5 * smallest_p > level:
+        return simulated_shift(n, m, level)
+    df = n + m - 2
+    critical = scipy.special.stdtrit(df, 1 - level / 2)
+    return scipy.special.nctdtrinc(df, 1 - POWER, critical) * sqrt(1 / n + 1 / m)
 
 
 def simulated_shift(n, m, level):
-    """Return detectable_shift: when x is shifted by s, it wins the pairs with y - x < s."""
-    tail = 2 * np.cumsum(mann_whitney_null(n, m))
-    losses = np.flatnonzero(tail <= level + 1e-12)  # so many lost pairs are still significant
-    if len(losses) == 0:
-        return nan
-    rng = np.random.default_rng(0)
-    last_needed = n * m - losses[-1] - 1  # the largest gap that must be closed
-    largest = []
-    # 400,000 draws for few seeds, down to 40,000: an error of about 0.1 to 0.4 %
-    for _ in range(min(100, max(10, 5000 // (n * m)))):
-        x, y = rng.normal(size=(4000, n, 1)), rng.normal(size=(4000, 1, m))
-        for rows in range(0, 4000, 200):  # blocks that fit into a processor's cache
-            gaps = (y[rows : rows + 200] - x[rows : rows + 200]).reshape(200, n * m)
-            largest.append(np.partition(gaps, last_needed, axis=1)[:, last_needed])
-    return float(np.quantile(np.concatenate(largest), POWER))
+    """Return detectable_shift by bisection, in 200 to 4,000 simulated comparisons."""
+    chosen = partitions(n, m)
+    number = int(np.clip(1_000_000 / len(chosen), 200, 4000))
+    noise = np.random.default_rng(0).standard_normal((n + m, number))
+    low, high = 0.0, 16.0
+    while high - low > 0.005:
+        shift = (low + high) / 2
+        above, _ = tails(welch_t(noise + shift * chosen[0][:, None], chosen))
+        power = np.mean(2 * above <= level + 1e-12)
+        low, high = (low, shift) if power >= POWER else (shift, high)
+    return high
 
 
 @cache
 def seeds_needed(shift):
     """Return how many seeds each side needs to find a shift (in sd) with 80 % power; maybe inf."""
-    if shift == 0:
-        return inf
-    n = max(4, ceil((normal_shift(1, 1) / shift) ** 2))
-    while n < 30 and not detectable_shift(n, n) <= shift:
+    if isnan(shift) or shift == 0:
+        return nan if isnan(shift) else inf
+    n = max(4, ceil(2 * (DETECTABLE / shift) ** 2))  # of infinitely many degrees of freedom
+    while not detectable_shift(n, n) <= shift:
         n += 1
     return n
-
-
-def spread_percent(x, y):
-    """Pooled standard deviation of x (n) and y (m) in percent of |mean of y|; NaN without any."""
-    (_, x_std, n), (y_mean, y_std, m) = mean_std(x), mean_std(y)
-    if n < 2 or m < 2 or y_mean == 0:
-        return nan
-    pooled = sqrt(((n - 1) * x_std**2 + (m - 1) * y_std**2) / (n + m - 2))
-    return 100 * pooled / abs(y_mean) or nan
-
-
-def detectable_percent(x, y):
-    """Improvement in percent that final returns x (n) and y (m) find with 80 % power, or NaN.
-
-    For normal returns with the pooled standard deviation of x and y.
-    """
-    spread = spread_percent(x, y)
-    return nan if isnan(spread) else detectable_shift(mean_std(x)[2], mean_std(y)[2]) * spread
-
-
-def seeds_for(x, y, percent):
-    """Seeds that each side needs to find an improvement of `percent` with 80 % power, or NaN.
-
-    For normal returns with the pooled standard deviation of x (n) and y (m); maybe infinite.
-    """
-    spread = spread_percent(x, y)
-    return nan if isnan(spread) else seeds_needed(round(abs(percent) / spread, 3))

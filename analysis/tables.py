@@ -1,68 +1,66 @@
-"""The tables of analyze.py: their columns, their captions, and in which order they come."""
+"""The tables of analyze.py: their rows, made of a Study's returns, their columns and captions."""
 
+from itertools import product
 from math import ceil
 
 import numpy as np
 import pandas as pd
 from scipy import stats
 
-from analysis.formatting import P_VALUE, PLAIN, SHARE, WHOLE, Table
+from analysis.folders import SEARCH
+from analysis.formatting import P_VALUE, PLAIN, SHARE, TENTH, WHOLE, Table
 from analysis.luck import (
     CONSISTENT_PERCENT,
     DRAWS,
-    FALSE_ALARMS,
-    FALSE_ALARMS_IN_THE_PAPER,
-    LUCKY,
-    POWER_IN_THE_PAPER,
-    POWER_OF_BEST,
-    SEEDS_TO_RESAMPLE,
     add_luck_of_best,
     add_luck_of_consistent,
     luck_of_study,
     luck_rows,
 )
-from analysis.paper import PAPER_CONFIGURATIONS, compare_tables
-from analysis.rows import (
-    best_rows,
-    consistency_rows,
-    early_rows,
-    interaction_rows,
-    statistics_rows,
-    summary_rows,
-)
-from analysis.runs import KEYS, STUDY, study_name
+from analysis.paper import compare_tables
+from analysis.runs import KEYS, STUDY, SUCCESS, rows_of, study_name
 from analysis.statistics import (
-    COVERAGE,
-    COVERAGE_OF_MIXTURES,
-    MIN_SEEDS,
-    MOST_VALUES,
-    PERMUTATIONS,
+    LEVEL,
+    bootstrap_iqm,
+    compare,
+    contrast,
     holm,
+    leave_one_seed_out,
+    mean_std,
+    probability_of_improvement,
+    steps_to_reach,
 )
-from analysis.verdicts import counted, seeds_of, verdict
+from analysis.verdicts import UNLEARNED, counted, difference, listed, seeds_of, verdict
+from noisy_wrappers import BASELINE, rounded
 
+PERCENTS = ("difference_percent", "iqm_change_percent", "iqm_change_low", "iqm_change_high")
+INTERVAL = ("difference_low", "difference_high")
+SEEDS_FOR_INTERACTION = 3  # of each of the four configurations
 # After those that name a study
 _COLUMNS = {
     "summary": """environment noise noise_rate n mean std n_baseline baseline_mean
-        baseline_std improvement_percent p std_change_percent steps_to_baseline""",
+        baseline_std difference improvement_percent p steps_to_baseline""",
     "best": """environment noise noise_rate baseline_mean baseline_std noisy_mean
-        noisy_std improvement_percent p p_adjusted luck_median_percent luck_95_percent p_luck
+        noisy_std difference improvement_percent p p_adjusted luck_median luck_95 p_luck
         leave_one_seed_out_percent n n_baseline chosen_from leave_one_seed_out_mean""",
     "consistency": """noise noise_rate percent_of_environments
-        average_improvement_percent std_improvement_percent p p_adjusted p_luck environments n
-        fails_at_every_rate""",
+        average_improvement_percent std_improvement_percent p p_adjusted p_luck
+        environments without_percent n fails_at_every_rate""",
     "luck": """environments best_beyond_luck configurations
         consistent consistent_by_luck consistent_by_luck_95 p_consistent consistent_beyond_luck
         consistently_worse consistently_worse_by_luck consistently_worse_by_luck_95
         p_consistently_worse consistently_worse_beyond_luck""",
+    "success": """environment noise noise_rate mean std baseline_mean baseline_std difference
+        p p_adjusted n n_baseline""",
     "interactions": """environment noise noise_rate n both_mean first_mean second_mean
         baseline_mean interaction interaction_low interaction_high standard_error
         interaction_percent percent_low percent_high""",
     "early_performance": "environment noise steps_millions noise_rate mean std n",
-    "statistics": """scope environment noise noise_rate verdict improvement_iqm_percent
-        improvement_low improvement_high p p_adjusted comparisons probability_of_improvement
-        probability_low probability_high environments n n_baseline n_baseline_most
-        iqm iqm_low iqm_high detectable_percent seeds_needed smallest_p smallest_p_adjusted""",
+    "statistics": """scope environment noise noise_rate verdict difference difference_low
+        difference_high difference_percent effect_size p p_adjusted n n_baseline n_baseline_most
+        detectable seeds_needed iqm iqm_low iqm_high iqm_change_percent iqm_change_low
+        iqm_change_high probability_of_improvement probability_low probability_high t pooled_std
+        environments comparisons smallest_p smallest_p_adjusted""",
 }
 COLUMNS = {name: [*STUDY, *text.split()] for name, text in _COLUMNS.items()}
 _COLUMNS_WITH = {
@@ -71,11 +69,208 @@ _COLUMNS_WITH = {
         consistent_beyond_luck consistently_worse consistently_worse_beyond_luck""",
     P_VALUE: """p p_adjusted smallest_p smallest_p_adjusted p_luck p_luck_of_best paper_p_luck
         p_consistent p_consistently_worse""",
-    SHARE: "probability_of_improvement probability_low probability_high",
+    SHARE: "probability_of_improvement probability_low probability_high effect_size t",
+    TENTH: "difference_se consistent_by_luck consistently_worse_by_luck",
     PLAIN: "steps_millions",
 }
 FORMATS = {name: form for form, names in _COLUMNS_WITH.items() for name in names.split()}
+STATISTICS_ONLY_CSV = ("iqm", "iqm_low", "iqm_high", "t", "pooled_std", "environments")
+STATISTICS_ONLY_CSV += ("seeds_needed", "comparisons", "smallest_p", "smallest_p_adjusted")
 LUCK_ONLY_CSV = ("consistent_by_luck_95", "consistently_worse_by_luck_95")
+
+# --------------------------------------------------------------------------------------------- rows
+
+
+def row_keys(study, environment, config):
+    """Return the columns that say what a row is about."""
+    return dict(zip(KEYS, (*study.key, environment, config.noise, config.noise_rate), strict=True))
+
+
+def summary_rows(study):
+    """Yield the final mean and std of every configuration, against the baseline of its env."""
+    for (e, env), config in product(enumerate(study.environments), study.returns):
+        mean, std, n = mean_std(study.final(config)[:, e])
+        if n == 0:
+            continue
+        baseline = study.final(BASELINE)[:, e]
+        base_mean, base_std, base_n = mean_std(baseline)
+        row = {
+            **row_keys(study, env, config),
+            "n": n,
+            "mean": mean,
+            "std": std,
+            "n_baseline": base_n,
+            "baseline_mean": base_mean,
+            "baseline_std": base_std,
+        }
+        if config != BASELINE:
+            row["difference"] = mean - base_mean
+            row["improvement_percent"] = study.percent_of(mean - base_mean, e)
+        curves = study.returns[config][..., e]
+        row["steps_to_baseline"] = steps_to_reach(curves, study.steps, base_mean)
+        yield row
+
+
+def best_rows(study, summary):
+    """Yield the best noise per environment, with the leave-one-seed-out value of choosing it."""
+    noisy = summary[summary["difference"].notna()]
+    for env, group in noisy[rows_of(noisy, study.key)].groupby("environment"):
+        best = group.loc[group["mean"].idxmax()]
+        e = study.environments.index(env)
+        finals = np.stack([study.final(c)[:, e] for c in study.returns if c != BASELINE])
+        held_out = leave_one_seed_out(finals)
+        gain = held_out - best["baseline_mean"]
+        yield best.to_dict() | {
+            "noisy_mean": best["mean"],
+            "noisy_std": best["std"],
+            "chosen_from": len(group),
+            "leave_one_seed_out_mean": held_out,
+            "leave_one_seed_out_percent": study.percent_of(gain, e),
+        }
+
+
+def consistency_rows(summary):
+    """Yield per noise and rate the share of envs that are matched or better, and by how much.
+
+    Every environment counts in the share, by the sign of its difference; the average is over those
+    whose baseline has a percentage, and the others are named.
+    """
+    keys = [*STUDY, "noise", "noise_rate"]
+    for key, group in summary[summary["difference"].notna()].groupby(keys):
+        mean, std, _ = mean_std(group["improvement_percent"])
+        without = group.loc[group["improvement_percent"].isna(), "environment"]
+        yield dict(zip(keys, key, strict=True)) | {
+            "percent_of_environments": 100 * (group["difference"] >= 0).mean(),
+            "average_improvement_percent": mean,
+            "std_improvement_percent": std,
+            "environments": len(group),
+            "without_percent": ", ".join(without),
+            "n": group["n"].min(),
+        }
+
+
+def early_rows(study):
+    """Yield mean and std at every 0.2 M steps, or at every fifth of a run below 1 M steps."""
+    total = study.steps[-1]
+    stride = 200_000 if total >= 1_000_000 else total / 5
+    wanted = np.arange(1, round(total / stride) + 1) * stride
+    places = np.unique(np.searchsorted(study.steps, wanted, side="right") - 1)
+    places = places[places >= 0]
+    noises = sorted({config.noise for config in study.returns if not config.is_baseline})
+    for (e, env), noise in product(enumerate(study.environments), noises):
+        configs = [config for config in study.returns if config.noise == noise]
+        if not any(np.isfinite(study.final(config)[:, e]).any() for config in configs):
+            continue  # not tried here: the baseline alone would be no comparison
+        for i, config in product(places, [BASELINE, *configs]):
+            mean, std, n = mean_std(study.returns[config][i, :, e])
+            if n > 0:
+                yield {
+                    **row_keys(study, env, config),
+                    "noise": noise,
+                    "steps_millions": study.steps[i] / 1e6,
+                    "mean": mean,
+                    "std": std,
+                    "n": n,
+                }
+
+
+def statistics_rows(study):
+    """Yield the comparison of every configuration with the baseline, per env and over all.
+
+    The scope of a row is "environment", or "all": of those with two seeds of both kinds.
+    """
+    places = [("environment", env, [e]) for e, env in enumerate(study.environments)]
+    if study.phase != "confirmation":  # there each environment has its one comparison
+        places.append(("all", "", list(range(len(study.environments)))))
+    limits, unlearned = baseline_limits(study), study.unlearned()
+    learned = np.array([env not in unlearned for env in study.environments])
+    for (scope, environment, chosen), config in product(places, study.returns):
+        x, y = study.final(config)[:, chosen], study.final(BASELINE)[:, chosen]
+        seeds = np.isfinite(x).sum(axis=0)
+        fewest = 2 if scope == "all" else 1
+        both = (seeds >= fewest) & (np.isfinite(y).sum(axis=0) >= fewest)
+        if scope == "all":
+            both &= learned
+        row = row_keys(study, environment, config) | {"scope": scope}
+        if scope == "all":
+            if config == BASELINE or both.sum() < 2:
+                continue
+        elif not seeds.any():
+            continue
+        else:  # returns of different environments have no common scale
+            row["n"] = seeds[0]
+            row["iqm"], row["iqm_low"], row["iqm_high"] = bootstrap_iqm(x)
+        if config != BASELINE and both.any():
+            clear = not any(low <= 0 <= high for low, high in limits[:, chosen][:, both].T)
+            row |= against_baseline(x[:, both], y[:, both], clear)
+            if study.metric == SUCCESS:  # never percent of a rate
+                row |= dict.fromkeys(PERCENTS, np.nan)
+            if environment in unlearned:
+                row |= dict.fromkeys([*PERCENTS, *INTERVAL, "t", "p"], np.nan)
+                row["verdict"] = UNLEARNED
+        yield row
+
+
+def baseline_limits(study):
+    """Return the 95 % intervals (2 x envs) of the baseline's IQM, NaN where there is none."""
+    limits = np.full((2, len(study.environments)), np.nan)
+    for e, returns in enumerate(study.final(BASELINE).T):
+        if np.isfinite(returns).any():
+            limits[:, e] = bootstrap_iqm(returns)[1:]
+    return limits
+
+
+def against_baseline(x, y, clear):
+    """Return the part of a row of statistics that compares x with y, both (seeds x envs).
+
+    clear: whether the IQM of every baseline is clearly not zero, so that the IQM has percent.
+    """
+    row = compare(x, y)._asdict()
+    names = ("probability_of_improvement", "probability_low", "probability_high")
+    row |= zip(names, probability_of_improvement(x, y), strict=True)
+    if clear and np.isfinite(row["difference_percent"]):
+        names = ("iqm_change_percent", "iqm_change_low", "iqm_change_high")
+        row |= zip(names, bootstrap_iqm(x, y), strict=True)
+    return row
+
+
+def interaction_rows(study):
+    """Yield, for two noises and both together: how much more do they change than their sum?
+
+    I = J(A + B) - J(A) - J(B) + J(0) of the mean final returns, in every environment where all
+    four have at least SEEDS_FOR_INTERACTION seeds, with a 95 % interval; then relative to |J(0)|.
+    """
+    for (e, environment), config in product(enumerate(study.environments), study.returns):
+        parts = config.parts
+        if len(parts) != 2 or parts[0] == parts[1]:
+            continue
+        cells = []
+        for part in (config, *parts, BASELINE):
+            finals = study.final(part)[:, e] if part in study.returns else np.empty(0)
+            cells.append(finals[np.isfinite(finals)])
+        if min(map(len, cells)) < SEEDS_FOR_INTERACTION:
+            continue
+        both, first, second, alone = cells
+        value, error, low, high = contrast(cells, [1, -1, -1, 1])
+        percent = study.percent_of(1.0, e)
+        yield {
+            **row_keys(study, environment, config),
+            "n": min(map(len, cells)),
+            "both_mean": both.mean(),
+            "first_mean": first.mean(),
+            "second_mean": second.mean(),
+            "baseline_mean": alone.mean(),
+            "interaction": value,
+            "interaction_low": low,
+            "interaction_high": high,
+            "standard_error": error,
+            "interaction_percent": value * percent,
+            "percent_low": low * percent,
+            "percent_high": high * percent,
+        }
+
+
+# ------------------------------------------------------------------------------------------- tables
 
 
 def frame(name, rows):
@@ -138,22 +333,21 @@ def with_p(table, statistics):
 def family_notes(statistics):
     """Say where the number of seeds is too small to show a difference, if corrected."""
     notes = []
-    tested = statistics[statistics["p"].notna()]
+    compared = statistics[statistics["verdict"].notna() & (statistics["verdict"] != UNLEARNED)]
     keys = ["comparisons", "smallest_p"]
-    for study, rows in tested.groupby(STUDY):
+    for study, rows in compared.groupby(STUDY):
         best = rows.sort_values("smallest_p", kind="stable")
         best = best.drop_duplicates(["scope", "environment"]).sort_index()
-        for (size, smallest), same in best.groupby(keys, sort=False):
+        for (size, smallest), same in best.groupby(keys, sort=False, dropna=False):
             places = same["environment"].mask(same["scope"] == "all", "all")
             where = f"{study_name(*study)}, {', '.join(places)}"
             seeds = counted(min(same["n"].min(), same["n_baseline"].min()), "seed")
-            needed = ceil(round(size * smallest / 0.05, 9))
-            if smallest > 0.05:
+            if smallest > LEVEL:
                 notes.append(
                     f"{where}: with {seeds} no difference can be significant (smallest possible p: "
                     f"{smallest:.2g})."
                 )
-            elif needed > 1:
+            elif (needed := ceil(round(size * smallest / LEVEL, 9))) > 1:
                 notes.append(
                     f"{where}: with {seeds} and {size:.0f} comparisons, differences can be "
                     f"significant after the correction only if at least {needed} of them are "
@@ -163,12 +357,32 @@ def family_notes(statistics):
     return notes
 
 
-def listed(numbers):
-    """Spell numbers for a sentence: "7, 13, 26"."""
-    return ", ".join(map(str, numbers))
+def unlearned_notes(studies):
+    """Say where no run has learned anything, so that comparisons say nothing."""
+    notes = []
+    for study in studies:
+        for environment, value in study.unlearned().items():
+            result = f"return {rounded(value)}"
+            if study.metric == SUCCESS:
+                result = f"succeed in {value:.0f} % of the episodes"
+            notes.append(
+                f"{study.name} on {environment}: all runs {result}: nothing was learned in "
+                f"{study.steps[-1]:,} steps, so they say nothing about noise."
+            )
+    return notes
 
 
-# Captions have at most two lines in the report; HOW is its last section.
+def success_table(studies):
+    """Return the table of final success rates as {name: Table}, empty without such studies."""
+    judging = [study for study in studies if study.phase != SEARCH]
+    rows = [row for study in judging for row in summary_rows(study)]
+    if not rows:
+        return {}
+    statistics = frame("statistics", (row for study in judging for row in statistics_rows(study)))
+    return {"success": table_of("success", with_p(frame("success", rows), adjust(statistics)))}
+
+
+# At most two lines in the report; docs/statistics.md says how the numbers are computed.
 CAPTIONS = {
     "best": """The best noise in each environment, which may still be worse than no noise. Mean
 \u00b1 standard deviation of the final return over n seeds (with / without noise).""",
@@ -180,9 +394,11 @@ or more environments. Average improvement \u00b1 standard deviation over environ
     "early_performance": """Mean test return \u00b1 standard deviation during training, by noise
 rate (0.00: no noise), with the number of seeds in brackets.""",
     "summary": """Final test return of every configuration: mean \u00b1 standard deviation over n
-seeds, and the improvement over no noise. Here p is not corrected.""",
-    "statistics": """Every noise against no noise: the improvement of the interquartile mean (IQM)
-with its 95 % interval, and the test behind the verdict.""",
+seeds, and the difference from no noise. Here p is not corrected.""",
+    "statistics": """Every noise against no noise: the difference of the mean final returns with its
+95 % interval, and its test. The effect size is the difference in standard deviations.""",
+    "success": """Success rate in the final test, in percent of its episodes: mean \u00b1 standard
+deviation over n seeds, and the difference from no noise in percentage points.""",
     "interactions": """What two noises do together beyond the sum of their effects, with 95 %
 intervals. Above zero, both together are better than the sum.""",
     "choice": """How the noise was chosen: each round of the search drops the worse half, and fresh
@@ -191,83 +407,21 @@ seeds confirm the winner or not.""",
     "compare_luck": """The same for the paper's tables.""",
     "compare": "The paper's table (environments v2, 1,000,000 steps) beside ours.",
 }
-HOW = {
-    "best": f"""The best noise is the one with the highest mean final return. It is chosen on the
-seeds that it is reported on, which flatters it. Improvement and p corrected are those of the
-statistics. Luck 95 %: if no noise did anything, the best mean of as many noises would still look
-this much better than no noise in one of twenty sweeps; in brackets, the probability that luck alone
-gives a mean at least as high as the best one has. best.csv has more columns. Its leave-one-seed-out
-value measures the procedure of choosing, not the noise that is named: choose on all seeds but one,
-measure on that one, average over seeds. It is descriptive: its terms share seeds, so it has no
-interval. A best noise counts as beyond luck where that probability is at most {LUCKY}.""",
-    "consistent": """p is the exact test over all environments, then corrected for all
-configurations (Benjamini-Hochberg). p luck: the probability that the highest average of as many
-configurations is as high if none does anything. n is the smallest number of seeds in any
-environment.""",
-    "consistently_worse": """Columns as in the table of consistent noise, p luck with the lowest
-average. Worse at every rate that was tried:""",
-    "luck": f"""{DRAWS:,} sweeps are drawn in which no noise does anything: the baseline and all
-configurations anew, with their numbers of seeds, from a normal distribution with the pooled
-standard deviation within configurations (from {SEEDS_TO_RESAMPLE} seeds of the baseline on, with
-the shape of their returns). By luck: the mean number of rows in the tables of consistent and
-consistently worse noise, and its 95 % quantile. p: the probability of at least as many rows as
-observed. Beyond luck: rows with a p luck of {LUCKY} or less. Configurations are those in two or
-more environments. The p luck of a best noise is right for normal returns of equal spread: that of
-90 useless configurations is then {LUCKY} or less in 5 % of simulated studies. Where a fifth of the
-runs end around a second, higher peak, it is in {FALSE_ALARMS[5]} % with five seeds and
-{FALSE_ALARMS[10]} % with ten. One configuration of 90 with a true gain of 1, 1.5 and 2 standard
-deviations is beyond luck in {listed(POWER_OF_BEST[5])} % of studies with five seeds, and in
-{listed(POWER_OF_BEST[10])} % with ten.""",
-    "summary": """Improvement: of the mean, in percent of |mean without noise|, with the p of the
-exact Mann-Whitney test. Steps to baseline: the first evaluation at which the mean over seeds
-reaches the final mean without noise.""",
-    "statistics": f"""IQM: interquartile mean of the final returns over n seeds. Improvement: IQM of
-(return - baseline mean) / |baseline mean| over seeds and environments, minus that of the baseline's
-own returns; the baseline are the runs without noise. [ ]: 95 % intervals from a stratified
-bootstrap over seeds (Student's t times the bootstrap standard error, with Satterthwaite's degrees
-of freedom: few seeds of the baseline widen it as much as few with noise). In simulated samples of
-one environment they held the true IQM in at least
-{", ".join(f"{c} % (n = {n})" for n, c in COVERAGE.items())} of the cases where returns were normal,
-skewed or 20 % of them in a low peak, but in
-{", ".join(f"{c} % (n = {n})" for n, c in COVERAGE_OF_MIXTURES.items())} where 40 % were in a low
-and narrow peak. P(improvement): probability that a noisy run beats a baseline run, averaged over
-environments, with Newcombe's interval. No interval for n < {MIN_SEEDS}. p: exact two-sided
-Mann-Whitney test; over several environments the test of P(improvement), in which every environment
-counts alike ({PERMUTATIONS:,} random orders with a fixed seed where the exact distribution has more
-than {MOST_VALUES:,} values). The test decides, also where an interval says otherwise: that of the
-improvement is for the interquartile mean. In a full grid the rows of all environments together are
-primary: in one environment alone no configuration with five seeds can reach 0.05 on its own after
-the correction. p corrected: Benjamini-Hochberg over one family, all configurations of an algorithm
-in one environment, or in all of them together. The verdict is better or worse where p corrected is
-at most 0.05, and perhaps so where only p is. statistics.csv also has the smallest p that one
-configuration alone could reach with its number of seeds. Detectable: the improvement that these
-seeds find at the 5 % level, uncorrected, with 80 % power. Seeds needed: how many on each side the
-observed improvement takes. Both are for normal returns with the standard deviation of these
-seeds.""",
-    "interactions": """Interaction = mean with both - mean with the first - mean with the second +
-mean without noise, of the final test returns, where each of the four has at least 3 seeds (n is the
-smallest number), with a 95 % interval (Welch, Satterthwaite), and in percent of |mean without
-noise|. This is descriptive: nothing is corrected for the number of rows.""",
-    "choice": """Score in the search: the mean over the seeds, and over each run's tests in the last
-15 % of its steps. Score in the confirmation, on fresh seeds (1001 and up): the mean final test
-return. Survives, in the confirmation: whether the winner was shown to be better than no noise.
-Search and confirmation have rows of their own everywhere, and only the confirmation is judged: the
-search's seeds chose the noise, which flatters it.""",
-    "missing": """Missing are the seeds that at least half of an algorithm's configurations with
-noise have, and baselines.""",
-    "compare_luck": f"""{PAPER_CONFIGURATIONS} configurations in each environment. The paper prints
-only means and standard deviations, so returns are taken as normal, with the standard deviation of
-each baseline, known from 5 seeds (PPO 10). Where a fifth of the runs end around a second, higher
-peak, the best of 90 useless configurations has a p luck of {LUCKY} or less in
-{FALSE_ALARMS_IN_THE_PAPER[5]} % of studies with five seeds and {FALSE_ALARMS_IN_THE_PAPER[10]} %
-with ten; one with a true gain of 1, 1.5 and 2 standard deviations in
-{listed(POWER_IN_THE_PAPER[5])} % and {listed(POWER_IN_THE_PAPER[10])} %, if returns are normal.""",
-    "compare": """The difference is in standard errors, where the steps are the same. Listed by:
-whose table has the row. Paper, luck: see the table of luck. Our steps:""",
-}
-CAPTIONS, HOW = (
-    {name: " ".join(text.split()) for name, text in texts.items()} for texts in (CAPTIONS, HOW)
-)
+CAPTIONS = {name: " ".join(text.split()) for name, text in CAPTIONS.items()}
+
+
+def percent_note(summary, metric):
+    """Say in which environments of a summary percentages would mean nothing, or ""."""
+    if metric == SUCCESS:
+        return "Success rates are in percent of the episodes, differences in percentage points."
+    without = summary["difference"].notna() & summary["improvement_percent"].isna()
+    names = sorted(set(summary.loc[without, "environment"]))
+    if not names:
+        return ""
+    return (
+        f"No percentage on {listed(names)}: the mean return without noise is not clearly different "
+        "from zero there. Averages of percentages leave this out; shares and best noises do not."
+    )
 
 
 def make_tables(studies, paper=None):
@@ -294,55 +448,46 @@ def make_tables(studies, paper=None):
     luck = frame("luck", luck_rows(lucks, best, good, bad))
     failing = bad[bad["fails_at_every_rate"] == "yes"][[*STUDY, "noise"]].drop_duplicates()
     failing = "; ".join(f"{noise} ({study_name(*study)})" for *study, noise in failing.values)
+    failing = f"Worse at every rate that was tried: {failing or 'none'}."
+    metric = studies[0].metric
+    note = percent_note(judged, metric)
     tables = [
-        table_of("best", best, view=best_view(best, statistics)),
-        table_of("consistent", good),
-        table_of(
-            "consistently_worse", bad, how=f"{HOW['consistently_worse']} {failing or 'none'}."
-        ),
+        table_of("best", best, view=best_view(best, statistics), note=note),
+        table_of("consistent", good, note=note),
+        table_of("consistently_worse", bad, note=f"{failing} {note}".strip()),
         table_of("luck", luck, only_csv=LUCK_ONLY_CSV),
-        table_of(
-            "statistics",
-            statistics,
-            only_csv=("environments", "comparisons", "smallest_p", "smallest_p_adjusted"),
-        ),
+        table_of("statistics", statistics, only_csv=STATISTICS_ONLY_CSV, note=note),
         table_of("early_performance", early, rates_beside=True),
     ]
     found = frame("interactions", (row for study in judging for row in interaction_rows(study)))
     if len(found):
         tables.append(table_of("interactions", found))
     for algorithm, table in summary.groupby("algorithm"):
-        tables.append(table_of("summary", table, name=f"summary_{algorithm}"))
+        more = {"name": f"summary_{algorithm}", "note": percent_note(table, metric)}
+        tables.append(table_of("summary", table, **more))
     if paper:
         lengths = {study.key: study.steps[-1] for study in studies}
         steps = ", ".join(f"{study_name(*key)} {n:,}" for key, n in lengths.items())
-        listed = judged, best, consistency, good, bad, early
-        for name, table in compare_tables(paper, lengths, *listed):
+        ours = judged, best, consistency, good, bad, early
+        for name, table in compare_tables(paper, lengths, *ours):
             section = name.removeprefix("compare_")
             if section == "luck":
                 more = {"kind": name, "only_csv": LUCK_ONLY_CSV}
             else:
-                more = {"kind": "compare", "how": f"{HOW['compare']} {steps}."}
+                more = {"kind": "compare", "note": f"Our steps: {steps}."}
             tables.append(table_of(frame=table, section=section, name=name, **more))
     return {table.name: table for table in tables}
 
 
-def table_of(kind, frame, name=None, section=None, how=None, **more):
-    """Make a Table with the formats and texts of this module; name and section may be its kind."""
-    how = HOW.get(kind, "") if how is None else how
-    return Table(name or kind, frame, CAPTIONS[kind], section or kind, FORMATS, how, **more)
+def table_of(kind, frame, name=None, section=None, **more):
+    """Make a Table with the formats and captions of this module; name and section may be kind."""
+    return Table(name or kind, frame, CAPTIONS[kind], section or kind, FORMATS, **more)
 
 
 def best_view(best, statistics):
-    """Return the best noises as people read them, in nine columns.
-
-    The improvement is that of the verdict, of the interquartile mean, with its interval.
-    """
-    keys = [*KEYS, "scope"]
-    tests = statistics.set_index(keys)[
-        ["improvement_iqm_percent", "improvement_low", "improvement_high"]
-    ]
-    rows = pd.MultiIndex.from_frame(best.assign(scope="environment")[keys])
+    """Return the best noises as people read them, in nine columns."""
+    tests = statistics[statistics["scope"] == "environment"].set_index(KEYS)
+    tests = tests.loc[list(best[KEYS].itertuples(index=False, name=None))]
     view = pd.DataFrame(index=best.index)
     names = [study_name(*key) for key in best[STUDY].itertuples(index=False)]
     view["algorithm, environment"] = [
@@ -350,8 +495,9 @@ def best_view(best, statistics):
         for name, environment in zip(names, best["environment"], strict=True)
     ]
     same = ["noise", "noise_rate", "baseline_mean", "baseline_std", "noisy_mean", "noisy_std"]
-    view = view.join(best[same]).join(tests.reindex(rows).set_index(best.index))
-    view = view.join(best[["p_adjusted", "luck_95_percent"]])
+    view = view.join(best[same])
+    view["difference"] = [difference(row) for row in tests.itertuples()]
+    view = view.join(best[["p_adjusted", "luck_95"]])
     view["p_luck_of_best"] = best["p_luck"]
     view["n"] = [seeds_of(*pair) for pair in best[["n", "n_baseline"]].to_numpy()]
     return view

@@ -1,49 +1,52 @@
 """One plain sentence for each environment and noise: is it better than no noise?
 
-A noise is called better or worse only where the p of the exact two-sided Mann-Whitney test (over
-several environments, of the test of the mean win rate), corrected with Benjamini and Hochberg's
-method over all configurations of one algorithm in one environment, is at most 0.05; where only the
-uncorrected p is, it is "perhaps" so.
+A noise is called better or worse only where the p of its comparison (statistics.compare), corrected
+for all configurations of a study in that environment, is at most 0.05; where only the uncorrected p
+is, it is "perhaps" so.
 """
 
 from math import nan
 
-import numpy as np
 import pandas as pd
 
 from analysis.runs import STUDY, rows_of, study_name
-from analysis.statistics import LEVEL, improvement_percent
-from noisy_wrappers import BASELINE
+from analysis.statistics import LEVEL, SEEDS_FOR_INTERVAL
+from noisy_wrappers import rounded
 
 UNCLEAR = "no clear difference"
+TOO_FEW = "too few seeds"
+UNLEARNED = "nothing learned"
 CLEAR = ["better", "worse"]
-VERDICTS = [*CLEAR, "perhaps better", "perhaps worse", UNCLEAR]  # in this order
+VERDICTS = [*CLEAR, "perhaps better", "perhaps worse", UNCLEAR, TOO_FEW, UNLEARNED]  # in this order
+POINTS = " percentage points of success"
 MAX_SEEDS = 1000  # a difference that would take more seeds is said to take more than these
 
 
 def verdict(row):
-    """Name the verdict of a row of statistics with its p, p_adjusted and win rate; or NaN."""
-    if pd.isna(row["p"]):
+    """Name the verdict of a row of statistics: one of VERDICTS, or NaN without a baseline."""
+    if pd.isna(row["n_baseline"]):
         return nan
-    if round(row["p"], 12) > LEVEL:
+    if row.get("verdict") == UNLEARNED:
+        return UNLEARNED
+    if pd.isna(row["p"]):
+        return TOO_FEW
+    if not significant(row["p"]):
         return UNCLEAR
-    direction = "better" if row["probability_of_improvement"] > 0.5 else "worse"
-    return direction if round(row["p_adjusted"], 12) <= LEVEL else f"perhaps {direction}"
+    direction = "better" if row["t"] > 0 else "worse"
+    return direction if significant(row["p_adjusted"]) else f"perhaps {direction}"
 
 
-# ---------------------------------------------------------------------------------------- sentences
+def significant(p):
+    """Tell whether a p-value is at most LEVEL, in spite of rounding errors."""
+    return round(p, 12) <= LEVEL
+
+
+# ---------------------------------------------------------------------------- numbers in a sentence
 
 
 def percent(value, sign="+"):
     """Spell a percentage: whole from 10 on, with a decimal below."""
-    return f"{value:{sign}.{0 if abs(value) >= 10 else 1}f} %"
-
-
-def interval(low, high):
-    """Spell an interval in percent: whole numbers, or with a decimal where it is narrow."""
-    if high - low >= 10:
-        return f"[{round(low)}, {round(high)}]"
-    return f"[{low:.1f}, {high:.1f}]"
+    return f"{value:{sign}z,.{0 if abs(value) >= 10 else 1}f} %"
 
 
 def counted(number, word):
@@ -61,62 +64,80 @@ def p_value(p):
     return f"= {p:.2g}" if p >= 0.001 else "< 0.001"
 
 
-def far_away(values):
-    """Count the values (n) that lie far above and far below the others (Tukey's outer fences)."""
-    low, high = np.quantile(values, [0.25, 0.75])
-    reach = 3 * (high - low)
-    return (values > high + reach).sum(), (values < low - reach).sum()
+def spread_of(row):
+    """Return what a comparison's difference may be off by: half its interval, or its spread."""
+    half = (row.difference_high - row.difference_low) / 2
+    return row.pooled_std if pd.isna(half) else half
 
 
-def disagreement(mean_percent, iqm_percent, x, y):
-    """Say where the improvement of the mean differs from that of the interquartile mean, or "".
+def difference(row, unit=""):
+    """Spell what a comparison found: "+11.8 [8.4, 15.3] (+21 %)", of several environments in sd.
 
-    They differ by at least 10 points and by half of the larger one. x (n) with noise, y (m)
-    without.
+    unit: of the difference, such as POINTS.
     """
-    apart = abs(mean_percent - iqm_percent)
-    if not apart >= max(10, abs(mean_percent) / 2, abs(iqm_percent) / 2):
-        return ""
-    reasons = []
-    for values, name in ((x, "with noise"), (y, "without noise")):
-        for count, where in zip(far_away(values), ("above", "below"), strict=True):
-            if count:
-                lie = "lies" if count == 1 else "lie"
-                reasons.append(f"{count} of {len(values)} runs {name} {lie} far {where} the others")
-    because = f": {' and '.join(reasons)}" if reasons else ""
-    return f" The mean says {percent(mean_percent)}{because}."
-
-
-def evidence(row):
-    """Spell the improvement with its interval and the p-values of a row of statistics."""
-    text = ""
-    if pd.notna(row["improvement_iqm_percent"]):
-        text = percent(row["improvement_iqm_percent"])
-        if pd.notna(row["improvement_low"]):
-            text += f" {interval(row['improvement_low'], row['improvement_high'])}"
-        text += ", "
-    text += f"p {p_value(row['p'])}"
-    if row["comparisons"] > 1 and row["verdict"] != UNCLEAR:
-        corrected = p_value(row["p_adjusted"]).removeprefix("= ")
-        text += f", corrected for {row['comparisons']:.0f} comparisons {corrected}"
-    elif row["comparisons"] == 1 and row["verdict"] != UNCLEAR:
-        text += ", the only comparison"
+    if pd.isna(row.difference):
+        text = f"{row.effect_size:+z.2f} standard deviations on average"
+        if pd.isna(row.effect_size):
+            text = "effects that have no mean"
+    else:
+        spread = spread_of(row)
+        text = rounded(row.difference, spread)
+        text = text if text.startswith("-") else f"+{text}"
+        if pd.notna(row.difference_low):
+            ends = row.difference_low, row.difference_high
+            text += f" [{', '.join(rounded(end, spread) for end in ends)}]"
+        text += unit
+    if pd.notna(row.difference_percent):
+        text += f" ({percent(row.difference_percent)})"
     return text
 
 
-def disagrees(direction, low, high):
-    """Say that the test decides where the interval says something else, or "".
-
-    direction: what the test says, "better", "worse" or UNCLEAR; low, high: the interval of the
-    improvement, NaN where there is none.
-    """
-    if not low <= high:
+def corrected(p, number, what):
+    """Spell a p-value that is corrected for a number of comparisons, if there are several."""
+    if number == 1:
         return ""
-    says = "better" if low > 0 else "worse" if high < 0 else UNCLEAR
-    return "" if says == direction else " Test and interval disagree: the test decides."
+    return f", corrected for {number:.0f} {what}s {p_value(p).removeprefix('= ')}"
 
 
-def reach(row):
+def borderline(row):
+    """Say where the interval of a comparison and its p differ, or ""."""
+    if pd.isna(row.difference_low):
+        return ""
+    excludes_zero = row.difference_low > 0 or row.difference_high < 0
+    if excludes_zero == significant(row.p):
+        return ""
+    return f" Borderline: the interval {'excludes' if excludes_zero else 'includes'} zero."
+
+
+def smallest(row):
+    """Say which p is the smallest possible where a comparison has too few seeds for an interval."""
+    few = min(row.n, row.n_baseline) < SEEDS_FOR_INTERVAL and significant(row.smallest_p)
+    return f" (smallest possible: {row.smallest_p:.2g})" if few else ""
+
+
+# ---------------------------------------------------------------------------------------- sentences
+
+
+def sentence(row, unit=""):
+    """Say in one sentence what a row of statistics shows; unit: of the difference."""
+    where = row["environment"]
+    if row["scope"] == "all":
+        where = f"all {row['environments']:.0f} environments together"
+    study = study_name(*row[STUDY])
+    start = f"{study} on {where} with {row['noise']} at rate {row['noise_rate']}"
+    if row["verdict"] == UNLEARNED:
+        return f"{start} cannot be judged: all runs have the same results, nothing was learned."
+    if row["verdict"] == TOO_FEW:
+        return f"{start} has too few seeds for a test: {difference(row, unit)}."
+    evidence = f"{difference(row, unit)}, p {p_value(row['p'])}{smallest(row)}"
+    if row["verdict"] == UNCLEAR:
+        return f"{start} shows {UNCLEAR}: {evidence}{power(row)}.{borderline(row)}"
+    alone = ", the only comparison" if row["comparisons"] == 1 else ""
+    evidence += alone or corrected(row["p_adjusted"], row["comparisons"], "comparison")
+    return f"{start} is {row['verdict']} than no noise: {evidence}.{borderline(row)}"
+
+
+def power(row):
     """Say what the seeds of a row without a clear difference could have shown, or ""."""
     n, m, most = int(row["n"]), int(row["n_baseline"]), int(row["n_baseline_most"])
     seeds = counted(n, "seed")
@@ -125,36 +146,22 @@ def reach(row):
     elif n != m:
         seeds += f" against {m}"
     parts = []
-    if row["smallest_p"] > LEVEL:
+    if not significant(row["smallest_p"]):
         parts.append(f"{seeds} cannot show any (smallest possible p: {row['smallest_p']:.2g})")
-    elif pd.notna(row["detectable_percent"]):
-        difference = percent(row["detectable_percent"], sign="")
-        power = "80 % power"
-        if row["comparisons"] > 1:
-            power += f" before the correction for {row['comparisons']:.0f} comparisons"
-        if row["smallest_p_adjusted"] > LEVEL:
-            power += ", which no noise can pass alone"
-        parts.append(f"{seeds} could have shown {difference} ({power})")
+    elif row["detectable"] > 0:
+        before, number = "80 % power", row["comparisons"]
+        if number > 1:
+            before += f" before the correction for {number:.0f} comparisons"
+            if not significant(row["smallest_p_adjusted"]):
+                before += ", which no noise can pass alone"
+        found = rounded(row["detectable"], spread_of(row))
+        parts.append(f"{seeds} could have shown {found} ({before})")
     needed = row["seeds_needed"]
     if needed > max(n, m):
         needed = f"about {needed:.0f}" if needed <= MAX_SEEDS else f"more than {MAX_SEEDS:,}"
-        difference = percent(abs(row["improvement_iqm_percent"]), sign="")
-        parts.append(f"{difference} would take {needed} seeds each")
+        observed = rounded(abs(row["difference"]), spread_of(row))
+        parts.append(f"{observed} would take {needed} seeds each")
     return "; " + ", and ".join(parts) if parts else ""
-
-
-def sentence(row):
-    """Say in one sentence what a row of statistics shows."""
-    where = row["environment"]
-    if row["scope"] == "all":
-        where = f"all {row['environments']:.0f} environments together"
-    study = study_name(*row[STUDY])
-    start = f"{study} on {where} with {row['noise']} at rate {row['noise_rate']}"
-    direction = row["verdict"].removeprefix("perhaps ")
-    text = f"is {row['verdict']} than no noise: {evidence(row)}."
-    if direction == UNCLEAR:
-        text = f"shows {UNCLEAR}: {evidence(row)}{reach(row)}."
-    return f"{start} {text}{disagrees(direction, row['improvement_low'], row['improvement_high'])}"
 
 
 def tally(verdicts):
@@ -172,7 +179,7 @@ def luck_sentence(best):
     best = best[best["p_luck"].notna()]
     if best.empty:
         return ""
-    if not (best["improvement_percent"] > 0).any():
+    if not (best["difference"] > 0).any():
         return "Nothing that was tried has a higher mean return than no noise."
     tried = set(best["chosen_from"])
     rivals = f"the best of {max(tried):.0f} useless noises would"
@@ -186,10 +193,10 @@ def luck_sentence(best):
         return f"The best noise{where} looks no better than {rivals}."
     where = [f"{row.environment} (p {p_value(row.p_luck)})" for row in beyond.itertuples()]
     elsewhere = "; elsewhere it does not" if len(beyond) < len(best) else ""
-    return f"On {together(where)} the best noise looks better than {rivals}{elsewhere}."
+    return f"On {listed(where)} the best noise looks better than {rivals}{elsewhere}."
 
 
-def together(names):
+def listed(names):
     """Join names for a sentence: "A, B and C"."""
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
@@ -200,7 +207,7 @@ def headlines(statistics, best):
     Counted are the verdicts of single environments. statistics, best: the frames of these tables.
     """
     lines = []
-    alone = statistics[statistics["p"].notna() & (statistics["scope"] == "environment")]
+    alone = statistics[statistics["verdict"].notna() & (statistics["scope"] == "environment")]
     for key, rows in alone.groupby(STUDY, sort=False):
         noises = counted(len(rows.drop_duplicates(["noise", "noise_rate"])), "noise")
         tried = f"{noises} in {counted(rows['environment'].nunique(), 'environment')}"
@@ -208,7 +215,9 @@ def headlines(statistics, best):
             tried = f"{counted(len(rows), 'comparison')} ({tried})"
         counts = [(word, (rows["verdict"] == word).sum()) for word in VERDICTS]
         counts = [(word, n) for word, n in counts if n or word in CLEAR]
-        luck = luck_sentence(best[rows_of(best, key)])
+        luck = ""
+        if (rows["verdict"] != UNLEARNED).any():
+            luck = luck_sentence(best[rows_of(best, key)])
         lines.append({"name": study_name(*key), "tried": tried, "counts": counts, "luck": luck})
     return lines
 
@@ -222,34 +231,18 @@ def clear_first(verdicts, number=10):
     return clear[:number], verdicts.drop(clear.index[:number])
 
 
-def sentences(studies, statistics):
-    """Return a frame with a verdict and a sentence for all that was tested.
+def sentences(statistics, unit=""):
+    """Return a frame with a verdict and a sentence for all that was compared.
 
+    unit: behind each difference, such as POINTS.
     All environments together come before each alone, and clear differences before others.
     """
-    columns = [*STUDY, "scope", "environment", "verdict", "sentence"]
-    tested = statistics[statistics["p"].notna()]
-    tested = tested.assign(
-        apart=tested["scope"] != "all",
-        rank=[VERDICTS.index(verdict) for verdict in tested["verdict"]],
+    compared = statistics[statistics["verdict"].notna()]
+    compared = compared.assign(
+        apart=compared["scope"] != "all",
+        rank=[VERDICTS.index(verdict) for verdict in compared["verdict"]],
     )
-    rows = []
-    for study in studies:
-        mine = tested[rows_of(tested, study.key)]
-        for _, row in mine.sort_values(["apart", "environment", "rank", "p"]).iterrows():
-            text = sentence(row) + remark(study, row)
-            rows.append((*row[columns[:-1]], text))
-    return pd.DataFrame(rows, columns=columns)
-
-
-def remark(study, row):
-    """Return what the returns behind a row of one environment say besides, or ""."""
-    if row["scope"] == "all":
-        return ""
-    e = study.environments.index(row["environment"])
-    configs = {(config.noise, config.noise_rate): config for config in study.returns}
-    x = study.final(configs[row["noise"], row["noise_rate"]])[:, e]
-    y = study.final(BASELINE)[:, e]
-    x, y = x[np.isfinite(x)], y[np.isfinite(y)]
-    mean_percent = improvement_percent(x.mean(), y.mean())
-    return disagreement(mean_percent, row["improvement_iqm_percent"], x, y)
+    compared = compared.sort_values([*STUDY, "apart", "environment", "rank", "p"], kind="stable")
+    compared["sentence"] = [sentence(row, unit) for _, row in compared.iterrows()]
+    columns = [*STUDY, "scope", "environment", "verdict", "sentence"]
+    return compared[columns].reset_index(drop=True)

@@ -1,8 +1,9 @@
-"""How far a sweep has come, in five views.
+"""How far a sweep has come, in six views.
 
 benchmark.sh calls this file from the project's folder:
 
     python -m sweep list FOLDER PRESET ...     one run per line: folder, state, command
+    python -m sweep dry-run FOLDER PRESET ...  the same, after their cost is said on stderr
     python -m sweep status FOLDER PRESET ...   a summary, the failed runs, the slowest running ones
     python -m sweep stopped FOLDER PRESET ...  a summary and the failed runs of a stopped sweep
     python -m sweep report FOLDER PRESET ...   a summary, and what did not finish: exit status 1
@@ -15,6 +16,8 @@ ended otherwise is read from its log, which benchmark.sh ends with the run's exi
 machine whose locks this one cannot see is taken for running while its log is young and has no end.
 """
 
+import argparse
+import contextlib
 import os
 import shutil
 import sys
@@ -26,6 +29,7 @@ from typing import NamedTuple
 
 from analysis.errors import take_over_terminal
 from analysis.folders import STOPPED, Log, is_locked, read_log
+from sweep.environment import cost
 from sweep.grid import check_extra, check_rollouts, command_line, grid, result, runs_in
 from sweep.options import check_arguments, parse_args
 
@@ -36,8 +40,7 @@ RUNNING, PROBABLY = "running", "probably running"
 class Sweep(NamedTuple):
     """What a view is about."""
 
-    runs_dir: str
-    extra: list  # the scripts' own options
+    args: argparse.Namespace  # as options.parse_args reads them
     runs: list  # of PlannedRun
     choices: list  # of choose.Choice, for the preset of that name
 
@@ -132,7 +135,7 @@ def table(rows):
 # ------------------------------------------------------------------------- the views: exit statuses
 
 
-def show_list(sweep):
+def show_list(sweep, with_cost=False):
     """Print the runs for benchmark.sh: folder, state and command; and what a batch will take."""
     states = []
     for run in sweep.runs:
@@ -142,7 +145,7 @@ def show_list(sweep):
             print(f"warning: {damage}", file=sys.stderr)
     if "todo" in states:
         check_rollouts(sweep.runs)
-        if sweep.extra:
+        if sweep.args.extra:
             check_extra(sweep.runs)
     for run, state in zip(sweep.runs, states, strict=True):
         folder = f"{run.folder.parent}/{run.folder.name}"  # with a slash, for --runs-dir . too
@@ -151,10 +154,20 @@ def show_list(sweep):
     if sweep.choices:
         from sweep import choose
 
-        plan = choose.plan(sweep.choices)
+        plan = choose.plan(sweep.choices, sweep.args)
+    elif with_cost and "todo" in states:
+        runs = {state: [] for state in ("done", "damaged", "todo")}
+        for run, state in zip(sweep.runs, states, strict=True):
+            runs[state].append(run)
+        plan[0] += "; " + cost(sweep.args, runs["done"], runs["todo"])
     for line in plan:
         print(line, file=sys.stderr)
     return 0
+
+
+def show_dry_run(sweep):
+    """Print the same, with what a sweep costs."""
+    return show_list(sweep, with_cost=True)
 
 
 def watch(sweep):
@@ -179,7 +192,7 @@ def show_status(sweep):
     if sweep.choices:
         from sweep import choose
 
-        print(*choose.standing(sweep.choices), sep="\n")
+        print(*choose.standing(sweep.choices, sweep.args), sep="\n")
     return int(any(p.reason == "damaged" for p in progresses))
 
 
@@ -198,17 +211,17 @@ def show_report(sweep):
     if sweep.choices:
         from sweep import choose
 
-        choose.report(sweep.choices, Path(sweep.runs_dir, "choice.csv"))
+        choose.report(sweep.choices, Path(sweep.args.runs_dir, "choice.csv"))
     if any(p.state == "done" for p in progresses):
-        print(f"See the curves with: tensorboard --logdir {sweep.runs_dir}")
-        print(f"Make tables and figures with: python analyze.py --runs-dir {sweep.runs_dir}")
+        print(f"See the curves with: tensorboard --logdir {sweep.args.runs_dir}")
+        print(f"Make tables and figures with: python analyze.py --runs-dir {sweep.args.runs_dir}")
     return int(unfinished)
 
 
 def show_progress(sweep, title, over):
     """Print the summary and the runs that are not on their way; return the progress of all."""
     progresses = [judge(run, over) for run in sweep.runs]
-    print(f"{sweep.runs_dir}: {summary(sweep.runs, progresses)}")
+    print(f"{sweep.args.runs_dir}: {summary(sweep.runs, progresses)}")
     everything = title == "not finished"
     named = [p for p in progresses if p.state == "failed" or (everything and p.reason)]
     if named:
@@ -230,6 +243,7 @@ def check_disk(folder):
 
 VIEWS = {
     "list": show_list,
+    "dry-run": show_dry_run,
     "status": show_status,
     "stopped": show_stopped,
     "report": show_report,
@@ -244,15 +258,17 @@ def main(view, caller, argv):
     if view == "status" and args.preset in (None, "custom") and args.given <= {"--runs-dir"}:
         runs = runs_in(args.runs_dir)
     else:
-        check_arguments(args)
+        with contextlib.redirect_stdout(sys.stderr):  # what a user's module prints is no run
+            check_arguments(args)
         if args.preset == "choose":
             from sweep import choose  # and with it pandas: no other preset should wait for that
 
-            choices = choose.choices(args)
+            ask = view in ("list", "dry-run")
+            choices = choose.choices(args, ask, keep=view == "list")
             runs = choose.runs_of(choices)
         else:
             runs = grid(args)
-    return VIEWS[view](Sweep(args.runs_dir, args.extra, runs, choices))
+    return VIEWS[view](Sweep(args, runs, choices))
 
 
 if __name__ == "__main__":
@@ -260,7 +276,7 @@ if __name__ == "__main__":
         print(__doc__)
         sys.exit()
     names = {"encoding": sys.getfilesystemencoding(), "errors": sys.getfilesystemencodeerrors()}
-    if sys.argv[1] == "list":  # folders as they are: bash starts their runs
+    if sys.argv[1] in ("list", "dry-run"):  # folders as they are: bash starts their runs
         sys.stdout.reconfigure(**names)
     else:
         take_over_terminal()

@@ -7,22 +7,21 @@ command computes from the finished runs where each choice stands.
 import csv
 import fcntl
 import itertools
+import math
 import os
+import sys
 from statistics import fmean
 from typing import NamedTuple
 
 from analysis.errors import fail
-from analysis.folders import CONFIRMATION, SEARCH, flat_choice, read_config, read_json
-from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED, read_run
+from analysis.folders import CONFIRMATION, SEARCH, flat_choice, read_config
+from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED, SUCCESS, read_run
 from analysis.statistics import detectable_shift, holm
-from noisy_wrappers import BASELINE, Configuration
+from analysis.verdicts import POINTS
+from noisy_wrappers import BASELINE, Configuration, rounded
 from sweep import halving
-from sweep.grid import PlannedRun, cell, cells, make_run, result
-
-# What a run takes on one core until the finished ones tell: docs/sweeps.md
-STEPS_PER_SECOND = {"sac": 150, "td3": 265, "ppo": 5700}  # in small MuJoCo environments
-IN_HUMANOID = {"sac": 90, "td3": 130, "ppo": 2900}
-START_UP = 10  # seconds, with compilation
+from sweep.environment import ask_all, remember, remembered, run_seconds, time_left, wall_time
+from sweep.grid import PlannedRun, cell, cells, make_run, of_the_paper, result
 
 
 class Choice(NamedTuple):
@@ -36,11 +35,16 @@ class Choice(NamedTuple):
     state: halving.State
     runs: dict[tuple[Configuration, int], PlannedRun]  # those that have been due so far
     returns: dict[tuple[Configuration, int], float]  # of those that are finished
-    core_hours: float  # about what is left
+    spread: float  # standard deviation over seeds of the search's last tests; NaN if unknown
+    run_seconds: float | None  # about what a run takes, if anything tells
+    metric: str = "return"  # or "success rate": then `returns` has rates of success in percent
 
 
-def choices(args):
-    """Return the choices of one command, or exit if its numbers make no choice."""
+def choices(args, ask=False, keep=False):
+    """Return the choices of one command, or exit if its numbers make no choice.
+
+    ask: make and time the environments of choices that have not begun. keep: what they answer.
+    """
     pairs = list(itertools.product(dict.fromkeys(args.algos), args.envs))
     fewest = halving.fewest_seeds(len(pairs))
     if args.confirm < fewest:
@@ -48,12 +52,39 @@ def choices(args):
             f"--confirm must be at least {fewest}, not {args.confirm}: with fewer seeds no "
             f"difference could be significant (number of verdicts: {len(pairs)})"
         )
-    return [follow(args, algorithm, env_id) for algorithm, env_id in pairs]
+    known = {env_id: remembered(args.runs_dir, env_id) for env_id in args.envs}
+    found = [follow(args, *pair, known[pair[1]]) for pair in pairs]
+    new = [(c.algorithm, c.env_id) for c in found if ask and not c.returns]
+    if not new:
+        return found
+    noises = {env_id: candidates(args, algorithm, env_id) for algorithm, env_id in new}
+    for env_id, answer in ask_all(args, noises).items():
+        leave_out(args, env_id, answer.unfit)
+        known[env_id] = answer
+        if keep:
+            remember(args.runs_dir, env_id, answer)
+    return [follow(args, *pair, known[pair[1]]) for pair in pairs]
 
 
-def follow(args, algorithm, env_id):
-    """Return one choice: where the finished runs have brought it."""
-    noises = candidates(args, algorithm, env_id)
+def leave_out(args, env_id, unfit):
+    """Say which noises cannot act in an environment; exit if the user has named them."""
+    reasons = {}
+    for noise, reason in unfit.items():
+        reason = reason.removeprefix(noise.partition("(")[0]).strip()  # of several noises, often
+        reasons.setdefault(reason, []).append(noise)
+    told = "; ".join(f"{', '.join(noises)} ({reason})" for reason, noises in reasons.items())
+    if told and args.noises and not of_the_paper(args):
+        fail(f"--noises: these cannot act in {env_id}: {told}")
+    if told:
+        print(f"{env_id}: left out, because they cannot act there: {told}", file=sys.stderr)
+
+
+def follow(args, algorithm, env_id, environment):
+    """Return one choice: where the finished runs have brought it.
+
+    environment: what is known of it, or None.
+    """
+    noises = candidates(args, algorithm, env_id, environment.unfit if environment else {})
     budget = 3 * len(noises) if args.budget is None else args.budget
     if budget < len(noises):
         fail(f"--budget must be at least {len(noises)}, a run for each noise, not {budget}")
@@ -61,7 +92,8 @@ def follow(args, algorithm, env_id):
     last_seed = sum(seeds for _, seeds in schedule)
     if last_seed >= FIRST_CONFIRMATION_SEED:
         fail(f"--budget {budget} is too large: the best noises would run with {last_seed} seeds")
-    runs, returns = {}, {}
+    runs, returns, last_tests, different = {}, {}, {}, set()
+    metric = args.metric.replace("_", " ")
     while True:
         state = halving.advance(noises, budget, args.confirm, returns)
         phase = SEARCH if len(state.rounds) < len(schedule) else CONFIRMATION
@@ -70,19 +102,31 @@ def follow(args, algorithm, env_id):
             run = make_run(args, algorithm, env_id, noise, seed, phase)
             check_place(run)
             if result(run)[0]:
-                run, value = with_return(run, phase)
-                if not run.damage:
-                    finished[noise, seed] = value
+                run, row = with_row(run)
+                tests = tests_of(run, row, metric) if row else ()
+                different |= set(tests)
+                if row and phase == CONFIRMATION:
+                    finished[noise, seed] = tests[-1]
+                elif row:
+                    finished[noise, seed] = halving.score(row["steps"], tests)
+                    last_tests.setdefault(noise, []).append(tests[-1])
             runs[noise, seed] = run
         if not finished:
             break
         returns |= finished
     check_frequencies(runs[key] for key in returns)
-    left = halving.number_of_runs(len(noises), budget, args.confirm) - len(returns)
-    speeds = IN_HUMANOID if "Humanoid" in env_id else STEPS_PER_SECOND
-    seconds = START_UP + args.total_timesteps / speeds[algorithm]
+    if len(different) == 1 and (state.rounds or not state.due):
+        fail(
+            f"{algorithm.upper()} on {env_id}: all {len(returns)} runs have a {metric} of "
+            f"{rounded(*different)} in every test: nothing was learned in "
+            f"{args.total_timesteps:,} steps, so further runs would say nothing about noise; "
+            "train for longer, or leave this out",
+            code=1,
+        )
     taken = [taken for taken in map(wall_time, map(runs.get, returns)) if taken]
-    seconds = fmean(taken) if taken else seconds
+    seconds = fmean(taken) if taken else None
+    if environment and not taken:
+        seconds = run_seconds(next(iter(runs.values())), environment)
     return Choice(
         name=f"{algorithm.upper()} on {env_id}",
         algorithm=algorithm,
@@ -92,7 +136,9 @@ def follow(args, algorithm, env_id):
         state=state,
         runs=runs,
         returns=returns,
-        core_hours=left * seconds / 3600,
+        spread=halving.spread(last_tests.values()),
+        run_seconds=seconds,
+        metric=metric,
     )
 
 
@@ -104,8 +150,8 @@ def runs_of(found):
     return [run for _, run in sorted(runs, key=lambda pair: pair[0])]
 
 
-def candidates(args, algorithm, env_id):
-    """Return the noises to choose from, each once."""
+def candidates(args, algorithm, env_id, unfit=()):
+    """Return the noises to choose from, each once, but for those that cannot act there."""
     noises = dict.fromkeys(cells(args, algorithm, env_id))
     noises.pop(BASELINE, None)  # at rate 0 a noise is none
     for pairs in args.exclude:
@@ -115,9 +161,10 @@ def candidates(args, algorithm, env_id):
         if excluded not in noises:
             fail(f"--exclude: {excluded} is not among the noises")
         del noises[excluded]
+    noises = [noise for noise in noises if noise.noise not in unfit]
     if not noises:
         fail("there is no noise to choose from")
-    return list(noises)
+    return noises
 
 
 def check_place(run):
@@ -127,18 +174,22 @@ def check_place(run):
         fail(f"{flat_choice(phase.parent)} (or choose another --runs-dir, if it is another sweep)")
 
 
-def with_return(run, phase):
-    """Return a finished run, with what is damaged in it, and what it counts for.
-
-    That is halving.score in the search, and its last test in the confirmation.
-    """
+def with_row(run):
+    """Return a finished run and its data; or the run with what is damaged in it, and None."""
     row = read_run(run.folder)
-    if row["status"] != "finished":
-        damage = f"{run.folder}/{row['reason']}; move its folder away to run it again"
-        return run._replace(damage=damage), None
-    if phase == CONFIRMATION:
-        return run, row["returns"][-1]
-    return run, halving.score(row["steps"], row["returns"])
+    if row["status"] == "finished":
+        return run, row
+    damage = f"{run.folder}/{row['reason']}; move its folder away to run it again"
+    return run._replace(damage=damage), None
+
+
+def tests_of(run, row, metric):
+    """Return the results of a run's tests (tests,), or exit if the environment tells no success."""
+    if metric != SUCCESS:
+        return row["returns"]
+    if row["success_rates"] is None:
+        fail(f"--metric success_rate: {run.kind[1]} tells no `is_success` or `success`")
+    return row["success_rates"]
 
 
 def check_frequencies(runs):
@@ -156,47 +207,73 @@ def check_frequencies(runs):
         )
 
 
-def wall_time(run):
-    """Return how many seconds a finished run has taken, or None where it does not say."""
-    seconds = read_json(run.folder / "result.json").get("wall_time_seconds")
-    return seconds if isinstance(seconds, int | float) and seconds > 0 else None
-
-
 # ---------------------------------------------------------------------------------------- in words
 
 
-def plan(found):
-    """Return lines that say, before a batch starts, what is due and what all of it will take.
+def plan(found, args):
+    """Return lines that say, before a batch starts, what it is for and what all of it will take.
 
-    Before the first batch, also what gain can be confirmed.
+    They also say what gain can be confirmed; before any run only in standard deviations.
     """
     if not any(choice.state.due for choice in found):
         return []
-    begun = any(choice.returns for choice in found)
-    return [*map(describe, found), total(found), *([] if begun else [reach(found)])]
+    lines = list(map(describe, found))
+    if not any(choice.returns for choice in found):
+        lines = [*map(question, found), *lines]
+    lines.append(total(found, args))
+    lines += filter(None, (reach(choice, len(found)) for choice in found))
+    return [*dict.fromkeys(lines), f"runs, logs and the verdict are stored in {args.runs_dir}"]
 
 
-def total(found):
+def question(choice):
+    """Say what a choice will decide."""
+    noises = choice.schedule[0][0] if choice.schedule else 1
+    which = f"the best of {noises} noises" if noises > 1 else "the noise"
+    return (
+        f"{choice.name}: is {which} better than no noise? "
+        f"{choice.confirm} fresh seeds of each will decide"
+    )
+
+
+def total(found, args):
     """Say how many runs all choices take, and what is left of them."""
     search = sum(noises * seeds for choice in found for noises, seeds in choice.schedule)
     confirm = sum(2 * choice.confirm for choice in found)
     finished = sum(len(choice.returns) for choice in found)
-    hours = sum(choice.core_hours for choice in found)
-    hours = f"{hours:.1f}" if hours >= 0.1 else f"{hours:.2g}"
-    return (
+    text = (
         f"{search + confirm} runs in all, {search} to search and {confirm} to confirm; "
-        f"{finished} are done, about {hours} core-hours are left"
+        f"{finished} are done"
     )
+    if any(choice.run_seconds is None for choice in found):
+        return text
+    batches = []
+    for numbers in itertools.zip_longest(*map(left, found), fillvalue=0):  # side by side
+        batches.append([])
+        for choice, runs in zip(found, numbers, strict=True):
+            batches[-1] += runs * [choice.run_seconds]
+    elsewhere = args.elsewhere and not finished
+    return f"{text}, {time_left(batches, args.jobs, elsewhere)}"
 
 
-def reach(found):
-    """Say what gain the confirmations of all choices can show."""
-    seeds = found[0].confirm
-    gain = detectable_shift(seeds, seeds, halving.LEVEL / len(found))
-    together = f", corrected for {len(found)} verdicts" if len(found) > 1 else ""
+def left(choice):
+    """Return the numbers of runs in the batches that are left."""
+    numbers = [noises * seeds for noises, seeds in choice.schedule] + [2 * choice.confirm]
+    return [len(choice.state.due), *numbers[len(choice.state.rounds) + 1 :]]
+
+
+def reach(choice, verdicts):
+    """Say what gain the confirmation can show, or nothing once runs are done without a spread."""
+    gain = detectable_shift(choice.confirm, choice.confirm, halving.LEVEL / verdicts)
+    seeds = f"{choice.confirm} fresh seeds confirm a true gain of"
+    power = "with 80 % power" + (f", corrected for {verdicts} verdicts" if verdicts > 1 else "")
+    if not choice.returns:
+        return f"{seeds} {gain:.1f} standard deviations over seeds {power}"
+    if not choice.spread > 0:
+        return ""
+    shift = gain * choice.spread
     return (
-        f"{seeds} fresh seeds confirm a true gain of {gain:.1f} standard deviations over seeds "
-        f"with 80 % power{together}"
+        f"{choice.name}: {seeds} about {rounded(shift, shift)}{unit(choice)} ({gain:.1f} standard "
+        f"deviations of the last tests in the search) {power}"
     )
 
 
@@ -215,7 +292,7 @@ def describe(choice):
     return f"{choice.name}, confirmation: {winner} against no noise, {due}"
 
 
-def standing(found):
+def standing(found, args):
     """Yield lines that say where each choice stands, which noises survive, and what is left.
 
     When all choices are finished, these are the verdicts.
@@ -226,11 +303,11 @@ def standing(found):
     for choice in found:
         yield describe(choice)
         if choice.state.due and choice.state.rounds:
-            yield f"  mean return after round {len(choice.state.rounds)}:"
+            yield f"  mean {choice.metric} after round {len(choice.state.rounds)}:"
             scores = choice.state.rounds[-1].scores
             for noise in sorted(choice.state.noises, key=scores.get, reverse=True):
-                yield f"  {scores[noise]:10.2f}  {noise}"
-    yield total(found)
+                yield f"  {rounded(scores[noise]):>10}  {noise}"
+    yield total(found, args)
 
 
 def report(found, path):
@@ -265,12 +342,20 @@ def rows(found):
     return result
 
 
+def unit(choice):
+    """Return what stands behind a difference."""
+    return POINTS if choice.metric == SUCCESS else ""
+
+
 def judged(found):
     """Return each finished choice's comparison, and its p corrected for all of them."""
     comparisons = []
     for choice in found:
         [winner] = choice.state.noises
-        comparisons.append(halving.compare(winner, choice.state.seeds, choice.returns))
+        comparison = halving.compare(winner, choice.state.seeds, choice.returns)
+        if choice.metric == SUCCESS:
+            comparison = comparison._replace(difference_percent=math.nan)  # never percent of a rate
+        comparisons.append(comparison)
     corrected = holm([comparison.p for comparison in comparisons])
     return list(zip(comparisons, corrected, strict=True))
 
@@ -279,7 +364,8 @@ def verdicts(found, judgements):
     """Yield what came out, one line for each choice."""
     for choice, (comparison, p) in zip(found, judgements, strict=True):
         noises = choice.schedule[0][0] if choice.schedule else 1
-        yield halving.verdict(choice.name, noises, comparison, p, len(found))
+        [winner] = choice.state.noises
+        yield halving.sentence(choice.name, winner, noises, comparison, p, len(found), unit(choice))
 
 
 def obstacle(choice):

@@ -9,6 +9,7 @@ import difflib
 import functools
 import itertools
 import os
+import re
 import shlex
 import subprocess
 from pathlib import Path
@@ -49,6 +50,8 @@ CHOOSE_NOISES = [
     "RandomUniformScaleReward(0.5, 1.5)",
     "RandomEarlyTermination(50)",
     "RandomNormalNoisyAction(0.1)",
+    "RandomActionDelay(0, 2)",
+    "RandomDynamics(0.7, 1.3)",
 ]
 CHOOSE_RATES = [0.05, 1.0]
 # The paper shows bars for several beta and names none of them: these are ours.
@@ -186,11 +189,15 @@ def best_pairs():
     return pairs
 
 
+def of_the_paper(args):
+    """Return whether the noises are given as --noises paper; options.entry reads it so."""
+    return args.noises == [[("paper", None)]]
+
+
 def cells(args, algorithm, env_id):
     """Return the configuration of every noisy cell of the grid, in the order given."""
-    of_the_paper = args.noises == [[("paper", None)]]  # --noises paper, as options.entry reads it
-    given = [] if of_the_paper else args.noises
-    pairs = preset_pairs("paper" if of_the_paper else args.preset, algorithm, env_id)
+    given = [] if of_the_paper(args) else args.noises
+    pairs = preset_pairs("paper" if of_the_paper(args) else args.preset, algorithm, env_id)
     entries, rates = [[pair] for pair in pairs], []
     if given or args.noise_rates:
         names = dict.fromkeys(noise for noise, _ in pairs)
@@ -320,7 +327,8 @@ def other_options(run, made_with):
 def command_line(run):
     """Return a run's command, complete: it can be pasted into a shell in the project's folder."""
     words = [os.environ.get("PYTHON", "python"), run.script, *run.arguments]
-    if ":" in run.kind[1] and "PYTHONPATH" in os.environ:  # where the environment's module lies
+    own = any(re.match(r"[\w.]+:[A-Za-z_]", word) for word in run.arguments)  # module:Name
+    if own and "PYTHONPATH" in os.environ:  # where a module of the user's lies
         words = ["env", f"PYTHONPATH={os.environ['PYTHONPATH']}", *words]
     return shlex.join(words)
 

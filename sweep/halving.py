@@ -14,22 +14,25 @@ baseline on fresh seeds, in one comparison that is fixed beforehand.
 """
 
 import math
-from statistics import fmean
+from statistics import fmean, variance
 from typing import NamedTuple
 
 import numpy as np
 
+from analysis import statistics
 from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED
-from analysis.statistics import (
-    bootstrap_iqm,
-    detectable_percent,
-    mann_whitney,
-    probability_of_improvement,
+from analysis.statistics import LEVEL  # of a verdict, two-sided, over all verdicts of one command
+from analysis.verdicts import (
+    borderline,
+    corrected,
+    difference,
+    p_value,
+    significant,
+    smallest,
+    spread_of,
 )
-from analysis.verdicts import UNCLEAR, disagrees, interval, p_value, percent
-from noisy_wrappers import BASELINE, Configuration
+from noisy_wrappers import BASELINE, Configuration, rounded
 
-LEVEL = 0.05  # of a verdict, two-sided, over all verdicts of one command
 SCORED = 0.15  # a run's score in the search is the mean of its tests in this last part of its steps
 
 
@@ -49,19 +52,6 @@ class State(NamedTuple):
     noises: list[Configuration]  # still in the running, in the order given
     seeds: range  # of the runs that the present round or the confirmation needs
     due: list[tuple[Configuration, int]]  # with their seeds, those that are not finished
-
-
-class Comparison(NamedTuple):
-    """The winner against the baseline on fresh seeds."""
-
-    winner: Configuration
-    seeds: int
-    improvement: float  # of the interquartile mean, in percent of |baseline mean|
-    low: float  # its 95 % interval
-    high: float
-    probability: float  # that a run with the noise beats one without
-    p: float  # exact two-sided Mann-Whitney
-    detectable: float  # the improvement in percent that is found with 80 % power
 
 
 # --------------------------------------------------------------------------------------- the search
@@ -122,6 +112,17 @@ def score(steps, returns):
     return float(returns[steps[-1] - steps < SCORED * steps[-1]].mean())
 
 
+def spread(groups):
+    """Return the standard deviation of returns over the seeds of a noise, pooled over noises.
+
+    groups: for each noise its returns. NaN if none has two.
+    """
+    groups = [values for values in groups if len(values) > 1]
+    freedom = sum(len(values) - 1 for values in groups)
+    squares = sum((len(values) - 1) * variance(values) for values in groups)
+    return math.sqrt(squares / freedom) if freedom else math.nan
+
+
 def missing(noises, seeds, returns):
     """Return the runs that have no return yet, the first seed of every noise first."""
     wanted = [(noise, seed) for seed in seeds for noise in noises]
@@ -141,54 +142,41 @@ def fewest_seeds(verdicts):
 
 def compare(winner, seeds, returns):
     """Compare the winner with the baseline on the fresh seeds, all of which have a return."""
-    noisy = np.array([[returns[winner, seed]] for seed in seeds])
-    baseline = np.array([[returns[BASELINE, seed]] for seed in seeds])
-    improvement, low, high = bootstrap_iqm(noisy, baseline)
-    probability, _, _ = probability_of_improvement(noisy, baseline)
-    p, _ = mann_whitney(noisy, baseline)
-    detectable = detectable_percent(noisy, baseline)
-    return Comparison(winner, len(seeds), improvement, low, high, probability, p, detectable)
+    pair = ([returns[noise, seed] for seed in seeds] for noise in (winner, BASELINE))
+    return statistics.compare(*pair)
 
 
 def helps(comparison, p_corrected):
     """Tell whether the noise was shown to be better than none."""
-    return p_corrected <= LEVEL and comparison.probability > 0.5
+    return significant(p_corrected) and comparison.t > 0
 
 
-def verdict(name, noises, comparison, p_corrected, verdicts):
+def sentence(name, winner, noises, comparison, p_corrected, verdicts, unit=""):
     """Say in one plain sentence what came out.
 
     name: the algorithm and the environment. noises: how many were searched. verdicts: for how many
-    verdicts p is corrected.
+    verdicts p is corrected. unit: of the difference.
     """
-    named = comparison.winner
-    seeds = f"{comparison.seeds} fresh seeds"
-    evidence = f"p {p_value(comparison.p)}"
-    if verdicts > 1:
-        corrected = p_value(p_corrected).removeprefix("= ")
-        evidence += f", corrected for {verdicts} verdicts {corrected}"
-    if math.isfinite(comparison.improvement):  # it is not where the baseline returns 0
-        change = f"{percent(comparison.improvement)} {interval(comparison.low, comparison.high)}"
-        evidence = f"{change}, {evidence}"
     start = f"{name}:"
-    better = "better" if comparison.probability > 0.5 else "worse"
-    direction = better if comparison.p <= LEVEL else UNCLEAR
-    end = f".{disagrees(direction, comparison.low, comparison.high)}"
+    evidence = f"{comparison.n} fresh seeds, {difference(comparison, unit)}"
+    evidence += f", p {p_value(comparison.p)}"
+    evidence += smallest(comparison) + corrected(p_corrected, verdicts, "verdict")
+    end = f".{borderline(comparison)}"
     if helps(comparison, p_corrected):
-        chance = f"a run with it beats one without with probability {comparison.probability:.2f}"
-        return f"{start} {named} beats no noise: {seeds}, {evidence}; {chance}{end}"
+        return f"{start} {winner} beats no noise: {evidence}{end}"
     if noises == 1:
-        start += f" {named} could not be shown to help"
+        start += f" {winner} could not be shown to help"
     else:
-        start += f" none of {noises} noises could be shown to help; the best of them, {named}"
-    if p_corrected <= LEVEL:
-        return f"{start}, is worse than no noise: {seeds}, {evidence}{end}"
-    text = f"{start}: {seeds}, {evidence}"
-    if math.isfinite(comparison.detectable):
-        difference = percent(comparison.detectable, sign="")
-        text += f"; with {comparison.seeds} seeds a difference of {difference} would have been seen"
-        text += " (80 % power before the correction)" if verdicts > 1 else " (80 % power)"
-    return f"{text}{end}"
+        start += f" none of {noises} noises could be shown to help; the best of them, {winner}"
+    if significant(p_corrected):
+        return f"{start}, is worse than no noise: {evidence}{end}"
+    if comparison.detectable > 0:
+        found = rounded(comparison.detectable, spread_of(comparison))
+        evidence += (
+            f"; with {comparison.n} seeds a difference of {found}{unit} would have been seen"
+        )
+        evidence += " (80 % power before the correction)" if verdicts > 1 else " (80 % power)"
+    return f"{start}: {evidence}{end}"
 
 
 def rows(algorithm, environment, state, returns, helped):

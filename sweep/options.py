@@ -11,7 +11,7 @@ from noisy_wrappers import canonical_env_id, split_noises
 from sweep.grid import ENVS, GIVEN_BY_THE_GRID, PRESETS, PROJECT, SEEDS, defaults, script_of
 
 GRID_OPTIONS = ["--algos", "--envs", "--noises", "--noise-rates", "--seeds", "--total-timesteps"]
-GRID_OPTIONS += ["--runs-dir", "--combine", "--exclude", "--budget", "--confirm"]
+GRID_OPTIONS += ["--runs-dir", "--combine", "--exclude", "--budget", "--confirm", "--metric"]
 EXECUTOR_OPTIONS = ["--dry-run", "--executor", "--jobs", "--sshlogin", "--remote-dir"]
 EXECUTOR_OPTIONS += ["--slurm-args", "--wait", "--help"]  # benchmark.sh reads these
 MOST_SEEDS = 10_000  # in a range
@@ -33,6 +33,7 @@ def parse_args(view, caller, argv):
     parser.add_argument("--exclude", nargs="+", type=entry, default=[])
     parser.add_argument("--budget", type=whole_number)
     parser.add_argument("--confirm", type=whole_number, default=25)
+    parser.add_argument("--metric", choices=("return", "success_rate"), default="return")
     split = argv.index("--") if "--" in argv else len(argv)
     words, extra = argv[:split], argv[split + 1 :]
     given = {word.partition("=")[0] for word in words if word.startswith("--")}
@@ -45,8 +46,21 @@ def parse_args(view, caller, argv):
     parser.set_defaults(**PRESETS.get(preset, {}))
     args = parser.parse_args(words)
     args.given, args.extra = given, extra
+    args.jobs, args.elsewhere = machines()
     args.runs_dir = from_project(caller, args.runs_dir)
     return args
+
+
+def machines():
+    """Return how many runs go on at a time, None if unknown, and whether on other machines.
+
+    benchmark.sh, which reads the executor's options, tells it by environment variables.
+    """
+    jobs, hosts = os.environ.get("SWEEP_JOBS"), os.environ.get("SWEEP_HOSTS")
+    elsewhere = bool(hosts) or os.environ.get("SWEEP_EXECUTOR") == "slurm"
+    if jobs:
+        return int(jobs) * (hosts.count(",") + 1 if hosts else 1), elsewhere
+    return None if elsewhere else len(os.sched_getaffinity(0)), elsewhere
 
 
 def unknown_option(name):
@@ -143,7 +157,7 @@ def check_arguments(args):
         args.envs = list(dict.fromkeys(map(canonical_env_id, args.envs)))
     except ValueError as error:
         fail(f"--envs: {error}")
-    for name in ("--exclude", "--budget", "--confirm"):
+    for name in ("--exclude", "--budget", "--confirm", "--metric"):
         if name in args.given and args.preset != "choose":
             fail(f"{name} is an option of choose")
     if args.combine and args.preset != "custom":

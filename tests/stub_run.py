@@ -96,10 +96,14 @@ def train(argv):
     pretend_to_train(args.total_timesteps, folder / "checkpoint.pt")
 
     tests = episodes_of(exp_name[:3], args.env_id, args.noise, args.noise_rate, args.seed)
-    rows = ["step,episode,episodic_return,episodic_length"]
+    tells = "Success" in args.env_id  # whether an episode returned more than 100
+    rows = ["step,episode,episodic_return,episodic_length" + ",success" * tells]
     for test, episodes in enumerate(tests, start=1):
         for episode, value in enumerate(episodes):
-            rows.append(f"{test * args.total_timesteps // 10},{episode},{value},100")
+            rows.append(
+                f"{test * args.total_timesteps // 10},{episode},{value},100"
+                + f",{value > 100:d}" * tells
+            )
     (folder / "eval.csv").write_text("\n".join(rows) + "\n")
     result = {"total_timesteps": args.total_timesteps, "wall_time_seconds": 36.0}
     result["final_return_mean"] = fmean(tests[-1])

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -92,7 +93,7 @@ def case(searched, tmp_path, monkeypatch):
     """The choice, a sweep with the same runs, and the run in each of them to be damaged."""
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(analyze, "figures", lambda *_: [])
-    monkeypatch.setattr(evaluate, "load", lambda run: (gym.make("Pendulum-v1"), None))
+    monkeypatch.setattr(evaluate, "load", lambda run: nullcontext((gym.make("Pendulum-v1"), None)))
     monkeypatch.setattr(evaluate, "play", lambda *_: [(1.0, 1)])
     choice = Path(shutil.copytree(searched, tmp_path / "choice"))
     runs = Path(shutil.copytree(searched / "search", tmp_path / "runs"))

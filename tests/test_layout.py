@@ -1,4 +1,4 @@
-"""What the folders promise: a small root, short files, imports that run one way."""
+"""What the folders promise: a small root, imports that run one way."""
 
 import ast
 import subprocess
@@ -60,11 +60,6 @@ def test_the_root_has_six_modules():
         "analyze.py",
         "evaluate.py",
     }
-
-
-@pytest.mark.parametrize("path", FILES, ids=module)
-def test_files_are_short(path):
-    assert len(path.read_text().splitlines()) <= 400
 
 
 def test_no_imports_in_a_circle():

@@ -2,9 +2,10 @@
 
     python tools/simulate_choose.py
 
-prints the table of docs/sweeps.md, in about two minutes. In each simulated choice one noise has a
-true gain and all others do nothing. Gains are in standard deviations of the final return over
-seeds. Returns are normal, or a fifth of the runs end far above the others.
+prints the tables of docs/sweeps.md, in about three minutes. In each simulated choice one noise has
+a true gain and all others do nothing. Gains are in standard deviations of the final return over
+seeds. Returns are normal, or a fifth of the runs end far above the others ("high peak"), or three
+in ten far below ("failing").
 """
 
 import argparse
@@ -15,11 +16,12 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from analysis.statistics import mann_whitney_null  # noqa: E402
+from analysis.statistics import random_partitions, tails, welch_t  # noqa: E402
 from sweep.halving import LEVEL, schedule  # noqa: E402
 
 TRIALS = 20_000
-GAINS = [1.0, 1.5, 2.0]
+GAINS = (1.0, 1.5, 2.0)
+PARTITIONS = 999  # of a test; the real one has a hundred times as many
 
 
 def normal(rng, shape):
@@ -27,10 +29,16 @@ def normal(rng, shape):
     return rng.standard_normal(shape)
 
 
-def two_peaked(rng, shape):
+def high_peak(rng, shape):
     """Draw returns, a fifth of them around a peak 4 widths above the other: mean 0, deviation 1."""
     returns = rng.standard_normal(shape) + 4 * (rng.random(shape) < 0.2)
     return (returns - 4 * 0.2) / np.sqrt(1 + 4**2 * 0.2 * 0.8)
+
+
+def failing(rng, shape):
+    """Draw returns, 30 % of them around a peak 4 widths below the other: mean 0, deviation 1."""
+    returns = rng.standard_normal(shape) - 4 * (rng.random(shape) < 0.3)
+    return (returns + 4 * 0.3) / np.sqrt(1 + 4**2 * 0.3 * 0.7)
 
 
 def equal_shares(noises, budget):
@@ -55,58 +63,73 @@ def search(returns, sizes):
     return alive[:, 0]
 
 
-def confirmed(noisy, baseline):
-    """Return which comparisons show a gain: the exact two-sided Mann-Whitney test, no ties.
+def confirmed(noisy, baseline, rng):
+    """Return which comparisons show a gain, by the permutation test of halving.compare.
 
     noisy, baseline (trials, seeds) -> (trials,) of bool.
     """
-    n, m = noisy.shape[1], baseline.shape[1]
-    losses = (noisy[:, :, None] < baseline[:, None, :]).sum(axis=(1, 2))
-    p = 2 * np.cumsum(mann_whitney_null(n, m))[losses]
-    return (p <= LEVEL) & (losses < n * m / 2)
+    chosen = random_partitions(noisy.shape[1], baseline.shape[1], PARTITIONS, rng)
+    above, _ = tails(welch_t(np.concatenate([noisy, baseline], axis=1).T, chosen))
+    return 2 * above <= LEVEL
 
 
-def simulate(noises, sizes, confirm, gain, draw=normal, trials=TRIALS):
-    """Return the shares of choices that find the good noise, that confirm it, that claim any."""
+def simulate(noises, sizes, confirm, gain, draw=normal, spread=1.0, trials=TRIALS):
+    """Return the shares of choices that find the good noise, that confirm it, that claim any.
+
+    With noise, returns have `spread` standard deviations of those without.
+    """
     rng = np.random.default_rng(0)
     seeds = sum(further for _, further in sizes)
     good, claims = [], []
     for _ in range(ceil(trials / 1000)):  # 1,000 at a time, to save memory
-        returns = draw(rng, (1000, noises, seeds))
+        returns = spread * draw(rng, (1000, noises, seeds))
         returns[:, 0] += gain
         found = search(returns, sizes) == 0
-        fresh = draw(rng, (1000, confirm)) + gain * found[:, None]
+        fresh = spread * draw(rng, (1000, confirm)) + gain * found[:, None]
         good.append(found)
-        claims.append(confirmed(fresh, draw(rng, (1000, confirm))))
+        claims.append(confirmed(fresh, draw(rng, (1000, confirm)), rng))
     good, claims = np.concatenate(good), np.concatenate(claims)
     return good.mean(), (good & claims).mean(), claims.mean()
 
 
-def row(noises, rounds, sizes, confirm):
-    """Return a line of the table."""
-    runs = sum(n * further for n, further in sizes) + 2 * confirm
-    found, *shares = simulate(noises, sizes, confirm, GAINS[0])[:2]
-    shares += [simulate(noises, sizes, confirm, gain)[1] for gain in GAINS[1:]]
-    shares.append(simulate(noises, sizes, confirm, GAINS[0], two_peaked)[1])
-    false = max(simulate(noises, sizes, confirm, 0, draw)[2] for draw in (normal, two_peaked))
-    cells = [noises, rounds, confirm, runs, *(f"{share:.2f}" for share in (found, *shares))]
-    return f"| {' | '.join(map(str, cells))} | {100 * false:.1f} % |"
+def print_table(*rows):
+    """Print a table in Markdown, the first row being its head."""
+    head, *body = (f"| {' | '.join(map(str, row))} |" for row in rows)
+    print(head, "|" + len(rows[0]) * "---|", *body, "", sep="\n", flush=True)
+
+
+def power(noises, sizes, confirm, draw=normal):
+    """Return what is found, and what is confirmed, at each gain: texts for a table."""
+    shares = [simulate(noises, sizes, confirm, gain, draw)[:2] for gain in GAINS]
+    return [f"{share:.2f}" for pair in shares for share in pair]
 
 
 def main():
-    """Print the table."""
+    """Print the tables."""
     raw = argparse.RawDescriptionHelpFormatter
     argparse.ArgumentParser(description=__doc__, formatter_class=raw).parse_args()
-    print(
-        "| noises | runs of a round | fresh seeds | runs in all | found, +1 sd | confirmed, +1 sd "
-        "| +1.5 sd | +2 sd | two peaks, +1 sd | false claims |"
+    columns = [f"{what}, +{gain:g} sd" for gain in GAINS for what in ("found", "confirmed")]
+    print_table(
+        ("noises", "returns", *columns),
+        *(
+            (n, draw.__name__.replace("_", " "), *power(n, schedule(n, 3 * n), 25, draw))
+            for n in (20, 90, 10, 4, 1)
+            for draw in (normal, high_peak, failing)
+        ),
     )
-    print("|" + 10 * "---|")
-    for noises in (90, 16, 10, 4, 1):
-        print(row(noises, "equal", equal_shares(noises, 3 * noises), 10))
-        if noises == 90:
-            print(row(noises, "equal", equal_shares(noises, 2 * noises), 25))
-        print(row(noises, "√noises", schedule(noises, 3 * noises), 25), flush=True)
+    rows = []
+    for draw in (normal, high_peak, failing):
+        claims = [simulate(1, [], 25, 0, draw, spread)[2] for spread in (1, 0.5, 2)]
+        rows.append(
+            (draw.__name__.replace("_", " "), *(f"{100 * share:.1f} %" for share in claims))
+        )
+    print_table(("returns", "same spread", "spread halved", "spread doubled"), *rows)
+    designs = (("equal, 3", equal_shares(90, 270), 10), ("equal, 2", equal_shares(90, 180), 25))
+    designs += (("√noises, 3", schedule(90, 270), 25),)
+    print_table(
+        ("runs of a round", "fresh seeds", *columns),
+        *((name, confirm, *power(90, sizes, confirm)) for name, sizes, confirm in designs),
+    )
 
 
 if __name__ == "__main__":

@@ -52,10 +52,8 @@ def test_search_and_confirmation_are_never_mixed(tmp_path, capsys):
         assert set(tables[name]["phase"]) == {fresh}
     assert row(tables["statistics"], noise=SCALE)["p"] == pytest.approx(2 / 252)
     printed = capsys.readouterr().out
-    found = (
-        f"PPO [confirmation] on Hopper-v5 with {SCALE} at rate 1.00 is better than no noise: +29 %"
-    )
-    assert found in printed
+    found = f"PPO [confirmation] on Hopper-v5 with {SCALE} at rate 1.00 is better than no noise: "
+    assert f"{found}+30.0 [27.7, 32.3] (+29 %), p = 0.0079" in printed
     assert "no finished baseline" not in printed and tables["missing"].empty
     choice = tables["choice"]
     assert choice["survives"].fillna("").tolist() == ["yes", "no", "", "yes"]
@@ -167,7 +165,7 @@ def test_rates_that_change_are_read_sorted_and_shown(tmp_path):
     assert combined["noise_rate"] == "0.50 + 1.00 to 0.00"
     studies, _ = analysis.runs.make_studies(analysis.runs.read_runs(tmp_path / "runs"))
     figures = analysis.figures.figures(studies, analysis.tables.make_tables(studies))
-    drawn = {name: figure for name, figure, _ in figures}
+    drawn = {drawing.name: drawing.figure for drawing in figures}
     lines = [text.get_text() for text in drawn["effects_SAC"].axes[0].get_yticklabels()]
     lines = [line.replace("\n(", "(") for line in lines]  # broken where there is little room
     changing = [f"{PUSH}, {rate}" for rate in ("0.00 to 1.00", "0.05", "1.00 to 0.00", "1.00")]

@@ -23,7 +23,7 @@ import ppo_continuous_noisy as ppo
 import sac_continuous_noisy as sac
 import td3_continuous_noisy as td3
 from evaluate import Args, main
-from noisy_wrappers import Configuration
+from noisy_wrappers import Configuration, rounded
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = {"SAC": sac, "TD3": td3, "PPO": ppo}
@@ -170,7 +170,7 @@ def test_what_is_stored_is_not_played_again(runs, monkeypatch, capsys):
     for run_dir in runs.iterdir():
         first = [row for row in stored(run_dir) if int(row["episode"]) < 2 and not row["noise"]]
         means[run_dir] = np.mean([float(row["episodic_return"]) for row in first])
-    assert f" {means[one(runs, 'TD3')]:.1f} " in capsys.readouterr().out  # of the first two
+    assert f" {rounded(means[one(runs, 'TD3')])} " in capsys.readouterr().out  # of the first two
 
 
 def test_more_episodes_replay_only_the_conditions_that_have_fewer(runs, monkeypatch):
@@ -206,7 +206,7 @@ def test_another_seed_plays_everything_and_stores_nothing(runs, capsys):
     means = []
     for rate in (0, 0.5, 1.0):
         played = evaluate.play(finished, [OBSERVATION], [rate], args)
-        means.append(f"{np.mean(played, axis=0)[0]:.1f}")
+        means.append(rounded(np.mean(played, axis=0)[0]))
     assert table[-1].split()[-3:] == means
     assert means[0] != default.split()[-2]
 
@@ -327,12 +327,12 @@ def test_the_table_of_known_returns(capsys):
     assert lines[1] == ["Mean return, tested with A(1) + B(2)"]
     assert lines[2][-2:] == ["clean", "at 0.1 + 0.1"]
     assert lines[4:6] == [
-        ["E", "PPO", "no noise", "0.00", "3", "33.3 ± 15.3", "0.8 ± 3.1"],
-        ["E", "PPO", "A(1)", "0.50", "1", "5.0", "7.5"],
+        ["E", "PPO", "no noise", "0.00", "3", "33 ± 15", "0.8 ± 3.1"],
+        ["E", "PPO", "A(1)", "0.50", "1", "5.000", "7.500"],
     ]
     assert lines[7] == ["Mean return, tested with C(3)"]
     assert lines[8][-2:] == ["clean", "at 0.5"]
-    assert lines[10][-2:] == ["33.3 ± 15.3", "-0.8 ± 3.1"]
+    assert lines[10][-2:] == ["33 ± 15", "-0.8 ± 3.1"]
     evaluate.print_table(list(cells), conditions[:1], cells, episodes=2)
     alone = capsys.readouterr().out
     assert "tested with" not in alone and alone.splitlines()[0].endswith("clean")

@@ -1,5 +1,6 @@
 """What luck alone shows (analysis.luck.py): cases with a known answer, and its false alarms."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from test_analyze import FINALS, SCALE, row, run, small_sweep
 import analysis.luck
 import analysis.paper
 import analysis.runs
+import analysis.statistics
 import analysis.tables
 import analyze
 from noisy_wrappers import BASELINE, Configuration
@@ -35,8 +37,8 @@ def make_study(baseline, noisy):
 def luck_of_one_environment(baseline, noisy):
     """Return p_luck of the best: baseline (seeds,), noisy (configs x seeds)."""
     study = make_study(baseline[:, None], noisy[..., None])
-    best = (noisy.mean(axis=1).max() - baseline.mean()) / abs(baseline.mean())
-    return analysis.luck.p_value(analysis.luck.luck_of_study(study).best["Env0-v0"], 100 * best)
+    best = noisy.mean(axis=1).max() - baseline.mean()
+    return analysis.luck.p_of_luck(analysis.luck.luck_of_study(study).best["Env0-v0"], best)
 
 
 # ------------------------------------------------------------------------------- a known answer
@@ -50,9 +52,9 @@ def test_a_single_configuration_is_students_test():
         baseline = np.full(max(n, m), NAN)
         baseline[:m] = rng.normal(100, 1, m)
         luck = analysis.luck.luck_of_study(make_study(baseline[:, None], noisy[..., None]))
-        percent = 100 * (np.nanmean(noisy) / np.nanmean(baseline) - 1)
+        difference = np.nanmean(noisy) - np.nanmean(baseline)
         expected = stats.ttest_ind(noisy[0, :n], baseline[:m], alternative="greater").pvalue
-        assert analysis.luck.p_value(luck.best["Env0-v0"], percent) == pytest.approx(
+        assert analysis.luck.p_of_luck(luck.best["Env0-v0"], difference) == pytest.approx(
             expected, abs=0.015
         )
 
@@ -60,18 +62,18 @@ def test_a_single_configuration_is_students_test():
 def test_the_best_of_many_against_a_baseline_that_is_known():
     """P(best <= x) is the product over configurations of Phi(x sqrt(n) / std)."""
     rng, n = np.random.default_rng(0), np.array([4] * 20 + [25] * 10)
-    draws = analysis.luck.draw_improvements(-50.0, 10.0, MANY, MANY, n, rng)
+    draws = analysis.luck.draw_differences(10.0, MANY, MANY, n, rng)
     assert draws.shape == (30, analysis.luck.DRAWS)
     best = draws.max(axis=0)
-    for percent in (10, 20, 30):  # of |-50|: 5, 10 and 15
-        expected = np.prod(stats.norm.cdf(percent / 2 * np.sqrt(n) / 10))
-        assert np.mean(best <= percent) == pytest.approx(expected, abs=0.02)
+    for difference in (5, 10, 15):
+        expected = np.prod(stats.norm.cdf(difference * np.sqrt(n) / 10))
+        assert np.mean(best <= difference) == pytest.approx(expected, abs=0.02)
 
 
 def test_an_unlucky_baseline_is_part_of_the_luck():
     """With as many seeds the baseline adds as much variance as one configuration has."""
     rng = np.random.default_rng(0)
-    draws = analysis.luck.draw_improvements(100.0, 10.0, MANY, 4, [4] * 50, rng)
+    draws = analysis.luck.draw_differences(10.0, MANY, 4, [4] * 50, rng)
     assert draws[0].std() == pytest.approx(5 * np.sqrt(2), rel=0.03)
     assert np.corrcoef(draws[0], draws[1])[0, 1] == pytest.approx(0.5, abs=0.03)
 
@@ -80,11 +82,11 @@ def test_twenty_seeds_of_the_baseline_are_resampled():
     """One run of a population of -1 and 3 in equal parts, minus another one: -4, 0 or 4."""
     for seeds, values in ((20, 3), (18, analysis.luck.DRAWS)):
         rng, baseline = np.random.default_rng(0), np.tile([-1.0, 3.0], seeds // 2)
-        draws = analysis.luck.draw_improvements(1.0, 2.0, MANY, 1, [1], rng, baseline)
+        draws = analysis.luck.draw_differences(2.0, MANY, 1, [1], rng, baseline)
         found, counts = np.unique(draws.round(1), return_counts=True)
         assert (len(found) == 3) == (values == 3)
         if values == 3:
-            assert found.tolist() == [-400, 0, 400]
+            assert found.tolist() == [-4, 0, 4]
             np.testing.assert_allclose(counts / draws.size, [0.25, 0.5, 0.25], atol=0.02)
 
 
@@ -111,15 +113,24 @@ def test_a_configuration_counts_where_it_was_run():
     assert (luck.lowest <= luck.highest).all()
 
 
-def test_what_cannot_be_drawn_is_left_out():
-    """No spread is known from single runs; improvements over zero do not exist."""
+def test_no_spread_is_known_from_single_runs():
     alone = analysis.luck.luck_of_study(make_study(np.ones((1, 1)), np.ones((2, 1, 1))))
-    with np.errstate(all="raise"):  # no division by zero
-        zero = analysis.luck.luck_of_study(make_study(np.array([[-1.0], [1]]), np.ones((2, 2, 1))))
-    assert alone.best == zero.best == {}
-    best = pd.DataFrame([STUDY | {"environment": "Env0-v0", "improvement_percent": 1}])
-    lucks = {("PPO", "", ""): alone}
-    assert analysis.luck.add_luck_of_best(best, lucks)["p_luck"].isna().all()
+    best = pd.DataFrame([STUDY | {"environment": "Env0-v0", "difference": 1.0}])
+    found = analysis.luck.add_luck_of_best(best, {("PPO", "", ""): alone})
+    assert alone.best == {} and found["p_luck"].isna().all()
+
+
+def test_a_baseline_of_zero_is_drawn_in_units_of_the_return():
+    """Its environment counts by sign; averages in percent are over the others."""
+    rng = np.random.default_rng(0)
+    baseline, noisy = rng.normal([0, 100], 1, (5, 2)), rng.normal([0, 100], 1, (3, 5, 2))
+    baseline[:, 0] -= baseline[:, 0].mean()
+    luck = analysis.luck.luck_of_study(make_study(baseline, noisy))
+    assert list(luck.best) == ["Env0-v0", "Env1-v0"] and 0.2 < np.median(luck.best["Env0-v0"]) < 2
+    assert luck.consistent.mean() == pytest.approx(3 / 4, abs=0.1)  # both of two environments
+    assert 0.2 < np.median(luck.highest) < 2  # percent of 100
+    luck = analysis.luck.luck_of_study(make_study(baseline[:, [0, 0]], noisy[..., [0, 0]]))
+    assert np.isnan(analysis.luck.p_of_luck(luck.highest, np.nan))
 
 
 # -------------------------------------------------------------------------------- false alarms
@@ -140,8 +151,8 @@ def test_useless_noise_is_seldom_beyond_luck(n, n_baseline, most, monkeypatch):
         baseline[:n_baseline, 0] = rng.normal(20, 1, n_baseline)
         noisy[:, :n, 0] = rng.normal(20, 1, (90, n))
         luck = analysis.luck.luck_of_study(make_study(baseline, noisy))
-        best = 100 * (np.nanmean(noisy, axis=1).max() / np.nanmean(baseline) - 1)
-        p.append(analysis.luck.p_value(luck.best["Env0-v0"], best))
+        best = np.nanmean(noisy, axis=1).max() - np.nanmean(baseline)
+        p.append(analysis.luck.p_of_luck(luck.best["Env0-v0"], best))
     p = np.array(p)
     assert 0.03 <= (p <= 0.05).mean() <= most
     assert 0.4 <= (p <= 0.5).mean() <= 0.6
@@ -153,11 +164,11 @@ def test_useless_noise_in_a_paper_is_beyond_luck_in_five_percent_of_studies(monk
     monkeypatch.setattr(analysis.luck, "DRAWS", 400)
     n = 5
     rng, studies, p = np.random.default_rng(n), 500, []
-    names = ["environment", "baseline_mean", "baseline_std", "improvement_percent"]
+    names = ["environment", "baseline_mean", "baseline_std", "difference"]
     for _ in range(studies):
         baseline, noisy = rng.normal(20, 1, n), rng.normal(20, 1, (90, n))
-        percent = 100 * (noisy.mean(axis=1).max() / baseline.mean() - 1)
-        values = ["Env0-v0", baseline.mean(), baseline.std(ddof=1), percent]
+        best = noisy.mean(axis=1).max() - baseline.mean()
+        values = ["Env0-v0", baseline.mean(), baseline.std(ddof=1), best]
         table = pd.DataFrame([STUDY | dict(zip(names, values, strict=True))])
         lucks = analysis.luck.luck_of_paper(table, {"PPO": n}, 90)
         p.append(analysis.luck.add_luck_of_best(table, lucks)["p_luck"].item())
@@ -166,19 +177,19 @@ def test_useless_noise_in_a_paper_is_beyond_luck_in_five_percent_of_studies(monk
 
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [5, 10])
-def test_the_captions_say_how_often_p_luck_is_wrong_and_how_often_it_finds_an_effect(
-    n, monkeypatch
-):
+def test_the_page_says_how_often_p_luck_is_wrong_and_how_often_it_finds_an_effect(n, monkeypatch):
     monkeypatch.setattr(analysis.luck, "DRAWS", 400)
-    own, paper = p_of_the_best(n, 0, simulate_choose.two_peaked)
-    assert own == pytest.approx(analysis.luck.FALSE_ALARMS[n], abs=5)
-    assert paper == pytest.approx(analysis.luck.FALSE_ALARMS_IN_THE_PAPER[n], abs=6)
-    own, paper = p_of_the_best(n, 1.5, simulate_choose.normal)
-    assert own == pytest.approx(analysis.luck.POWER_OF_BEST[n][1], abs=8)
-    assert paper == pytest.approx(analysis.luck.POWER_IN_THE_PAPER[n][1], abs=8)
-    for name, found in (("luck", "POWER_OF_BEST"), ("compare_luck", "POWER_IN_THE_PAPER")):
-        powers = ", ".join(map(str, getattr(analysis.luck, found)[n]))
-        assert f"{powers} %" in analysis.tables.HOW[name]
+    page = (Path(analyze.__file__).parent / "docs/statistics.md").read_text()
+    draws = {"high peak": simulate_choose.high_peak, "low peak": simulate_choose.failing}
+    for name, gain in (("high peak", 0), ("low peak", 0), ("normal", 1.5)):
+        [line] = re.findall(rf"^\| {name} \| {n} \| (.*) \|$", page, re.MULTILINE)
+        cells = [cell.rstrip(" %") for cell in line.split(" | ")]
+        place = 2 if gain else 0
+        said = float(cells[place]), float(cells[4 + place])
+        found = p_of_the_best(n, gain, draws.get(name, simulate_choose.normal))
+        assert found == pytest.approx(said, abs=8), name
+        if name == "low peak":
+            assert found[1] <= 2.5
 
 
 def p_of_the_best(n, gain, draw, studies=200):
@@ -190,14 +201,15 @@ def p_of_the_best(n, gain, draw, studies=200):
     for _ in range(studies):
         baseline, noisy = 20 + draw(rng, (n, 1)) / 10, 20 + draw(rng, (90, n, 1)) / 10
         noisy[0] += gain / 10
-        best = 100 * (noisy.mean(axis=1).max() / baseline.mean() - 1)
+        best = noisy.mean(axis=1).max() - baseline.mean()
         lucks = analysis.luck.luck_of_study(make_study(baseline, noisy))
-        own += analysis.luck.p_value(lucks.best["Env0-v0"], best) <= analysis.luck.LUCKY
-        row = STUDY | {"environment": "Env0-v0", "improvement_percent": best}
+        own += analysis.luck.p_of_luck(lucks.best["Env0-v0"], best) <= analysis.statistics.LEVEL
+        row = STUDY | {"environment": "Env0-v0", "difference": best}
         row |= {"baseline_mean": baseline.mean(), "baseline_std": baseline.std(ddof=1)}
         lucks = analysis.luck.luck_of_paper(pd.DataFrame([row]), {"PPO": n}, 90)
         paper += (
-            analysis.luck.p_value(lucks["PPO", "", ""].best["Env0-v0"], best) <= analysis.luck.LUCKY
+            analysis.luck.p_of_luck(lucks["PPO", "", ""].best["Env0-v0"], best)
+            <= analysis.statistics.LEVEL
         )
     return 100 * own / studies, 100 * paper / studies
 
@@ -213,7 +225,7 @@ def test_luck_stands_beside_the_best_and_the_consistent(tmp_path):
     finals = [values for key, values in FINALS.items() if key[0] == "Pusher-v5"]
     baseline, noisy = np.array(finals[0], float), np.array(finals[1:], float)
     assert pusher["p_luck"] == pytest.approx(luck_of_one_environment(baseline, noisy), abs=0.005)
-    assert pusher["luck_median_percent"] < pusher["luck_95_percent"] < pusher["improvement_percent"]
+    assert pusher["luck_median"] < pusher["luck_95"] < pusher["difference"]
     good, bad = tables["consistent"], tables["consistently_worse"]
     assert list(good["noise"]) == [SCALE] and 0 < good["p_luck"].item() < 0.05
     assert bad["p_luck"].item() == pytest.approx(1 / (analysis.luck.DRAWS + 1))
@@ -236,6 +248,6 @@ def test_luck_in_the_papers_tables():
     best = tables["best"]
     walker = row(best, algorithm="PPO", environment="Walker2d-v2")
     # Of 90 means of 10 runs the highest, minus the baseline's: about 4.0 standard errors of 1206.7
-    assert walker["luck_95_percent"] > 100 * 4.0 * 1206.7 / np.sqrt(10) / 1806
+    assert walker["luck_95"] > 4.0 * 1206.7 / np.sqrt(10)
     assert (best["p_luck"] > 0.1).all() and (best["p_luck"] < 1).all()
     assert luck["best_beyond_luck"].sum() == 0 == luck["consistent_beyond_luck"].sum()

@@ -214,5 +214,5 @@ def test_of_many_versions_is_said_at_the_end(tmp_path):
 )
 def test_luck_is_said_in_one_sentence(improvements, p_luck, tried, expected):
     best = {"environment": ["Ant-v5", "Hopper-v5"][: len(tried)], "chosen_from": tried}
-    best |= {"improvement_percent": improvements, "p_luck": p_luck}
+    best |= {"difference": improvements, "p_luck": p_luck}
     assert analysis.verdicts.luck_sentence(pd.DataFrame(best)) == expected

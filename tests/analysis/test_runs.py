@@ -79,7 +79,7 @@ def test_averages_over_environments_take_the_newest_version_of_each_and_say_so(t
             write_run(tmp_path / "runs", [level], env=env, seed=seed, noise=SCALE, rate=0.1)
     statistics = run(tmp_path)["statistics"]
     average = statistics[statistics["scope"] == "all"]
-    assert list(average["environments"]) == [2] and average["improvement_iqm_percent"].item() == 10
+    assert list(average["environments"]) == [2] and average["difference_percent"].item() == 10
     _, notes = make_studies(read_runs(tmp_path / "runs"))
     assert notes == [
         "SAC [environments v4] is apart, because averages over environments take the newest "

@@ -1,4 +1,4 @@
-"""How the paper tested PPO: the program plays six ways beside training; the verdicts by hand."""
+"""How the paper tested PPO: the program plays six ways beside training."""
 
 import multiprocessing
 import os
@@ -9,14 +9,12 @@ import time
 import gymnasium as gym
 import numpy as np
 import pandas as pd
-import paper_tests
 import pytest
 import torch
-import ways
-from scipy import stats
 
 import ppo_continuous_noisy as ppo
 from noisy_wrappers import make_noisy
+from results.experiments import paper_tests
 
 SMALL = {"total_timesteps": 60, "num_steps": 12, "num_minibatches": 3, "update_epochs": 2}
 SMALL |= {"env_id": "toy_envs:Tiny-v0", "eval_frequency": 20, "eval_episodes": 3, "compile": False}
@@ -53,7 +51,7 @@ def test_training_does_not_notice_the_tests(tested, tmp_path):
 def test_the_table_has_every_episode_and_the_scripts_own_tests(tested):
     folder, table = tested
     assert list(table) == ["way", "step", "episode", "episodic_return"]
-    assert len(table) == 6 * 3 * 3 and set(table["way"]) == set(ways.WAYS)
+    assert len(table) == 6 * 3 * 3 and set(table["way"]) == set(paper_tests.WAYS)
     own = table[table["way"] == "training-mean"].drop(columns="way").reset_index(drop=True)
     evaluations = pd.read_csv(folder / "eval.csv").drop(columns="episodic_length")
     pd.testing.assert_frame_equal(own, evaluations)
@@ -69,7 +67,7 @@ def test_the_ways_differ_as_they_say(tested):
     own, per_test = returns["own-mean"], returns["own_per_test-mean"]
     assert (own[0] == per_test[0]).all() and (own[1:] != per_test[1:]).all()
     assert (returns["training-mean"] != own).all()
-    for statistics in ways.STATISTICS:
+    for statistics in paper_tests.STATISTICS:
         assert (returns[f"{statistics}-mean"] != returns[f"{statistics}-sampled"]).all()
 
 
@@ -115,11 +113,11 @@ def test_finished_runs_are_skipped_and_others_begin_anew(tested, monkeypatch, ca
     assert paper_tests.try_to_train(args)
     assert (folder / "tests.csv").read_text() == text
     everything = tmp_path / "all"
-    for env_id, noise, rate, seed in ways.planned_runs():
+    for env_id, noise, rate, seed in paper_tests.planned_runs():
         run = ppo.Args(env_id, seed, noise=noise, noise_rate=rate, runs_dir=str(everything))
         paper_tests.folder_of(run).mkdir(parents=True)
         (paper_tests.folder_of(run) / "tests.csv").touch()
-    monkeypatch.setattr(sys, "argv", ["paper_tests.py", "--runs-dir", str(everything)])
+    monkeypatch.setattr(sys, "argv", ["paper_tests", "--runs-dir", str(everything)])
     before = signal.getsignal(signal.SIGTERM)
     assert paper_tests.main() == 0
     signal.signal(signal.SIGTERM, before)
@@ -127,14 +125,14 @@ def test_finished_runs_are_skipped_and_others_begin_anew(tested, monkeypatch, ca
 
 
 def test_bad_input(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["paper_tests.py", "--jobs", "0"])
+    monkeypatch.setattr(sys, "argv", ["paper_tests", "--jobs", "0"])
     assert paper_tests.main() == 2
     assert capsys.readouterr().err == "error: --jobs must be at least 1, not 0\n"
 
 
 def start_program(runs_dir):
     os.setsid()
-    sys.argv = ["paper_tests.py", "--runs-dir", str(runs_dir)]
+    sys.argv = ["paper_tests", "--runs-dir", str(runs_dir)]
     sys.exit(paper_tests.main())
 
 
@@ -156,11 +154,8 @@ def test_sigterm_ends_the_program_and_its_runs(tmp_path):
     assert not list(tmp_path.glob("*/tests.csv"))
 
 
-# ------------------------------------------------------------------------------------- the verdicts
-
-
 def test_the_plan():
-    runs = ways.planned_runs()
+    runs = paper_tests.planned_runs()
     assert len(runs) == len(set(runs)) == 2 * 2 * 10 + 2 * 5
     assert [seed for *_, seed in runs] == sorted(seed for *_, seed in runs)
     noises = {(env_id, *noise, *rate) for env_id, noise, rate, _ in runs if noise}
@@ -171,41 +166,3 @@ def test_the_plan():
     for env_id, noise, rate, _ in runs:
         if noise:
             make_noisy(gym.make(env_id), noise, rate)
-
-
-def test_the_difference_from_the_paper_is_welchs():
-    returns, paper = np.array([1.0, 2, 3, 6]), np.array([4.0, 5, 7, 9, 10])
-    found = ways.from_paper(returns, (paper.mean(), paper.std(ddof=1), 5))
-    expected = stats.ttest_ind(returns, paper, equal_var=False)
-    assert found == pytest.approx((expected.statistic, expected.pvalue))
-
-
-def test_the_interval_of_a_gain():
-    """At 50 % the means agree exactly; the interval is Fieller's for many runs."""
-    rng = np.random.default_rng(0)
-    noisy, baseline = rng.normal(150, 20, 4000), rng.normal(100, 20, 4000)
-    noisy, baseline = noisy + 150 - noisy.mean(), baseline + 100 - baseline.mean()
-    assert ways.p_of_gain(noisy, baseline, 50) == pytest.approx(1)
-    error = 100 * np.sqrt(noisy.var() + 1.5**2 * baseline.var()) / 100 / np.sqrt(4000)
-    assert ways.p_of_gain(noisy, baseline, 50 + 1.96 * error) == pytest.approx(0.05, abs=0.003)
-    assert ways.p_of_gain(noisy, baseline, 50 - 1.96 * error) == pytest.approx(0.05, abs=0.003)
-
-
-def test_verdicts_by_hand():
-    level = 0.05 / 6
-    good = {"baselines": [(1.9, 0.07), (-1, 0.3)], "controls": [(0, 1.0), (0.5, 0.6)]}
-    good |= {"gain": 80.0, "p_no_gain": level / 2, "p_paper_gain": 0.5}
-    cases = [
-        ({}, "reproduces"),
-        ({"baselines": [(2.1, 0.05), (-1, 0.3)]}, "not excluded"),
-        ({"controls": [(0, 1.0), (-2.1, 0.05)]}, "not excluded"),
-        ({"p_no_gain": 2 * level}, "not excluded"),
-        ({"gain": -80.0}, "not excluded"),
-        ({"p_paper_gain": 2 * level}, "reproduces"),
-        ({"p_paper_gain": level / 2}, "excluded"),
-        ({"baselines": [(2.9, level / 2), (-1, 0.3)]}, "excluded"),
-        ({"controls": [(0, 1.0), (-2.9, level / 2)]}, "excluded"),
-        ({"baselines": [(2.5, 2 * level), (-1, 0.3)]}, "not excluded"),
-    ]
-    for change, expected in cases:
-        assert ways.verdict(**good | change) == expected, change

@@ -512,8 +512,11 @@ def test_a_dry_run_of_choose_prints_the_batch_that_is_due(tmp_path, stub):
     assert (
         first.out.count("\n") == 3 and "13 runs in all, 5 to search and 8 to confirm" in first.err
     )
-    # 13 runs of 4000 steps at 5,700 steps per second, and 10 seconds to start: 139 s
-    assert "0 are done, about 0.039 core-hours are left" in first.err
+    # 13 runs with 10 seconds to start and 4000 steps; here one takes 0.1 to 5 ms
+    hours = re.search(r"0 are done, about ([\d.]+) core-hours are left", first.err)
+    assert 0.036 <= float(hours[1]) <= 0.2
+    assert "Pendulum-v1: " in first.err and " ms a step" in first.err
+    assert not list(tmp_path.iterdir())
     for line in first.out.splitlines():
         subprocess.run(line, shell=True, check=True)
     second = run(*command, "--dry-run", env=stub)
@@ -522,6 +525,7 @@ def test_a_dry_run_of_choose_prints_the_batch_that_is_due(tmp_path, stub):
     assert "4 fresh seeds confirm" in first.err and "fresh seeds confirm" not in second.err
     # The three finished runs say that they have taken 36 seconds each; ten are left.
     assert "3 are done, about 0.1 core-hours are left" in second.err
+    assert " ms a step" not in second.err
 
 
 def test_a_choice_never_mixes_runs_with_other_options(tmp_path):

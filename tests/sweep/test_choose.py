@@ -14,11 +14,11 @@ import simulate_choose
 import stub_run
 
 from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED
-from analysis.statistics import holm
-from noisy_wrappers import BASELINE, Configuration
+from analysis.statistics import Comparison, holm
+from noisy_wrappers import BASELINE, Configuration, rounded
 from sweep import choose
+from sweep.environment import Environment, remember
 from sweep.halving import (
-    Comparison,
     advance,
     compare,
     fewest_seeds,
@@ -27,7 +27,7 @@ from sweep.halving import (
     rows,
     schedule,
     score,
-    verdict,
+    sentence,
 )
 from sweep.options import check_arguments, parse_args
 
@@ -177,20 +177,26 @@ def test_the_simulation_confirms_by_the_test():
         comparison = compare(noise, range(CONFIRM), returns)
         verdicts.append(helps(comparison, comparison.p))
     assert 0 < sum(verdicts) < 60
-    assert list(simulate_choose.confirmed(noisy, baseline)) == verdicts
+    found = simulate_choose.confirmed(noisy, baseline, rng)  # with fewer partitions
+    assert np.mean(found != verdicts) <= 0.05
 
 
-@pytest.mark.parametrize("noises", [16, 90])
+@pytest.mark.parametrize("noises", [20, 90])
 def test_the_default_finds_and_confirms_what_docs_say(noises):
     sizes = schedule(noises, 3 * noises)
     found = [simulate_choose.simulate(noises, sizes, 25, gain, trials=4000) for gain in (1, 1.5)]
-    assert [confirmed for _, confirmed, _ in found] == pytest.approx([0.63, 0.89], abs=0.025)
+    assert [confirmed for _, confirmed, _ in found] == pytest.approx([0.63, 0.90], abs=0.025)
 
 
-@pytest.mark.parametrize("draw", [simulate_choose.normal, simulate_choose.two_peaked])
-def test_useless_noises_are_claimed_to_help_in_at_most_three_percent(draw):
-    _, _, claims = simulate_choose.simulate(90, schedule(90, 270), 25, 0, draw, trials=2000)
-    assert 0.01 <= claims <= 0.032
+@pytest.mark.slow
+@pytest.mark.parametrize("draw", ["normal", "high_peak", "failing"])
+@pytest.mark.parametrize("spread", [1, 0.5, 2])
+def test_useless_noises_are_claimed_to_help_in_at_most_four_percent(draw, spread):
+    """Also where they change the spread of the returns."""
+    draw = getattr(simulate_choose, draw)
+    _, _, claims = simulate_choose.simulate(1, [], 25, 0, draw, spread, trials=4000)
+    assert 0.012 <= claims <= 0.042
+    assert abs(draw(np.random.default_rng(0), 10**6).mean()) < 0.005
 
 
 @pytest.mark.parametrize("noises", [1, 4, 10])
@@ -218,45 +224,72 @@ def test_fewest_seeds():
     assert [fewest_seeds(verdicts) for verdicts in (1, 2, 6, 7)] == [4, 5, 5, 6]
 
 
+GOOD = Comparison(
+    environments=1,
+    n=10,
+    n_baseline=10,
+    n_baseline_most=10,
+    difference=11.8,
+    difference_low=8.4,
+    difference_high=15.3,
+    difference_percent=21.0,
+    effect_size=1.2,
+    pooled_std=9.8,
+    t=2.7,
+    p=0.011,
+    smallest_p=2e-5,
+    detectable=12.9,
+    seeds_needed=12,
+)
+
+
 def test_verdicts_in_words():
     noise = Configuration.parse("RandomEarlyTermination(50)", 1.0)
-    good = Comparison(noise, 10, 15.2, 3.9, 26.6, 0.83, 0.011, 20.0)
-    assert verdict("PPO on Pusher-v5", 90, good, 0.011, 1) == (
+    name = "PPO on Pusher-v5"
+    assert sentence(name, noise, 90, GOOD, 0.011, 1) == (
         "PPO on Pusher-v5: RandomEarlyTermination(50) at 1.0 beats no noise: 10 fresh seeds, "
-        "+15 % [4, 27], p = 0.011; a run with it beats one without with probability 0.83."
+        "+11.8 [8.4, 15.3] (+21 %), p = 0.011."
     )
-    assert not helps(good, 0.06)
-    corrected = verdict("PPO on Pusher-v5", 90, good, 0.055, 5)
+    assert not helps(GOOD, 0.06)
+    corrected = sentence(name, noise, 90, GOOD, 0.055, 5)
     assert "none of 90 noises could be shown to help; the best of them, Random" in corrected
     assert "p = 0.011, corrected for 5 verdicts 0.055; " in corrected
-    seen = "; with 10 seeds a difference of 20 % would have been seen (80 % power"
+    seen = "; with 10 seeds a difference of 12.9 would have been seen (80 % power"
     assert corrected.endswith(f"{seen} before the correction).")
-    alone = verdict("PPO on Pusher-v5", 90, good._replace(p=0.07, low=-1.0), 0.07, 1)
-    assert alone.endswith(f"{seen}).")
-    # An interval with zero in it beside a p below 0.05 looks like a mistake
-    odd = " Test and interval disagree: the test decides."
-    assert verdict("", 90, good._replace(low=-1.0), 0.011, 1).endswith(f"0.83.{odd}")
-    assert verdict("", 90, good._replace(p=0.07), 0.07, 1).endswith(f"{seen}).{odd}")
-    falling = good._replace(winner=Configuration.parse(A, "1.0:0.0"))
-    assert "RandomNormalNoisyReward(1.0) at 1.0 to 0.0 beats" in verdict("", 2, falling, 0.011, 1)
-    assert verdict("PPO on X", 1, good._replace(p=0.3), 0.3, 1).startswith(
+    unclear = GOOD._replace(p=0.07, difference_low=-1.0)
+    assert sentence(name, noise, 90, unclear, 0.07, 1).endswith("(80 % power).")
+    # An interval with zero in it beside a p below 0.05 would look like a mistake
+    odd = " Borderline: the interval includes zero."
+    assert sentence("", noise, 90, unclear._replace(p=0.03), 0.03, 1).endswith(f"p = 0.03.{odd}")
+    odd = odd.replace("includes", "excludes")
+    assert sentence("", noise, 90, GOOD._replace(p=0.07), 0.07, 1).endswith(f"power).{odd}")
+    falling = Configuration.parse(A, "1.0:0.0")
+    assert f"{A} at 1.0 to 0.0 beats" in sentence("", falling, 2, GOOD, 0.011, 1)
+    assert sentence("PPO on X", noise, 1, unclear, 0.3, 1).startswith(
         "PPO on X: RandomEarlyTermination(50) at 1.0 could not be shown to help: 10 fresh seeds, "
     )
-    bad = good._replace(probability=0.17, low=-26.6, high=-3.9)
-    assert not helps(bad, bad.p) and "is worse than no noise: 10 fresh" in verdict("", 9, bad, 0, 1)
+    bad = GOOD._replace(t=-2.7, difference=-11.8, difference_low=-15.3, difference_high=-8.4)
+    assert not helps(bad, bad.p)
+    assert "is worse than no noise: 10 fresh seeds, -11.8" in sentence("", noise, 9, bad, 0.01, 1)
 
 
-def test_a_comparison_by_hand():
+@pytest.mark.parametrize(
+    ("baseline", "expected"),
+    [
+        ([8.0, 9.0, 11.0, 12.0], "+3.5 (+35 %), p = 0.057 (smallest possible: 0.029); with 4"),
+        ([0.0, 0.0, 0.0, 0.0], "beats no noise: 4 fresh seeds, +13.50, p = 0.029 (smallest"),
+        ([-1e-6, 0.0, 1e-6, 0.0], "beats no noise: 4 fresh seeds, +13.50, p = 0.029 (smallest"),
+        ([-12.0, -13.0, -14.0, -15.0], "+27.0 (+200 %), p = 0.029"),
+    ],
+)
+def test_a_comparison_by_hand(baseline, expected):
+    """The 12 is in both: with it exchanged, the difference is the same."""
     noise = Configuration.parse("A", 0.1)
     returns = {(noise, 1001 + i): value for i, value in enumerate([12.0, 13.0, 14.0, 15.0])}
-    returns |= {(BASELINE, 1001 + i): value for i, value in enumerate([8.0, 9.0, 11.0, 12.0])}
+    returns |= {(BASELINE, 1001 + i): value for i, value in enumerate(baseline)}
     found = compare(noise, range(1001, 1005), returns)
-    # 15 of 16 pairs and a tie are won. U >= 15.5: of 70 orders, 1 has U = 16, 1 has U = 15.
-    assert found.probability == 15.5 / 16 and found.p == pytest.approx(2 * 2 / 70)
-    assert found.improvement == pytest.approx(35) and found.low < 35 < found.high
-    zero = compare(noise, range(1001, 1005), returns | {(BASELINE, 1001 + i): 0 for i in range(4)})
-    sentence = verdict("PPO on X", 2, zero, zero.p, 1)
-    assert "nan" not in sentence and "4 fresh seeds, p = 0.029; a run" in sentence
+    assert found.difference == pytest.approx(13.5 - np.mean(baseline)) and found.n == 4
+    assert expected in sentence("PPO on X", noise, 2, found, found.p, 1)
 
 
 def test_rows_of_choice_csv():
@@ -352,32 +385,69 @@ def test_two_algorithms_and_environments_at_once(tmp_path):
         assert float(line["score"]) == pytest.approx(fmean(wanted))
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "env", "seconds"),
-    [  # eight runs of 1,000 steps, each with ten seconds to start
-        ("sac", "Hopper-v5", 8 * (10 + 1000 / 150)),
-        ("sac", "Humanoid-v5", 8 * (10 + 1000 / 90)),
-        ("td3", "HumanoidStandup-v5", 8 * (10 + 1000 / 130)),
-        ("ppo", "Humanoid-v5", 8 * (10 + 1000 / 2900)),
-    ],
-)
-def test_the_core_hours_announced(algorithm, env, seconds, tmp_path):
-    args = arguments(
-        f"--algos | {algorithm} | --envs | {env} | --noises | {A}@1 | --confirm | 4", tmp_path
+THREE = "RandomMixupObservation(0.5) | RandomDropoutObservation(0.9)"
+THREE = f"--noise-rates | 1 | --confirm | 5 | --noises | {A} | {THREE}"
+
+
+def test_a_noise_is_chosen_by_the_rate_of_success(tmp_path):
+    env_id = "toy_envs:IsSuccess-v0"
+    text = f"--algos | ppo | --envs | {env_id} | --metric | success_rate | {THREE}"
+    args = arguments(text, tmp_path)
+    batches(args)
+    [verdict] = conclude(args, tmp_path)
+    lines = read(tmp_path / "choice.csv")
+    rates = {}
+    for line in lines[-2:]:
+        noise = Configuration.parse(line["noise"], line["noise_rate"])
+        last = [
+            stub_run.episodes_of("ppo", env_id, *noise.texts, seed)[-1]
+            for seed in range(1001, 1006)
+        ]
+        rates[noise] = 100 * np.mean(np.array(last) > 100)
+        assert float(line["score"]) == pytest.approx(rates[noise])
+    gain = rates.pop(noise) - rates.pop(BASELINE)
+    found = re.search(
+        r"5 fresh seeds, ([-+][\d.]+) \[.*\] percentage points of success, p", verdict
     )
-    [choice] = choose.choices(args)
-    assert choice.core_hours == pytest.approx(seconds / 3600)
+    assert float(found[1]) == pytest.approx(gain, abs=0.5) and abs(gain) > 5
+    assert "(80 %" in verdict or " %" not in verdict  # never percent of a rate
+    returns = arguments(f"--algos | ppo | --envs | {env_id} | {THREE}", tmp_path)
+    assert "percentage points" not in conclude(returns, tmp_path)[0]
 
 
-def test_the_readme_says_what_it_takes_by_default():
+def test_choose_by_success_needs_an_environment_that_tells_it(tmp_path, capsys):
+    text = f"--algos | ppo | --envs | Pendulum-v1 | --metric | success_rate | {THREE}"
+    with pytest.raises(SystemExit) as exit_:
+        batches(arguments(text, tmp_path))
+    assert exit_.value.code == 2
+    told = "error: --metric success_rate: Pendulum-v1 tells no `is_success` or `success`\n"
+    assert capsys.readouterr().err == told
+
+
+def test_choose_stops_where_nothing_was_learned(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(stub_run, "episodes_of", lambda *run: [[-50.0] * 10] * 10)
+    args = arguments(f"--algos | ppo | --envs | Pendulum-v1 | {THREE}", tmp_path)
+    with pytest.raises(SystemExit) as exit_:
+        batches(args)
+    assert exit_.value.code == 1
+    assert len(list(tmp_path.glob("*/*__*"))) == 6  # after the first round: two seeds of three
+    told = (
+        "PPO on Pendulum-v1: all 6 runs have a return of -50.00 in every test: nothing was learned "
+    )
+    assert f"error: {told}in 1,000 steps" in capsys.readouterr().err
+
+
+def test_the_readme_says_what_it_takes_by_default(tmp_path):
     text = " ".join((Path(__file__).parents[2] / "README.md").read_text().split())
     pattern = r"takes (\d+) runs of a .*: about (\d+) core-hours with PPO and (\d+) with SAC in a"
     runs, *hours = map(int, re.search(pattern, text).groups())
     for algorithm, announced in zip(("ppo", "sac"), hours, strict=True):
-        args = parse_args("list", "/", ["choose", "--algos", algorithm, "--envs", "Hopper-v5"])
+        args = parse_args("list", str(tmp_path), ["choose", "--algos", algorithm])
+        args.envs, known = ["Hopper-v5"], Environment(0.05e-3, 200, 1000, 11, True, {})
+        remember(args.runs_dir, "Hopper-v5", known)
         choices = choose.choices(args)
-        assert choose.total(choices).startswith(f"{runs} runs in all")
-        assert choices[0].core_hours == pytest.approx(announced, rel=0.03)
+        assert choose.total(choices, args).startswith(f"{runs} runs in all")
+        assert runs * choices[0].run_seconds / 3600 == pytest.approx(announced, rel=0.1)
 
 
 def test_the_default_noises_and_those_of_the_paper(tmp_path):
@@ -389,8 +459,8 @@ def test_the_default_noises_and_those_of_the_paper(tmp_path):
         [choice] = choose.choices(args)
         return choice.state.noises
 
-    assert len(tried()) == 16 and {noise.noise_rate for noise in tried()} == {"0.05", "1.00"}
-    assert len({noise.noise for noise in tried()}) == 8
+    assert len(tried()) == 20 and {noise.noise_rate for noise in tried()} == {"0.05", "1.00"}
+    assert len({noise.noise for noise in tried()}) == 10
     assert not any(noise.noise == "RandomNormalNoisyObservation(1.0)" for noise in tried())
     assert [str(noise) for noise in tried("--noise-rates 0.2")] == [
         f"{noise.noise} at 0.2" for noise in tried()[::2]
@@ -407,20 +477,37 @@ def test_an_excluded_noise_is_no_other_choice(tmp_path):
         stub_run.train([choice.runs[run].script, *choice.runs[run].arguments])
     excluded = f"{words} | --exclude | RandomEarlyTermination(50)@1"
     [choice] = choose.choices(arguments(excluded, tmp_path))
-    assert len(choice.returns) == 15
+    assert len(choice.returns) == 19
 
 
 def test_what_the_confirmation_can_show(tmp_path):
     words = f"--algos | ppo | --envs | Pendulum-v1 | --noises | {A}@1"
-    [line] = choose.plan(choose.choices(arguments(words, tmp_path)))[2:]
-    assert line == (
-        "25 fresh seeds confirm a true gain of 0.8 standard deviations over seeds with 80 % power"
-    )
-    two = arguments(words.replace("ppo", "ppo | sac"), tmp_path)
-    assert choose.plan(choose.choices(two))[3] == (
-        "25 fresh seeds confirm a true gain of 0.9 standard deviations over seeds with 80 % power, "
-        "corrected for 2 verdicts"
-    )
+
+    def lines(words):
+        args = arguments(words, tmp_path)
+        plan = choose.plan(choose.choices(args), args)
+        return [line for line in plan if "fresh seeds confirm" in line]
+
+    unit = "standard deviations over seeds with 80 % power"
+    assert lines(words) == [f"25 fresh seeds confirm a true gain of 0.8 {unit}"]
+    [line] = lines(words.replace("ppo", "ppo | sac"))
+    assert line.endswith(f" 0.9 {unit}, corrected for 2 verdicts")
+    # Once there is a spread, in the return's own units
+    two = f"{words} | RandomMixupObservation(0.5)@1 | --budget | 6 | --confirm | 5"
+    [choice] = choose.choices(arguments(two, tmp_path))
+    for run in map(choice.runs.get, choice.state.due):
+        stub_run.train([run.script, *run.arguments])
+    tests = [
+        [stub_run.tests_of("ppo", "Pendulum-v1", [noise], [1.0], seed)[-1] for seed in (1, 2, 3)]
+        for noise in (A, "RandomMixupObservation(0.5)")
+    ]
+    spread = math.sqrt(fmean(np.var(tests, axis=1, ddof=1)))
+    [line] = lines(two)
+    gain, units = re.search(
+        r"of about ([\d.]+) \(([\d.]+) standard deviations of the", line
+    ).groups()
+    assert line.startswith("PPO on Pendulum-v1: 5 fresh seeds confirm a true gain of about ")
+    assert float(gain) == pytest.approx(spread * float(units), rel=0.06)
 
 
 def test_a_second_choice_takes_the_same_fresh_seeds(tmp_path):
@@ -473,7 +560,8 @@ def test_two_commands_that_end_side_by_side_keep_each_others_lines(tmp_path, mon
     assert [found["algorithm"] for found in read(path)] == ["first", "x"]
 
 
-def test_status_says_who_survives(tmp_path):
+def test_status_says_who_survives(tmp_path, monkeypatch):
+    monkeypatch.setenv("SWEEP_JOBS", "2")
     scores = {}
     for noise in (A, "RandomMixupObservation(0.5)", "RandomDropoutObservation(0.9)"):
         tests = stub_run.tests_of("ppo", "Pendulum-v1", [noise], [1.0], 1)
@@ -485,23 +573,24 @@ def test_status_says_who_survives(tmp_path):
         f"--budget | 7 | --noises | {' | '.join(noises)}",
         tmp_path,
     )
-    line, total = choose.standing(choose.choices(args))
-    assert total.startswith("15 runs in all, 7 to search and 8 to confirm; 0 are done, about ")
+    line, total = choose.standing(choose.choices(args), args)
+    assert total == "15 runs in all, 7 to search and 8 to confirm; 0 are done"
     assert line == "PPO on Pendulum-v1, round 1 of 2: 3 of 3 noises, seed 1; runs to do: 3"
     for choice in choose.choices(args):
         for run in choice.state.due:
             stub_run.train([choice.runs[run].script, *choice.runs[run].arguments])
-    assert list(choose.standing(choose.choices(args))) == [
+    assert list(choose.standing(choose.choices(args), args)) == [
         "PPO on Pendulum-v1, round 2 of 2: 2 of 3 noises, seeds 1 to 3; runs to do: 4",
         "  mean return after round 1:",
-        f"  {scores[best]:10.2f}  {best} at 1.0",
-        f"  {scores[second]:10.2f}  {second} at 1.0",
+        f"  {rounded(scores[best]):>10}  {best} at 1.0",
+        f"  {rounded(scores[second]):>10}  {second} at 1.0",
         # Twelve runs are left; each of the three has taken 36 seconds
-        "15 runs in all, 7 to search and 8 to confirm; 3 are done, about 0.1 core-hours are left",
+        "15 runs in all, 7 to search and 8 to confirm; 3 are done, about 0.1 core-hours are left, "
+        "0.06 hours on the clock with 2 runs at a time",
     ]
     batches(args)
     finished = choose.choices(args)
-    [verdict] = choose.standing(finished)
+    [verdict] = choose.standing(finished, args)
     assert verdict.startswith("PPO on Pendulum-v1: ") and "4 fresh seeds" in verdict
     assert not (tmp_path / "choice.csv").exists()  # the status only looks
     assert [verdict] == list(choose.conclusion(finished))

@@ -78,7 +78,9 @@ def configurations(draw):
             steps = sorted(draw(st.lists(st.sampled_from([1, 2, 12]), min_size=1, max_size=2)))
             arguments = [str(k) for k in steps] if draw(st.booleans()) else ["each_step=True"]
             arguments += draw(st.sampled_from([[], ["truncate=True"], ["truncate=False"]]))
-        elif "Uniform" in name:
+        elif name == "RandomActionDelay":
+            arguments = [str(draw(st.integers(0, 12)))]
+        elif "Uniform" in name or name == "RandomDynamics":
             arguments = [str(x) for x in sorted(draw(st.tuples(few, few)))]
         else:
             most = 1 if "Mixup" in name or "Dropout" in name else 1e16
@@ -87,6 +89,10 @@ def configurations(draw):
                 arguments = [str(tuple(draw(st.lists(few, min_size=2, max_size=3))))]
             if "Normal" in name and draw(st.booleans()):
                 arguments.append(f"loc={draw(few)}")
+        if name.endswith("Observation") and draw(st.booleans()):
+            keys = ["a", "b", "a-b", "a b", "a/b", "a', 'b", "ab", "0"]
+            keys = draw(st.lists(st.sampled_from(keys), min_size=1, max_size=2))
+            arguments.append(f"keys={tuple(keys)}" if draw(st.booleans()) else "keys=0")
         noises.append(f"{name}({', '.join(arguments)})")
     rates = [draw(st.sampled_from([0.0, 0.05, 0.5, 1.0, "0:0", "1:0", "0:.5"])) for _ in noises]
     return noises, rates

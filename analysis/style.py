@@ -1,0 +1,44 @@
+"""The look of all figures: palette, widths, scales."""
+
+import matplotlib
+import numpy as np
+from matplotlib.colors import LinearSegmentedColormap
+
+STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
+STYLE["svg.hashsalt"] = "noisy"  # equal figures are equal files
+STYLE["pdf.fonttype"] = 42  # TrueType: ICML and GECCO refuse a paper with Type 3 fonts
+STYLE["text.parse_math"] = False  # names of experiments are no formulas
+STYLE["axes.titley"] = 1.0  # above the axes, without a search for labels that are in the way
+WIDTH = 10  # inches of most figures
+WIDTHS = (5.2, 8, WIDTH, 12, 12)  # with one to five panels in a row
+NARROW_WIDTH = 4.2  # inches of those for a telephone
+HEIGHT = 3.6  # inches, at least
+# Colour-blind readers tell these apart (Okabe and Ito, 2008); report.html.jinja has them, too.
+BETTER, WORSE, UNCLEAR = "#0072B2", "#D55E00", "#8C8C8C"
+PALETTE = [BETTER, WORSE, "#009E73"]  # of lines that are no verdicts, from the same source
+COLORS = {"better": BETTER, "worse": WORSE}  # of verdicts; all others are grey
+DIVERGING = LinearSegmentedColormap.from_list("effects", [WORSE, "white", BETTER])
+viridis = matplotlib.colormaps["viridis"]  # ordered by lightness, so it reads in grey
+
+
+def line_style(i, number):
+    """Return colour, line and marker of line i of so many; the first is the baseline, in black."""
+    color = viridis(0.7 * (i - 1) / max(1, number - 2)) if i else "black"
+    return color, ["-", "--", "-.", ":"][i % 4], ["", "o", "s", "^", "D", "v", "P", "X"][i % 8]
+
+
+def broken(label):
+    """Put each noise or rate of a combination on a line of its own."""
+    return str(label).replace(" + ", " +\n")
+
+
+def ink_on(value, limit):
+    """Return the colour of a number that can be read on its cell of a heatmap."""
+    return "white" if value > 0.7 * limit else "black"  # only the blue is dark
+
+
+def color_limit(values, most=np.inf):
+    """Return where the colours of a heatmap end: at its largest number, at most `most`."""
+    sizes = np.abs(np.asarray(values, float))
+    limit = min(most, sizes[np.isfinite(sizes)].max(initial=0)) or 1.0
+    return float(np.ceil(limit)) if most == 100 else limit

@@ -1,0 +1,138 @@
+"""Returns with noise against returns without: means, intervals, tests and verdicts."""
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+LEVEL = 0.05
+SHUFFLES = 100_000
+
+
+def mann_whitney_p(x, y):
+    """Return the two-sided p of the exact Mann-Whitney test."""
+    return stats.mannwhitneyu(x, y, method="exact").pvalue
+
+
+def permutation_p(x, y):
+    """Return the two-sided p of Welch's t when runs are shuffled; exact for few of them."""
+    options = {"vectorized": True, "n_resamples": SHUFFLES, "rng": 0}
+    return stats.permutation_test((x, y), welch_t, **options).pvalue
+
+
+def joint_p(pairs):
+    """Return the two-sided p of the mean of Welch's t over environments.
+
+    pairs: (x, y) of each environment, within which the runs are shuffled.
+    """
+    rng, shuffled = np.random.default_rng(0), 0
+    for x, y in pairs:
+        runs = rng.permuted(np.tile(np.concatenate([x, y]), (SHUFFLES, 1)), axis=1)
+        shuffled = shuffled + welch_t(runs[:, : len(x)], runs[:, len(x) :])
+    observed = sum(welch_t(np.asarray(x), np.asarray(y)) for x, y in pairs)
+    as_far = (abs(shuffled) >= abs(observed) - 1e-9).sum()
+    return (1 + as_far) / (1 + SHUFFLES)
+
+
+def welch_t(x, y, axis=-1):
+    """Return Welch's t of the samples along an axis of x and y."""
+    squared = sum(z.var(axis, ddof=1) / z.shape[axis] for z in (x, y))
+    return (x.mean(axis) - y.mean(axis)) / np.sqrt(squared)
+
+
+def compare(x, y, p):
+    """Compare runs with noise (x) with runs without (y).
+
+    p(x, y) is the test, mann_whitney_p or permutation_p. The interval of the difference is Welch's,
+    at 95 %; the columns that end in _percent are relative to the mean without noise.
+    """
+    difference = x.mean() - y.mean()
+    low, high = stats.ttest_ind(x, y, equal_var=False).confidence_interval(0.95)
+    row = {"n": len(x), "mean": x.mean(), "sd": x.std(ddof=1)}
+    row |= {"n_without": len(y), "mean_without": y.mean(), "sd_without": y.std(ddof=1)}
+    row |= {"difference": difference, "low": low, "high": high}
+    percent = 100 / abs(y.mean())
+    row |= {f"{name}_percent": percent * row[name] for name in ("difference", "low", "high")}
+    return row | {"p": p(x, y)}
+
+
+def average_change(pairs):
+    """Return the change in percent of the mean return, averaged over environments.
+
+    pairs: (x, y) of each environment -> change, low, high, p. The 95 % interval and the test are
+    Welch's and Satterthwaite's; the means without noise in the denominators are taken as known.
+    """
+    parts = []  # variance of a mean, and its degrees of freedom
+    changes = []
+    for x, y in pairs:
+        scale = 100 / abs(y.mean()) / len(pairs)
+        changes.append(scale * (x.mean() - y.mean()))
+        parts += [(scale**2 * z.var(ddof=1) / len(z), len(z) - 1) for z in (x, y)]
+    variance = sum(v for v, _ in parts)
+    df = variance**2 / sum(v**2 / n for v, n in parts)
+    half = stats.t.ppf(0.975, df) * np.sqrt(variance)
+    change = sum(changes)
+    p = 2 * stats.t.sf(abs(change) / np.sqrt(variance), df)
+    return change, change - half, change + half, p
+
+
+def holm(p):
+    """Return p-values corrected by Holm's method."""
+    p = np.asarray(p, float)
+    order = p.argsort()
+    corrected = np.empty(len(p))
+    corrected[order] = np.minimum(1, np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1)))
+    return corrected
+
+
+def comparisons(runs):
+    """Compare each noise in a frame of read_returns with no noise: a row a comparison.
+
+    p is of the permuted Welch t; `holm` corrects it for these rows. A noise in several environments
+    gets one row more, "together", with the average change and the test of all at once.
+    """
+    rows, together = [], {}
+    keys = ["algorithm", "environment", "steps"]
+    for key, group in runs.groupby(keys):
+        sides = group.groupby("seed")["seed"].transform("size")
+        group = group[sides == sides.max()]  # the whole seeds
+        without = group.loc[group["noise"] == "", "test"].to_numpy()
+        for (noise, rate), same in group[group["noise"] != ""].groupby(["noise", "rate"]):
+            row = dict(zip(keys, key, strict=True)) | {"noise": noise, "rate": rate}
+            pair = same["test"].to_numpy(), without
+            rows.append(row | compare(*pair, permutation_p))
+            together.setdefault((key[0], key[2], noise, rate), []).append(pair)
+    table = pd.DataFrame(rows)
+    table["holm"] = holm(table["p"])
+    table["verdict"] = list(map(in_words, table["difference"], table["holm"]))
+    for (algorithm, steps, noise, rate), pairs in together.items():
+        if len(pairs) > 1:
+            change, low, high, _ = average_change(pairs)
+            p = joint_p(pairs)
+            row = {"algorithm": algorithm, "environment": "together", "steps": steps}
+            row |= {"noise": noise, "rate": rate, "difference_percent": change}
+            row |= {"low_percent": low, "high_percent": high, "p": p}
+            table.loc[len(table)] = row | {"verdict": in_words(change, p)}
+    return table
+
+
+def in_words(effect, p):
+    """Return what noise does by the rule of plans.md: "helps", "harms" or "undecided"."""
+    if p > LEVEL:
+        return "undecided"
+    return "helps" if effect > 0 else "harms"
+
+
+def verdict(tests, claimed=1, of=all):
+    """Judge a claim by its tests: a list of (effect, corrected p), one for each case.
+
+    A case with p <= 0.05 confirms or contradicts by its sign; claimed, 1 or -1, is that of the
+    claim. The claim that `all` cases have the effect is confirmed if all do, and contradicted if
+    any does the opposite; the claim that `any` has it, the other way round.
+    """
+    if not tests:
+        return "not tested"
+    signs = [np.sign(effect) * claimed if p <= LEVEL else 0 for effect, p in tests]
+    if of(sign == 1 for sign in signs):
+        return "confirmed"
+    opposite = any if of is all else all
+    return "contradicted" if opposite(sign == -1 for sign in signs) else "undecided"

@@ -1,0 +1,61 @@
+"""The returns of the runs in results/data, one row a run."""
+
+import json
+from pathlib import Path
+
+import pandas as pd
+
+RESULTS = Path(__file__).parents[1]
+DATA = RESULTS / "data"
+ENVIRONMENTS = ["HalfCheetah", "Hopper", "Humanoid", "Pusher", "Walker2d"]
+
+
+def read_returns(*names, step=None):
+    """Return the finished runs in these folders of data/.
+
+    Columns: folder, algorithm ("PPO"), environment ("Hopper"), version ("v5"), noise (as in
+    "RandomNormalNoisyReward(1.0)", several joined by " + ", "" without noise), rate (a text, too),
+    seed, steps (of training), test: the mean test return at the end, or after `step` steps, and
+    training: the mean of the last 100 training episodes.
+    """
+    rows = []
+    for name in names:
+        for path in sorted((DATA / name).rglob("result.json")):
+            args = json.loads((path.parent / "config.json").read_text())["args"]
+            environment, version = args["env_id"].split("-")
+            row = {"folder": name, "algorithm": args["exp_name"].split("_")[0].upper()}
+            row |= {"environment": environment, "version": version}
+            row |= {"noise": " + ".join(args["noise"])}
+            row |= {"rate": " + ".join(f"{rate}" for rate in args["noise_rate"])}
+            row |= {"seed": args["seed"], "steps": args["total_timesteps"]}
+            result = json.loads(path.read_text())
+            row["test"] = result["final_return_mean"]
+            if step is not None:
+                row["test"] = read_curve(path.parent)[step]
+            rows.append(row | {"training": result["train_return_mean_last_100"]})
+    return pd.DataFrame(rows)
+
+
+def read_curve(folder):
+    """Return the mean test returns of a run, indexed by step."""
+    return pd.read_csv(folder / "eval.csv").groupby("step")["episodic_return"].mean()
+
+
+def each_run_once(runs):
+    """Drop runs that another folder has, too: all settings, the seed and the return are equal.
+
+    Two batches share them where they ran the same seeds at commits that compute the same.
+    """
+    same = ["algorithm", "environment", "version", "noise", "rate", "seed", "steps", "test"]
+    return runs.drop_duplicates(same)
+
+
+def select(runs, algorithm, environment, noise="", rate=""):
+    """Return the test returns of one configuration, in the order of the seeds."""
+    found = runs[
+        (runs["algorithm"] == algorithm)
+        & (runs["environment"] == environment)
+        & (runs["noise"] == noise)
+        & (runs["rate"] == rate)
+    ]
+    return found.sort_values("seed")["test"].to_numpy()

@@ -1,0 +1,171 @@
+"""The study's numbers by hand, its rules with known answers, its tables from the committed runs."""
+
+import io
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+
+from results.study import __main__, baselines, claims, compare, returns
+
+NOISE = "RandomNormalNoisyReward(1.0)"
+RESULT = {"train_return_mean_last_100": 0.0}
+
+
+def write_run(folder, test, noise="", rate=1.0, seed=1, env_id="Hopper-v5"):
+    """Write what the study reads of a run: tests of 0 and `test` at steps 10 and 20."""
+    path = folder / f"{noise}-{rate}-{seed}-{env_id}"
+    path.mkdir(parents=True)
+    args = {"exp_name": "ppo_continuous_noisy", "env_id": env_id, "seed": seed}
+    args |= {"noise": [noise] if noise else [], "noise_rate": [rate] if noise else []}
+    (path / "config.json").write_text(json.dumps({"args": args | {"total_timesteps": 20}}))
+    (path / "result.json").write_text(json.dumps(RESULT | {"final_return_mean": test}))
+    rows = f"10,0,-1\n10,1,1\n20,0,{test - 1}\n20,1,{test + 1}\n"
+    (path / "eval.csv").write_text("step,episode,episodic_return\n" + rows)
+
+
+@pytest.fixture
+def data(tmp_path, monkeypatch):
+    """Return a folder that the study takes for results/data."""
+    monkeypatch.setattr(returns, "DATA", tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("tests", "claimed", "of", "expected"),
+    [
+        ([], 1, all, "not tested"),
+        ([(3, 0.05)], 1, all, "confirmed"),
+        ([(3, 0.051)], 1, all, "undecided"),
+        ([(-3, 0.01)], 1, all, "contradicted"),
+        ([(-3, 0.01)], -1, all, "confirmed"),
+        ([(3, 0.01), (1, 0.5)], 1, all, "undecided"),
+        ([(3, 0.01), (1, 0.5)], 1, any, "confirmed"),
+        ([(3, 0.01), (-1, 0.01)], 1, all, "contradicted"),
+        ([(3, 0.01), (-1, 0.01)], 1, any, "confirmed"),
+        ([(-3, 0.01), (-1, 0.5)], 1, any, "undecided"),
+        ([(-3, 0.01), (-1, 0.01)], 1, any, "contradicted"),
+        ([(3, float("nan"))], 1, all, "undecided"),
+    ],
+)
+def test_verdicts_have_known_answers(tests, claimed, of, expected):
+    assert compare.verdict(tests, claimed, of) == expected
+
+
+@pytest.mark.parametrize(
+    ("effect", "p", "word"),
+    [(1, 0.05, "helps"), (-1, 0.05, "harms"), (-1, 0.06, "undecided")],
+)
+def test_the_rule_of_the_plans(effect, p, word):
+    assert compare.in_words(effect, p) == word
+
+
+def test_a_row_says_whether_the_papers_value_is_covered():
+    effect = [(20.4, 0.01)]
+    inside, outside = (
+        claims.row("c", "page", paper, (20.4, -5.2, 30), effect, "5 + 5", after=True)
+        for paper in (-5, 31)
+    )
+    assert inside == {
+        "claim": "c*",
+        "the paper": "-5 %",
+        "ours [95 %]": "+20 % [-5, 30]",
+        "covered": "yes",
+        "verdict": "confirmed",
+        "runs": "[5 + 5][page]",
+    }
+    assert outside["covered"] == "no"
+
+
+def test_separated_samples_have_the_smallest_p_possible():
+    x, y = np.array([5.0, 6, 7, 9]), np.array([1.0, 2, 3, 4.5])
+    assert compare.permutation_p(x, y) == pytest.approx(2 / 70)
+    assert compare.mann_whitney_p(x, y) == pytest.approx(2 / 70)
+    assert compare.joint_p([(x, y)]) == pytest.approx(2 / 70, abs=0.002)
+    assert compare.joint_p([(x[:3], y[:3]), (x[1:], y[1:])]) == pytest.approx(2 / 400, abs=0.001)
+    assert compare.joint_p([(x, y), (y, x)]) == pytest.approx(1)
+
+
+def test_holm_by_hand():
+    assert compare.holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
+    assert compare.holm([0.5, 0.9]) == pytest.approx([1, 1])
+
+
+def test_a_comparison_by_hand():
+    x, y = np.array([-3.0, -5, -4]), np.array([-8.0, -12, -10, -10])
+    found = compare.compare(x, y, compare.mann_whitney_p)
+    interval = stats.ttest_ind(x, y, equal_var=False).confidence_interval(0.95)
+    assert (found["n"], found["mean"], found["sd"]) == (3, -4, 1)
+    assert (found["n_without"], found["mean_without"]) == (4, -10)
+    assert found["difference"] == 6 and found["difference_percent"] == pytest.approx(60)
+    assert (found["low"], found["high"]) == pytest.approx(tuple(interval))
+    assert found["low_percent"] == pytest.approx(10 * found["low"])
+    assert found["p"] == pytest.approx(2 / 35)
+
+
+def test_the_average_change_of_one_environment_is_welchs():
+    x, y = np.array([3.0, 5, 4, 9]), np.array([8.0, 12, 10])
+    change, low, high, p = compare.average_change([(x, y)])
+    expected = stats.ttest_ind(x, y, equal_var=False)
+    limits = expected.confidence_interval(0.95)
+    assert [change, low, high] == pytest.approx([-47.5, 10 * limits.low, 10 * limits.high])
+    assert p == pytest.approx(expected.pvalue)
+    assert compare.average_change([(x, y), (x, y)])[0] == pytest.approx(change)
+
+
+def test_a_set_is_compared_by_environment_and_together(data):
+    for seed in range(1, 5):
+        for env_id in ("Hopper-v5", "Pusher-v5"):
+            write_run(data / "set", 100.0 + seed, seed=seed, env_id=env_id)
+            write_run(data / "set", 50.0 + seed, NOISE, seed=seed, env_id=env_id)
+        write_run(data / "set", 7.0, seed=seed, env_id="Humanoid-v5")  # no noise: no row
+    write_run(data / "set", 1e6, NOISE, seed=5)  # no whole seed
+    table = compare.comparisons(returns.read_returns("set")).set_index("environment")
+    assert list(table.index) == ["Hopper", "Pusher", "together"]
+    assert list(table["n"])[:2] == [4, 4] and table["difference"]["Hopper"] == -50
+    assert table["p"]["Pusher"] == pytest.approx(2 / 70)
+    assert table["holm"]["Pusher"] == pytest.approx(4 / 70)
+    assert list(table["verdict"]) == ["undecided", "undecided", "harms"]
+    assert table["difference_percent"]["together"] == pytest.approx(-50 / 1.025)
+
+
+def test_reading_runs(data):
+    write_run(data / "a", 3.0, NOISE, rate=0.01)
+    write_run(data / "a", 4.0, seed=2)
+    write_run(data / "b", 4.0, seed=2)
+    write_run(data / "b", 5.0, seed=3)
+    runs = returns.read_returns("a", "b")
+    assert len(runs) == 4 and set(runs["algorithm"]) == {"PPO"}
+    once = returns.each_run_once(runs)
+    assert list(returns.select(once, "PPO", "Hopper")) == [4, 5]
+    assert list(returns.select(once, "PPO", "Hopper", NOISE, "0.01")) == [3]
+    assert list(returns.read_returns("a", step=10)["test"]) == [0, 0]
+
+
+@pytest.mark.slow
+def test_the_study_agrees_with_the_finished_one():
+    """Another program computed the finished tables: its p, standard errors and percent are here."""
+    theirs = pd.read_csv(returns.RESULTS / "tables/baselines.csv")
+    sac = theirs[theirs["baseline"] == "SAC on HalfCheetah-v5"].iloc[0]
+    ours = baselines.sac_and_td3().query("algorithm == 'SAC' and steps == 1_000_000")
+    assert list(ours["p"]) == pytest.approx([sac["paper_p"], sac["cleanrl_p"]], rel=1e-4)
+    assert list(ours["se"]) == pytest.approx([sac["paper_se"], sac["cleanrl_se"]], rel=1e-4)
+    table = pd.read_csv(returns.RESULTS / "tables/early_termination.csv", index_col=0)
+    row = table.loc["terminated at 50, none: fresh seeds 11 to 30"]
+    runs = returns.read_returns("runs").query("11 <= seed <= 30")
+    noise = "RandomEarlyTermination(50)", "1.0"
+    samples = (returns.select(runs, "PPO", "Pusher", *config) for config in (noise, ()))
+    found = compare.compare(*samples, compare.mann_whitney_p)
+    assert f"{found['difference_percent']:+.1f} %" == row["change"]
+    assert "{difference:+.1f} [{low:.1f}, {high:.1f}]".format(**found) == row["difference [95 %]"]
+    assert f"{found['p']:.2g}" == f"{row['p']:.2g}"
+
+
+@pytest.mark.slow
+def test_committed_tables_are_those_of_the_committed_runs():
+    for name, table in __main__.tables().items():
+        computed = pd.read_csv(io.StringIO(__main__.as_csv(table)))
+        committed = pd.read_csv(returns.RESULTS / f"tables/{name}.csv")
+        pd.testing.assert_frame_equal(computed, committed, rtol=1e-3, atol=0.1, obj=name)
