@@ -535,11 +535,13 @@ class Run:
         if self.folder.is_symlink():
             fail(f"{self.folder} is a link: remove it, or choose another --exp-name or --runs-dir")
         in_use = fail_on(BlockingIOError, f"{self.folder} is in use by another process")
-        with fail_on(OSError, "--runs-dir"), in_use:
+        no_locks = fail_on(OSError, f"--runs-dir: the file system of {self.folder} has no locks")
+        with fail_on(OSError, "--runs-dir"):
             self.folder.mkdir(parents=True, exist_ok=True)
             lock = os.open(self.folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
             self.lock = os.fdopen(lock)
-            fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
+            with no_locks, in_use:
+                fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
             result, _, self.checkpoint, *_ = ours = [self.folder / name for name in self.FILES]
             old = [path.with_suffix(".tmp") for path in ours]  # of a process that was killed
             if args.overwrite:
@@ -572,7 +574,8 @@ class Run:
         path = self.folder / "config.json"
         with self._reading(path):
             config = json.loads(path.read_text())
-            old = {name: config["args"].get(name) for name in asdict(self.args)}
+            # one that an older version did not have is no difference
+            old = {name: config["args"].get(name, own) for name, own in asdict(self.args).items()}
         if self.args.eval_frequency is None:
             self.args.eval_frequency = old["eval_frequency"]
         new = {k: v for k, v in asdict(self.args).items() if k not in noisy.MAY_DIFFER_IN_A_RUN}

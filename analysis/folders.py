@@ -20,7 +20,7 @@ ALGORITHMS = ("SAC", "TD3", "PPO")
 SEARCH, CONFIRMATION = PHASES = ("search", "confirmation")  # the folders of a choice
 # Arguments that have columns of their own, or may differ; the steps of tests are intersected.
 NOT_SETTINGS = {"env_id", "exp_name", "seed", "noise", "noise_rate"} | MAY_DIFFER_IN_A_TABLE
-ENV_ID = re.compile(r"(?:[\w.]+:)?[\w:./-]+")  # a module, and what Gymnasium takes for an id
+ENV_ID = re.compile(r"(?:\w+(?:\.\w+)*:)?[\w./-]+")  # a module, and what Gymnasium takes for an id
 STOPPED = (129, 130, 138, 143)  # exit statuses of a run that was told to stop, by signal
 END = re.compile(r"# .* exit=(\d+)")  # the last line of run_one in sweep/executors.sh
 PROGRESS = re.compile(r"step=(\d+)/\d+ sps=(\d+)")  # the line of _show_progress in the scripts

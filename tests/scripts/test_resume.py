@@ -3,6 +3,8 @@
 The commands are processes forked from a server (commands.py).
 """
 
+import errno
+import fcntl
 import functools
 import io
 import itertools
@@ -718,6 +720,30 @@ def test_a_folder_of_another_configuration_is_refused_until_overwritten(
     assert not differing(outcome(path.parent), alone(algorithm))
     line = refused(algorithm, [*words, "--gamma", "0.5"], capsys)  # finished: likewise
     assert "gamma" in line
+
+
+@one_script
+def test_an_argument_that_an_older_version_did_not_have_is_no_difference(algorithm, stopped):
+    words, path = stopped
+    config = json.loads(path.with_name("config.json").read_text())
+    del config["args"]["max_episode_steps"]
+    path.with_name("config.json").write_text(json.dumps(config))
+    assert train(algorithm, words)
+    assert_finished(path.parent)
+
+
+@one_script
+def test_a_file_system_without_locks_is_one_line(algorithm, tmp_path, capsys, monkeypatch):
+    def lockf(*_):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "lockf", lockf)
+    with pytest.raises(SystemExit) as error:
+        train(algorithm, options(algorithm, tmp_path))
+    assert error.value.code == 2
+    line = capsys.readouterr().err
+    assert line.startswith(f"error: --runs-dir: the file system of {tmp_path}/")
+    assert line.endswith("has no locks: [Errno 37] No locks available\n")
 
 
 @pytest.mark.slow
