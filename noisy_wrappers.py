@@ -2024,12 +2024,14 @@ def refusals(env_id: str) -> tuple[type[Exception], ...]:
     """Return the errors that ``make_flat(gymnasium.make(env_id))`` raises on purpose.
 
     They are Gymnasium's and this module's. Of Gymnasium's own environments a missing dependency is
-    an ImportError; any other error comes from the environment's code.
+    an ImportError, and those of Gymnasium-Robotics fail an assertion where MuJoCo is too new. Any
+    other error comes from the environment's code.
     """
     spec = gym.registry.get(env_id.rpartition(":")[2])
     maker: Any = spec.entry_point if spec else ""  # "package.module:Class" or a function
-    is_gymnasiums = getattr(maker, "__module__", str(maker)).startswith("gymnasium.")
-    return (gym.error.Error, SpaceError, *([ImportError] if is_gymnasiums else []))
+    package = getattr(maker, "__module__", str(maker)).partition(".")[0]
+    more = {"gymnasium": (ImportError,), "gymnasium_robotics": (AssertionError,)}
+    return (gym.error.Error, SpaceError, *more.get(package, ()))
 
 
 def seed_globals(seed: int) -> None:

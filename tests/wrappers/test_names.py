@@ -3,12 +3,20 @@
 import re
 import sys
 
+import gymnasium as gym
 import pytest
 from cases import A, B, C, hypothesis_settings
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from noisy_wrappers import WRAPPERS, canonical_env_id, canonical_noises, run_folder, run_name
+from noisy_wrappers import (
+    WRAPPERS,
+    canonical_env_id,
+    canonical_noises,
+    refusals,
+    run_folder,
+    run_name,
+)
 from sweep.grid import NOISES as NOISES_OF_THE_PAPER
 
 
@@ -154,3 +162,10 @@ def test_what_a_module_raises_passes_through(source, error, tmp_path, monkeypatc
     with pytest.raises(error):
         canonical_env_id("buggy_module:Env-v0")
     assert sys.path == path
+
+
+def test_an_assertion_is_a_refusal_only_of_a_package_that_asserts_its_versions():
+    gym.register("Asserting-v0", "gymnasium_robotics.fetch:Env")
+    gym.register("Own-v0", "my_envs:Env")
+    assert AssertionError in refusals("Asserting-v0")
+    assert not {AssertionError, ImportError} & set(refusals("my_envs:Own-v0"))
