@@ -57,6 +57,8 @@ class Args:
     """where the tables, the figures and report.html go; by default RUNS_DIR/results"""
     compare: Path | None = None
     """a folder with the paper's tables as csv (results/paper): adds compare_* tables"""
+    latex: bool = False
+    """also write the tables as Markdown and LaTeX, and the figures as pdf"""
     metric: Literal["return", "success_rate"] = "return"
     """what the verdicts judge by: final test returns, or rates of success in percent"""
 
@@ -116,27 +118,25 @@ def overview_of(runs, studies):
     return " ".join(parts)
 
 
-def write_results(out, verdicts, tables, studies, overview, problems, notes):
+def write_results(out, latex, verdicts, tables, studies, overview, problems, notes):
     """Write all tables, all figures and the report; return the names of tables and figures."""
     out.mkdir(parents=True, exist_ok=True)
     for table in tables.values():
-        write_table(out, table)
+        write_table(out, table, latex)
     drawn = list(figures(studies, tables))
     names = {*tables}
     for drawing in drawn:
         if drawing.kind != "robustness":  # which is about returns
             reword(drawing, studies[0].metric)
-        write_figure(out, drawing)
+        write_figure(out, drawing, latex)
         names |= {drawing.name, drawing.narrow_name}
     write_report(out, verdicts, tables, drawn, overview, problems, notes)
     return names
 
 
 def left_by_others(out, names):
-    """Return the tables and figures in `out` that have other names: an earlier analysis's."""
-    found = {path.stem for path in out.glob("*.csv") if path.with_suffix(".tex").exists()}
-    found |= {path.stem for path in out.glob("*.svg")}
-    return sorted(found - names)
+    """Return the tables and figures in `out` that this analysis, with its names, did not write."""
+    return sorted({path.stem for path in [*out.glob("*.csv"), *out.glob("*.svg")]} - names)
 
 
 def terminal_width():
@@ -218,12 +218,12 @@ def main(args):
     notes = unlearned_notes(studies) + family_notes(tables["statistics"].frame) + notes
     overview = overview_of(runs, studies)
     try:
-        names = write_results(out, verdicts, tables, studies, overview, problems, notes)
+        names = write_results(out, args.latex, verdicts, tables, studies, overview, problems, notes)
     except OSError as error:
         fail(f"--out: {error}")
     old = left_by_others(out, names)
     if old:
-        notes.append(f"{out} also holds an earlier analysis, not renewed: {', '.join(old)}")
+        notes.append(f"{out} also holds files that this analysis did not write: {', '.join(old)}")
     print_results(out, verdicts, tables, overview, problems, notes)
     return int(number["corrupt"] > 0)
 

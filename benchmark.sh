@@ -212,7 +212,7 @@ stop() { # EXIT_STATUS
 # The executor and its guard have process groups of their own, so that one signal to the executor's
 # reaches every run once.
 run_todo() {
-  local guard watch=''
+  local guard watch
   write_list
   if [ "$executor" = slurm ]; then
     trap - EXIT # its tasks read the list later
@@ -229,12 +229,12 @@ run_todo() {
   set +m
   [ "$stopped" -eq 0 ] || "stop_$executor" &
   trap '' PIPE # whoever reads what this prints may leave first
-  [ ! -t 2 ] || { "$PYTHON" -m sweep watch "$caller" "${grid[@]}" & watch=$!; }
+  "$PYTHON" -m sweep watch "$caller" "${grid[@]}" & watch=$!
   while kill -0 -- "-$group" 2>/dev/null; do
     sleep 1 & wait $! || true # a trap interrupts wait, not sleep
   done
   kill -- "-$guard" || true
-  [ -z "$watch" ] || { kill "$watch" && echo >&2; }
+  kill "$watch" && { [ ! -t 2 ] || echo >&2; } || true
   group='' ids=()
   tried+=$'\n'$todo
 }

@@ -1,6 +1,8 @@
 """Test trained policies again: clean and under noise, in a window, or as a video.
 
-    python evaluate.py runs/*Hopper-v5* --noise "RandomNormalNoisyAction(0.2)" --noise-rate 0.5 1
+    python evaluate.py runs/*Hopper-v5* --noises "RandomNormalNoisyAction(0.2)" --noise-rates 0.5 1
+    python evaluate.py runs/*Hopper-v5* --noises "RandomDynamics(0.7, 0.7)" "RandomActionDelay(2)"
+    python evaluate.py runs/*my_envs* --env-id my_envs:MyHeavyEnv-v0
     python evaluate.py runs/baseline_s1__Hopper-v5__sac_continuous_noisy --render
     python evaluate.py runs --video videos
 
@@ -28,7 +30,7 @@ import tempfile
 import traceback
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +50,14 @@ from analysis.folders import (
     read_result,
     runs_of,
 )
-from analysis.runs import ROBUSTNESS_COLUMNS, script_name, study_name, usual_settings
+from analysis.formatting import slug
+from analysis.runs import (
+    ROBUSTNESS_COLUMNS,
+    script_name,
+    study_name,
+    usual_settings,
+    where_tested,
+)
 from noisy_wrappers import (
     BASELINE,
     Configuration,
@@ -72,10 +81,12 @@ class Args:
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
     """folders of finished runs, or folders that hold such folders"""
-    noise: tuple[str, ...] = ()
+    noises: tuple[str, ...] = ()
     """noises to test under; "A(..)+B(..)" combines two"""
-    noise_rate: tuple[float | str, ...] = ()
+    noise_rates: tuple[float | str, ...] = (1.0,)
     """noise rates; every noise is tested at every rate"""
+    env_id: str | None = None
+    """another environment to test in, with the same spaces; by default that of the training"""
     episodes: int = 100
     """test episodes per policy and condition"""
     seed: int = 2_000_000
@@ -98,6 +109,12 @@ class FinishedRun:
     environment: str
     configuration: Configuration
     settings: dict  # the other arguments
+    elsewhere: str = ""  # another environment to be tested in
+
+    @property
+    def tested_in(self):
+        """The environment that the policy plays in."""
+        return self.elsewhere or self.environment
 
 
 class UnusableError(Exception):
@@ -122,7 +139,7 @@ def find_runs(paths):
         try:
             config = read_config(folder) if has_begun(folder) else None
             if config and read_result(folder, config):
-                names = [field.name for field in fields(FinishedRun)][1:]
+                names = [field.name for field in fields(FinishedRun)][1:-1]
                 runs.append(FinishedRun(folder, *(config[name] for name in names)))
         except DamageError as error:
             damaged[folder] = str(error)
@@ -137,16 +154,14 @@ def read_conditions(args):
 
     That is {(noise, noise rate) as in robustness.csv: (noises, noise rates)}.
     """
-    if bool(args.noise) != bool(args.noise_rate):
-        fail("--noise and --noise-rate go together: every noise is tested at every rate")
     conditions = {BASELINE.columns: BASELINE.texts}
-    for noise, rate in itertools.product(args.noise, args.noise_rate):
+    for noise, rate in itertools.product(args.noises, args.noise_rates):
         try:
             configuration = Configuration.read(split_noises(noise), [rate])
         except ValueError as error:
             fail(error)
         if any(start != end for start, end in configuration.rates):
-            fail(f"--noise-rate {rate}: policies are tested at constant rates")
+            fail(f"--noise-rates {rate}: policies are tested at constant rates")
         conditions.setdefault(configuration.columns, configuration.texts)  # a rate of 0 is clean
     return conditions
 
@@ -157,22 +172,37 @@ def load(run, render_mode=None):
 
     Raises UnusableError.
     """
-    refuse_foreign_module(run)
     script = importlib.import_module(script_name(run.algorithm))
-    try:
-        canonical_env_id(run.environment)  # imports its module
-    except ValueError as error:
-        raise UnusableError(error) from None
+    for environment in {run.environment, run.tested_in}:
+        refuse_foreign_module(run, environment)
+        try:
+            canonical_env_id(environment)  # imports its module
+        except ValueError as error:
+            raise UnusableError(error) from None
     steps = run.settings.get("max_episode_steps")
     drawn = {"render_mode": render_mode} if render_mode else {}  # not every class takes it
     seed_globals(Args.seed)  # as every episode does: the constructor may draw, too
-    with script.make_env(run.environment, max_episode_steps=steps, **drawn) as env:
+    with script.make_env(run.tested_in, max_episode_steps=steps, **drawn) as env:
+        if run.elsewhere:
+            with script.make_env(run.environment, max_episode_steps=steps) as trained_in:
+                check_spaces(run, trained_in, env)
         try:
             policy = script.load_policy(run.folder, env)
         except Exception as error:  # a damaged file may raise anything
-            reason = f"policy.pt is not a policy for {run.environment}: {in_words(error)}"
+            reason = f"policy.pt is not a policy for {run.tested_in}: {in_words(error)}"
             raise UnusableError(reason) from None
         yield env, policy
+
+
+def check_spaces(run, trained_in, env):
+    """Raise UnusableError unless both environments have the same spaces."""
+    for name in ("observation_space", "action_space"):
+        here, there = getattr(trained_in, name), getattr(env, name)
+        if here != there:
+            raise UnusableError(
+                f"--env-id {run.elsewhere}: its {name} is {there}, that of {run.environment} is "
+                f"{here}; a policy needs the same"
+            )
 
 
 def folders_of_runs(run):
@@ -182,12 +212,12 @@ def folders_of_runs(run):
     return folder, runs_dir.parent if runs_dir.name in PHASES else runs_dir
 
 
-def refuse_foreign_module(run):
-    """Raise UnusableError if the run's environment would be imported from a folder of runs.
+def refuse_foreign_module(run, environment):
+    """Raise UnusableError if an environment would be imported from a folder of runs.
 
     Whoever made a folder of runs that somebody downloads has written their config.json, too.
     """
-    module, colon, _ = run.environment.rpartition(":")
+    module, colon, _ = environment.rpartition(":")
     first, *rest = module.split(".")
     folder, runs_dir = folders_of_runs(run)
     here, project = Path.cwd(), Path(__file__).resolve().parent
@@ -199,7 +229,7 @@ def refuse_foreign_module(run):
             beside = place.is_relative_to(runs_dir) and not is_own
             if beside or place.is_relative_to(folder) or folder.is_relative_to(top):
                 raise UnusableError(
-                    f"{run.environment} would be imported from {place}, in a folder "
+                    f"{environment} would be imported from {place}, in a folder "
                     "of runs; if you trust that module, move it to where your own ones are"
                 )
 
@@ -261,7 +291,8 @@ def draw(run, noises, rates, args):
 
 def record(run, noises, rates, args):
     """Play one episode into a video; return its result."""
-    name = f"{run.folder.name}__{noise_slug(noises, rates) or 'clean'}.mp4"
+    place = f"__{slug(run.elsewhere)}" if run.elsewhere else ""
+    name = f"{run.folder.name}__{noise_slug(noises, rates) or 'clean'}{place}.mp4"
     with tempfile.TemporaryDirectory(dir=args.video, prefix=".") as temporary:
         folder = Path(temporary, "video")  # a new one: RecordVideo warns of one that exists
         with load(run, "rgb_array") as (env, policy):
@@ -314,9 +345,9 @@ def play_all(play, tasks, args):
 
 
 def read_stored(run):
-    """Read robustness.csv: {(noise, noise rate): what play_episodes returns}.
+    """Read robustness.csv: {(noise, noise rate, environment): what play_episodes returns}.
 
-    Raises UnusableError.
+    The environment is empty for that of the training. Raises UnusableError.
     """
     path = run.folder / "robustness.csv"
     stored = {}
@@ -325,7 +356,8 @@ def read_stored(run):
         for row in csv.DictReader(text.splitlines()):
             told = (int(row["success"]),) if row.get("success") else ()
             result = (float(row["episodic_return"]), int(row["episodic_length"]), *told)
-            stored.setdefault((row["noise"], row["noise_rate"]), []).append(result)
+            key = row["noise"], row["noise_rate"], row.get("environment") or ""
+            stored.setdefault(key, []).append(result)
     except (OSError, ValueError, KeyError, TypeError, OverflowError, csv.Error) as error:
         text = f"robustness.csv: {in_words(error)}; delete that file to play everything again"
         raise UnusableError(text) from None
@@ -352,9 +384,13 @@ def write_stored(run, stored):
         with open(temporary, "w", encoding="utf-8") as file:
             writer = csv.writer(file, lineterminator="\n")
             told = any(len(result) > 2 for results in stored.values() for result in results)
-            writer.writerow([*ROBUSTNESS_COLUMNS, "success"] if told else ROBUSTNESS_COLUMNS)
-            for key, results in stored.items():
-                writer.writerows([*key, i, *result] for i, result in enumerate(results))
+            elsewhere = any(environment for _, _, environment in stored)
+            columns = [*ROBUSTNESS_COLUMNS, *["success"] * told, *["environment"] * elsewhere]
+            writer.writerow(columns)
+            for (*condition, environment), results in stored.items():
+                for i, result in enumerate(results):
+                    row = [*condition, i, *result, *[""] * (told and len(result) == 2)]
+                    writer.writerow([*row, *[environment] * elsewhere])
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(run.folder / "robustness.csv")
@@ -379,8 +415,10 @@ def print_table(runs, conditions, stored, episodes):
     trained = {}
     for run, name in zip(runs, names_of(runs), strict=True):
         noise = run.configuration.noise or "no noise"
-        config = (run.environment, name, noise, run.configuration.noise_rate)
-        trained.setdefault(config, []).append(stored[run])
+        where = where_tested(run.environment, run.elsewhere)
+        config = (where, name, noise, run.configuration.noise_rate)
+        at_hand = {key[:2]: value for key, value in stored[run].items() if key[2] == run.elsewhere}
+        trained.setdefault(config, []).append(at_hand)
     noises = dict.fromkeys(noise for noise, _ in conditions if noise)
     for tested_with in noises or [""]:
         columns = [key for key in conditions if key[0] in ("", tested_with)]
@@ -480,6 +518,12 @@ def main(args):
         if len({run.folder.name for run in runs}) < len(runs):
             fail("--video: two of these runs have the same name, and so would their videos")
         draw_without_display()
+    if args.env_id:
+        try:
+            env_id = canonical_env_id(args.env_id)
+        except ValueError as error:
+            fail(f"--env-id: {error}")
+        runs = [replace(run, elsewhere=env_id * (env_id != run.environment)) for run in runs]
     stored = check_runs(runs, conditions, bad, storing)
     runs = list(stored)
     tell(bad)
@@ -495,19 +539,23 @@ def main(args):
         print(f"--seed {args.seed} is not the default: everything is played, nothing is stored")
     todo = []
     for run, key in itertools.product(runs, conditions):
-        if len(stored[run].get(key, [])) < args.episodes:
+        if len(stored[run].get((*key, run.elsewhere), [])) < args.episodes:
             todo.append((run, key))
     tasks = [(run, *conditions[key]) for run, key in todo]
     for (run, key), results in zip(todo, play_all(play, tasks, args), strict=True):
-        stored[run][key] = results
+        stored[run][*key, run.elsewhere] = results
         if storing:
-            store(run, key, results)
+            store(run, (*key, run.elsewhere), results)
     print_table(runs, conditions, stored, args.episodes)
     return bool(bad)
 
 
 if __name__ == "__main__":
     take_over_terminal()
+    for word in sys.argv[1:]:
+        if word.partition("=")[0] in ("--noise", "--noise-rate"):
+            flag = word.partition("=")[0]
+            fail(f"{flag} is {flag}s here: every noise is tested at every rate")
     try:
         sys.exit(main(tyro.cli(Args, description=__doc__)))
     except KeyboardInterrupt:

@@ -558,8 +558,8 @@ class Run:
         if self.is_finished:
             with self._reading(result):
                 self.result = json.loads(result.read_text())
+                self._say_finished()
             self.checkpoint.unlink(missing_ok=True)
-            self._say_finished()
         else:
             noises = " + ".join(map("{} at {}".format, args.noise, args.noise_rate))
             begun = f"{algorithm} on {args.env_id} | noise: {noises or 'none (baseline)'}"

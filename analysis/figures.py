@@ -369,14 +369,15 @@ def robustness_curves(algorithm, noise, rows):
     return Drawing("robustness", f"curves {algorithm} {noise}", fig, caption)
 
 
-def write_figure(out, drawing):
-    """Write {name}.svg, and .pdf for LaTeX, without dates: equal figures are equal files.
+def write_figure(out, drawing, latex=False):
+    """Write {name}.svg, with `latex` also .pdf; without dates, so equal figures are equal files.
 
     A narrow figure is for the report only, so it is no .pdf.
     """
     fig = drawing.figure
     fig.savefig(out / f"{drawing.name}.svg", metadata={"Date": None})
-    fig.set_layout_engine("none")  # the layout is done
-    fig.savefig(out / f"{drawing.name}.pdf", metadata={"CreationDate": None})
+    if latex:
+        fig.set_layout_engine("none")  # the layout is done
+        fig.savefig(out / f"{drawing.name}.pdf", metadata={"CreationDate": None})
     if drawing.narrow:
         drawing.narrow.savefig(out / f"{drawing.narrow_name}.svg", metadata={"Date": None})

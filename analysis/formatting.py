@@ -180,20 +180,22 @@ def wrapped(text, width=0):
     return textwrap.fill(text, width, **style)
 
 
-def write_table(out, table):
-    """Write {name}.csv (all digits), .md and .tex (longtable, as people read them)."""
+def write_table(out, table, latex=False):
+    """Write {name}.csv, with all digits; with `latex` also .md and .tex, as people read it."""
     table.frame.to_csv(
         out / f"{table.name}.csv", index=False, float_format="%.10g", lineterminator="\n"
     )
+    if not latex:
+        return
     text = shown(table)
     cells = text.map(lambda cell: cell.replace("|", r"\|").replace("<", "&lt;"))
     markdown = tabulate(cells.values, text.columns, tablefmt="pipe", disable_numparse=True)
     note = f"\n{table.note}\n" if table.note else ""
     (out / f"{table.name}.md").write_text(f"{table.caption}\n\n{markdown}\n{note}", "utf-8")
-    latex = tabulate(text.values, text.columns, tablefmt="latex_longtable", disable_numparse=True)
+    lines = tabulate(text.values, text.columns, tablefmt="latex_longtable", disable_numparse=True)
     escaped = re.sub(r"([%&_#])", r"\\\1", table.caption)
     escaped = escaped.replace("|", r"\textbar{}").replace("\n", " ")
-    latex = latex.replace("\n", f"\n\\caption{{{escaped}}}\\\\\n", 1)
+    lines = lines.replace("\n", f"\n\\caption{{{escaped}}}\\\\\n", 1)
     for sign, command in (("\u00b1", r"$\pm$"), ("\u2013", "--"), (" < ", " $<$ ")):
-        latex = latex.replace(sign, command)
-    (out / f"{table.name}.tex").write_text(latex + "\n", "utf-8")
+        lines = lines.replace(sign, command)
+    (out / f"{table.name}.tex").write_text(lines + "\n", "utf-8")

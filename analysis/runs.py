@@ -34,6 +34,7 @@ from noisy_wrappers import BASELINE, Configuration
 
 STUDY = ["algorithm", "exp_name", "phase"]  # the columns that name a study: see study_name
 KEYS = [*STUDY, "environment", "noise", "noise_rate"]
+ELSEWHERE = ", tested in "
 SUCCESS = "success rate"  # what a Study may have in place of returns
 EVAL_COLUMNS = ["step", "episode", "episodic_return", "episodic_length"]
 RUN_COLUMNS = ["run", "status", "reason", *KEYS, "configuration", "seed", "total"]
@@ -54,6 +55,11 @@ def study_name(algorithm, exp_name="", phase=""):
 def script_name(algorithm):
     """Return the exp_name that a training script gives its runs by default."""
     return f"{algorithm.lower()}_continuous_noisy"
+
+
+def where_tested(environment, elsewhere):
+    """Name where runs were tested: in their own environment, or in another one."""
+    return f"{environment}{ELSEWHERE}{elsewhere}" if elsewhere else environment
 
 
 def rows_of(table, key):

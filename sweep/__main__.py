@@ -7,7 +7,7 @@ benchmark.sh calls this file from the project's folder:
     python -m sweep status FOLDER PRESET ...   a summary, the failed runs, the slowest running ones
     python -m sweep stopped FOLDER PRESET ...  a summary and the failed runs of a stopped sweep
     python -m sweep report FOLDER PRESET ...   a summary, and what did not finish: exit status 1
-    python -m sweep watch FOLDER PRESET ...    the summary on one line that is rewritten
+    python -m sweep watch FOLDER PRESET ...    the summary, again and again
 
 FOLDER is the one that benchmark.sh was called from: relative paths count from there.
 
@@ -171,13 +171,19 @@ def show_dry_run(sweep):
 
 
 def watch(sweep):
-    """Rewrite the summary every ten seconds, until benchmark.sh ends."""
-    parent = os.getppid()
+    """Show the summary until benchmark.sh ends: on a terminal one line that is rewritten.
+
+    Elsewhere lines follow each other, seldom enough for the log of a sweep that takes days.
+    """
+    parent, terminal = os.getppid(), sys.stderr.isatty()
+    pause = 10 if terminal or sweep.args.preset == "demo" else 600  # seconds
     while os.getppid() == parent:
-        width = shutil.get_terminal_size().columns - 1
         line = summary(sweep.runs, [judge(run, over=False) for run in sweep.runs])
-        print(f"\r{line[:width].ljust(width)}", end="", file=sys.stderr, flush=True)
-        time.sleep(10)
+        if terminal:
+            width = shutil.get_terminal_size().columns - 1
+            line = f"\r{line[:width].ljust(width)}"
+        print(line, end="" if terminal else "\n", file=sys.stderr, flush=True)
+        time.sleep(pause)
     return 0
 
 

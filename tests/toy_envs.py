@@ -202,7 +202,7 @@ class Talks(Count):
 
 
 class Solves(Count):
-    """Tells whether it is solved: in two of five episodes, or from the fifth on.
+    """Tells whether it is solved: in two of five episodes, or in the fifth and sixth.
 
     `only` tells it only where it is solved, as some do.
     """
@@ -216,7 +216,7 @@ class Solves(Count):
     def reset(self, **kwargs):
         observation, info = super().reset(**kwargs)
         self.resets += 1
-        self.solved = self.resets >= 5 if self.only else self.np_random.random() < 0.4
+        self.solved = self.resets in (5, 6) if self.only else self.np_random.random() < 0.4
         return observation, info
 
     def step(self, action):

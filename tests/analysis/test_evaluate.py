@@ -109,7 +109,7 @@ def streams(name, seed, position):
 @pytest.mark.parametrize("algorithm", SCRIPTS)
 def test_noisy_returns_are_those_of_a_loop_with_the_documented_seeds(runs, algorithm):
     run_dir = one(runs, algorithm)
-    main(Args((run_dir,), noise=(OBSERVATION, COMBINED), noise_rate=(0.5,), episodes=6))
+    main(Args((run_dir,), noises=(OBSERVATION, COMBINED), noise_rates=(0.5,), episodes=6))
     env = gym.make("InvertedPendulum-v5")
     policy = SCRIPTS[algorithm].load_policy(run_dir, env)
 
@@ -157,7 +157,7 @@ def test_the_time_limit_of_training_holds(runs):
 
 
 def test_what_is_stored_is_not_played_again(runs, monkeypatch, capsys):
-    args = Args((runs,), noise=(OBSERVATION,), noise_rate=(0.5, 1.0), episodes=4)
+    args = Args((runs,), noises=(OBSERVATION,), noise_rates=(0.5, 1.0), episodes=4)
     main(args)
     table, before = capsys.readouterr().out, files(runs)
     monkeypatch.setattr(evaluate, "play", None)
@@ -175,9 +175,9 @@ def test_what_is_stored_is_not_played_again(runs, monkeypatch, capsys):
 
 def test_more_episodes_replay_only_the_conditions_that_have_fewer(runs, monkeypatch):
     run_dir = one(runs, "PPO")
-    main(Args((run_dir,), noise=(OBSERVATION,), noise_rate=(0.5, 1.0), episodes=2))
+    main(Args((run_dir,), noises=(OBSERVATION,), noise_rates=(0.5, 1.0), episodes=2))
     first = stored(run_dir)
-    main(Args((run_dir,), noise=(OBSERVATION, ACTION), noise_rate=(0.5,), episodes=3))
+    main(Args((run_dir,), noises=(OBSERVATION, ACTION), noise_rates=(0.5,), episodes=3))
     again = stored(run_dir)
     counts = {}
     for row in again:
@@ -263,8 +263,8 @@ def test_the_longer_of_two_results_is_kept(runs):
     [finished], _ = evaluate.find_runs([one(runs, "PPO")])
     short, long = [(1.0, 1)], [(1.0, 1), (2.0, 2)]
     for results in (short, long, short):
-        evaluate.store(finished, ("", "0.0"), results)
-    assert evaluate.read_stored(finished) == {("", "0.0"): long}
+        evaluate.store(finished, ("", "0.0", ""), results)
+    assert evaluate.read_stored(finished) == {("", "0.0", ""): long}
 
 
 def test_training_again_deletes_nothing_of_a_write(runs, monkeypatch):
@@ -316,9 +316,9 @@ def test_the_table_of_known_returns(capsys):
     ]:
         # A third episode is stored and not asked for; the second number is the length.
         cells[a_run(noise, rate)] = {
-            ("", "0.0"): [(value, 1) for value in (*clean, 1000)],
-            ("A(1) + B(2)", "0.1 + 0.1"): [(value, 1) for value in (*noisy, 1000)],
-            ("C(3)", "0.5"): [(-value, 1) for value in (*noisy, 1000)],
+            ("", "0.0", ""): [(value, 1) for value in (*clean, 1000)],
+            ("A(1) + B(2)", "0.1 + 0.1", ""): [(value, 1) for value in (*noisy, 1000)],
+            ("C(3)", "0.5", ""): [(-value, 1) for value in (*noisy, 1000)],
         }
     conditions = [("", "0.0"), ("A(1) + B(2)", "0.1 + 0.1"), ("C(3)", "0.5")]
     evaluate.print_table(list(cells), conditions, cells, episodes=2)
@@ -375,7 +375,8 @@ def test_all_of_a_folder_with_logs_and_an_analysis(runs, capsys):
         means.append(
             np.mean([float(r["episodic_return"]) for r in rows if r["noise_rate"] == "0.5"])
         )
-    assert table[4][6] == f"{np.mean(means):.1f} ± {np.std(means, ddof=1):.1f}"
+    spread = np.std(means, ddof=1)
+    assert table[4][6] == f"{rounded(np.mean(means), spread)} ± {rounded(spread, spread)}"
     before = files(runs)
     main(Args((runs,), (OBSERVATION,), (0.5, 1.0), episodes=3))  # the folder stands for its runs
     assert capsys.readouterr().out == result.out
@@ -419,7 +420,7 @@ def test_videos(runs, tmp_path):
         assert len(video) == int(row["episodic_length"]) + 1  # the reset's, and one per step
         assert video.shape[1:] == (480, 480, 3)
         assert video[0].std() > 10 and np.abs(video[0].astype(int) - video[-1]).max() > 50
-    assert f"return {float(row['episodic_return']):.1f}, " in result.stdout
+    assert f"return {rounded(float(row['episodic_return']))}, " in result.stdout
 
 
 def test_videos_of_runs_of_one_name(runs, tmp_path, capsys):
@@ -609,13 +610,12 @@ def test_a_module_of_ones_own_is_imported(runs_dir, trained, tmp_path, monkeypat
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"noise": ("Nothing(1)",), "noise_rate": (1.0,)}, "unknown name"),
-        ({"noise": (ACTION,), "noise_rate": (1.5,)}, "1.5"),
-        ({"noise": (ACTION,), "noise_rate": ("x",)}, "'x'"),
-        ({"noise": (ACTION,), "noise_rate": ("1:0",)}, "constant rates"),
-        ({"noise": (ACTION,)}, "--noise-rate"),
-        ({"noise_rate": (1.0,)}, "--noise"),
-        ({"noise": (f"{OBSERVATION[:-4]}(1, 2))",), "noise_rate": (1.0,)}, "has 2 numbers"),
+        ({"noises": ("Nothing(1)",), "noise_rates": (1.0,)}, "unknown name"),
+        ({"noises": (ACTION,), "noise_rates": (1.5,)}, "1.5"),
+        ({"noises": (ACTION,), "noise_rates": ("x",)}, "'x'"),
+        ({"noises": (ACTION,), "noise_rates": ("1:0",)}, "constant rates"),
+        ({"env_id": "Nowhere-v0"}, "--env-id: there is no environment"),
+        ({"noises": (f"{OBSERVATION[:-4]}(1, 2))",), "noise_rates": (1.0,)}, "has 2 numbers"),
         ({"episodes": 0}, "--episodes must be at least 1, not 0"),
         ({"jobs": 0}, "--jobs"),
         ({"seed": -1}, "--seed"),
@@ -630,6 +630,33 @@ def test_a_module_of_ones_own_is_imported(runs_dir, trained, tmp_path, monkeypat
 )
 def test_bad_arguments(runs, capsys, options, message):
     refused(Args(**({"runs": (runs,)} | options)), message, runs, capsys)
+
+
+@pytest.mark.parametrize("flag", ["--noise", "--noise-rate"])
+def test_the_flags_of_earlier_versions_name_the_new_ones(flag):
+    command = [sys.executable, str(ROOT / "evaluate.py"), "runs", f"{flag}=1"]
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr == f"error: {flag} is {flag}s here: every noise is tested at every rate\n"
+
+
+def test_another_environment(runs, capsys):
+    """Its tests stand beside those at home, are not played again, and never mix with them."""
+    run_dir = one(runs, "PPO")
+    home = json.loads((run_dir / "config.json").read_text())["args"]["env_id"]
+    main(Args((run_dir,), (OBSERVATION,), episodes=2))
+    before = (run_dir / "robustness.csv").read_text()
+    gym.register("Heavy-v0", gym.spec(home).entry_point, max_episode_steps=7)
+    for _ in range(2):
+        main(Args((run_dir,), (OBSERVATION,), env_id="Heavy-v0", episodes=2))
+    rows = stored(run_dir)
+    assert [row["environment"] for row in rows] == 4 * [""] + 4 * ["Heavy-v0"]
+    at_home = [",".join(list(row.values())[:-1]) for row in rows[:4]]
+    assert at_home == before.splitlines()[1:]
+    assert all(int(row["episodic_length"]) <= 7 for row in rows[4:])
+    table = capsys.readouterr().out.splitlines()[-1]
+    assert f"{home}, tested in Heavy-v0" in table
+    refused(Args((run_dir,), env_id="Pendulum-v1"), "a policy needs the same", runs, capsys)
 
 
 def refused(args, message, runs, capsys):

@@ -102,6 +102,7 @@ def on_its_own(log, terminal=None, ignored=()):
     """Be a process that may have children, with a process group and perhaps a terminal."""
     multiprocessing.current_process()._config["daemon"] = False
     os.environ["HOSTILE_LOG"] = log
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whatever these tests are started below
     for number in ignored:
         signal.signal(number, signal.SIG_IGN)
     os.setsid()

@@ -357,6 +357,7 @@ def test_killed_by_somebody_else_at_a_random_time_compiled(tmp_path):
     # The networks, the batch and the precision of test_compiled_and_plain_updates_agree, so that
     # the compiler finds its own results.
     small = {"env_id": "toy_envs:Tiny-v0", "num_steps": 16, "matmul_precision": "highest"}
+    small |= {"max_episode_steps": 40}
     small |= {"total_timesteps": 1000, "eval_frequency": 250, "compile": True}
     words = options("ppo", tmp_path / "killed", **small)
     (tmp_path / "killed").mkdir()
