@@ -714,7 +714,8 @@ def test_names_of_folders(tmp_path, stub):
     runs = os.fsencode(tmp_path) + b"/caf\xe9 \x1b[31m"
     grid = [*GRID, "--total-timesteps", "400", "--runs-dir", os.fsdecode(runs)]
     result = run(*grid, env=stub, cwd=tmp_path, script=tmp_path / "bench")
-    assert result.code == 0 and not result.err.partition("to do\n")[2], result.out + result.err
+    assert result.code == 0, result.out + result.err
+    assert all(line.endswith("to do") for line in result.err.splitlines()), result.err
     assert "3 runs: 3 done" in result.out and "\x1b" not in result.out
     assert len([name for name in os.listdir(runs) if b"__" in name]) == 3
     again = run(*grid, env=stub, cwd=tmp_path, script=tmp_path / "bench")
