@@ -213,7 +213,7 @@ def show_report(sweep):
     progresses = show_progress(sweep, "not finished", over=True)
     unfinished = any(p.state != "done" for p in progresses)
     if unfinished:
-        check_disk(sweep.runs[0].folder.parent)
+        check_disk(sweep.runs[0].folder.parent / "logs")
     if sweep.choices:
         from sweep import choose
 

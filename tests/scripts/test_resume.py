@@ -726,7 +726,7 @@ def test_a_folder_of_another_configuration_is_refused_until_overwritten(
 def test_an_argument_that_an_older_version_did_not_have_is_no_difference(algorithm, stopped):
     words, path = stopped
     config = json.loads(path.with_name("config.json").read_text())
-    del config["args"]["max_episode_steps"]
+    del config["args"]["gamma"]
     path.with_name("config.json").write_text(json.dumps(config))
     assert train(algorithm, words)
     assert_finished(path.parent)
