@@ -177,13 +177,16 @@ def watch(sweep):
     """
     parent, terminal = os.getppid(), sys.stderr.isatty()
     pause = 10 if terminal or sweep.args.preset == "demo" else 600  # seconds
+    shown = -pause if terminal else time.monotonic()
     while os.getppid() == parent:
-        line = summary(sweep.runs, [judge(run, over=False) for run in sweep.runs])
-        if terminal:
-            width = shutil.get_terminal_size().columns - 1
-            line = f"\r{line[:width].ljust(width)}"
-        print(line, end="" if terminal else "\n", file=sys.stderr, flush=True)
-        time.sleep(pause)
+        if time.monotonic() - shown >= pause:
+            shown = time.monotonic()
+            line = summary(sweep.runs, [judge(run, over=False) for run in sweep.runs])
+            if terminal:
+                width = shutil.get_terminal_size().columns - 1
+                line = f"\r{line[:width].ljust(width)}"
+            print(line, end="" if terminal else "\n", file=sys.stderr, flush=True)
+        time.sleep(1)
     return 0
 
 
