@@ -214,7 +214,7 @@ def test_another_seed_plays_everything_and_stores_nothing(runs, capsys):
 @pytest.mark.slow
 def test_a_kill_leaves_whole_conditions_and_the_same_command_goes_on(runs):
     run_dir = one(runs, "PPO")
-    options = ["--noise", OBSERVATION, ACTION, "--noise-rate", "0.3", "0.6", "--episodes", "30"]
+    options = ["--noises", OBSERVATION, ACTION, "--noise-rates", "0.3", "0.6", "--episodes", "30"]
     process = commands.start(evaluate.__file__, [run_dir, *options])
     while not (run_dir / "robustness.csv").exists():
         assert process.is_alive()
@@ -246,7 +246,7 @@ def test_two_processes_on_one_run_lose_nothing(runs):
     noises = ("RandomNormalNoisyReward(1.0)", "RandomUniformNoisyReward(0.0, 1.0)")
     slow, processes = ("os.fsync", None, wait), []
     for noise, episodes in zip(noises, ("1", "2"), strict=True):
-        options = ["--noise", noise, "--noise-rate", *rates, "--episodes", episodes]
+        options = ["--noises", noise, "--noise-rates", *rates, "--episodes", episodes]
         processes.append(commands.start(evaluate.__file__, [run_dir, *options], slow))
     for process in processes:
         result = commands.ended(process)
@@ -359,7 +359,7 @@ def test_all_of_a_folder_with_logs_and_an_analysis(runs, capsys):
     (runs / "results").mkdir()
     (runs / "results" / "report.html").touch()
     (runs / "choice.csv").touch()
-    options = ["--noise", OBSERVATION, "--noise-rate", "0.5", "1.0", "--episodes", "3"]
+    options = ["--noises", OBSERVATION, "--noise-rates", "0.5", "1.0", "--episodes", "3"]
     result = commands.run(evaluate.__file__, [*sorted(runs.iterdir()), *options])
     assert (result.code, result.err) == (0, "")
     table = [re.split(r" {2,}", line) for line in result.out.splitlines()]
@@ -407,7 +407,7 @@ def test_an_environment_that_takes_no_arguments(tmp_path):
 def test_videos(runs, tmp_path):
     run_dir = one(runs, "PPO")
     before = files(runs)
-    options = ["--noise", ACTION, "--noise-rate", "1.0", "--video", tmp_path / "a" / "b"]
+    options = ["--noises", ACTION, "--noise-rates", "1.0", "--video", tmp_path / "a" / "b"]
     result = run(run_dir, *options, "--episodes", "9")
     assert (result.returncode, result.stderr) == (0, "")
     assert files(runs) == before

@@ -50,7 +50,7 @@ def test_files_are_utf_8_whatever_the_locale(tmp_path):
         for noise in ({}, {"noise": SCALE, "rate": 0.1}):
             write_run(tmp_path / "runs", [1.0, 2.0 + seed], seed=seed, exp_name=NAME, **noise)
     locale = {"LC_ALL": "POSIX", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-    command = [sys.executable, analyze.__file__, "--runs-dir", tmp_path / "runs"]
+    command = [sys.executable, analyze.__file__, "--runs-dir", tmp_path / "runs", "--latex"]
     done = subprocess.run(command, capture_output=True, env=os.environ | locale)
     assert (done.returncode, done.stderr) == (0, b"")
     assert b"na?ve" in done.stdout and b" ? " in done.stdout

@@ -255,7 +255,7 @@ def test_a_failing_and_a_killed_run(engine, tmp_path):
 
     sweep = start(*grid, *executor, env=env)
     wait_for((killed / "checkpoint.pt").exists, what="the first checkpoint")
-    os.kill(*processes("--noise", SCALE, tmp_path), signal.SIGKILL)
+    os.kill(*processes("--env-id", SCALE, tmp_path), signal.SIGKILL)
     out, err = sweep.communicate(timeout=PATIENCE)
     assert sweep.returncode == 1, err
     assert "3 runs: 1 done, 0 running, 2 failed, 0 to do" in out

@@ -124,7 +124,7 @@ def test_a_sweep_and_a_test_from_the_folder_of_the_noise(folder):
     [noisy] = folder.glob("runs/p0.5_s1_my_noises--StickyAction_3__*/result.json")
     assert 0 < json.loads(noisy.read_text())["noise_applied_fraction"]["StickyAction"] < 0.6
     assert len([*folder.glob("runs/*/result.json")]) == 2
-    test = ["--noise", TEXT, "--noise-rate", "1", "--episodes", "2"]
+    test = ["--noises", TEXT, "--noise-rates", "1", "--episodes", "2"]
     run(sys.executable, ROOT / "evaluate.py", "runs", *test)
     (folder / "my_noises.py").unlink()
     run(sys.executable, ROOT / "analyze.py")  # reads runs without their noise
