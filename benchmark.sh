@@ -229,7 +229,7 @@ run_todo() {
   set +m
   [ "$stopped" -eq 0 ] || "stop_$executor" &
   trap '' PIPE # whoever reads what this prints may leave first
-  "$PYTHON" -m sweep watch "$caller" "${grid[@]}" & watch=$!
+  WATCHED=$$ "$PYTHON" -m sweep watch "$caller" "${grid[@]}" & watch=$!
   while kill -0 -- "-$group" 2>/dev/null; do
     sleep 1 & wait $! || true # a trap interrupts wait, not sleep
   done

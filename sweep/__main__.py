@@ -175,7 +175,9 @@ def watch(sweep):
 
     Elsewhere lines follow each other, seldom enough for the log of a sweep that takes days.
     """
-    parent, terminal = os.getppid(), sys.stderr.isatty()
+    # benchmark.sh may be killed before this line: then another process is the parent already
+    parent = int(os.environ.get("WATCHED", os.getppid()))
+    terminal = sys.stderr.isatty()
     pause = 10 if terminal or sweep.args.preset == "demo" else 600  # seconds
     shown = -pause if terminal else time.monotonic()
     while os.getppid() == parent:
