@@ -221,8 +221,10 @@ def refuse_foreign_module(run, name):
     module, colon, _ = name.partition("(")[0].rpartition(":")
     first, *rest = module.strip().split(".")
     here, project = Path.cwd(), Path(__file__).resolve().parent
-    # where the import will look; this executes nothing
-    spec = PathFinder.find_spec(first, [str(here), *sys.path]) if colon else None
+    # the import looks in this order; asking executes nothing
+    others = [entry for entry in sys.path if entry not in (str(here), str(project))]
+    path = [*([str(here)] if here != project else []), *others, str(project)]
+    spec = PathFinder.find_spec(first, path) if colon else None
     folder, runs_dir = folders_of_runs(run)
     for found in (spec.submodule_search_locations or [spec.origin]) if spec else ():
         entry = Path(found).parent.resolve()

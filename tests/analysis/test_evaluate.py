@@ -622,6 +622,10 @@ def test_a_module_of_ones_own_is_imported(runs_dir, trained, tmp_path, monkeypat
     monkeypatch.setattr(sys, "path", sys.path[:])
     assert main(Args((run_dir,), episodes=1)) == 0
     assert len(stored(run_dir)) == 1
+    (run_dir / "evil.py").write_text("raise SystemExit('imported')")
+    (tmp_path / "link.py").symlink_to(run_dir / "evil.py")
+    other_environment(run_dir, "link:Mine-v0")
+    assert main(Args((run_dir,), episodes=1)) == 2
 
 
 @pytest.mark.parametrize(
