@@ -12,8 +12,8 @@ initial states. Returns are the environment's own, before noise on the reward. T
 robustness.csv in the run's folder, and what is stored there is not played again. That file has no
 column for the seed: with any --seed but the default, everything is played and nothing is stored.
 
-The module of a run's environment, as in my_envs:MyEnv-v0, is imported from your own path, never
-from a folder of runs. Runs that cannot be tested are listed; the exit status is 1 then.
+The module of an environment or of a noise, as in my_envs:MyEnv-v0, is imported from your own path,
+never from a folder of runs. Runs that cannot be tested are listed; the exit status is 1 then.
 """
 
 import csv
@@ -31,6 +31,7 @@ import traceback
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
+from importlib.machinery import PathFinder
 from pathlib import Path
 
 import numpy as np
@@ -212,26 +213,31 @@ def folders_of_runs(run):
     return folder, runs_dir.parent if runs_dir.name in PHASES else runs_dir
 
 
-def refuse_foreign_module(run, environment):
-    """Raise UnusableError if an environment would be imported from a folder of runs.
+def refuse_foreign_module(run, name):
+    """Raise UnusableError if an environment or a noise would be imported from a folder of runs.
 
-    Whoever made a folder of runs that somebody downloads has written their config.json, too.
+    Whoever made a folder of runs that somebody downloads chose its modules and their names, too.
     """
-    module, colon, _ = environment.rpartition(":")
-    first, *rest = module.split(".")
-    folder, runs_dir = folders_of_runs(run)
+    module, colon, _ = name.partition("(")[0].rpartition(":")
+    first, *rest = module.strip().split(".")
     here, project = Path.cwd(), Path(__file__).resolve().parent
-    for entry in {here, *map(Path, sys.path)} if colon else ():
-        entry = entry.resolve()
+    # the import looks in this order; asking executes nothing
+    others = [entry for entry in sys.path if entry not in (str(here), str(project))]
+    path = [*([str(here)] if here != project else []), *others, str(project)]
+    spec = PathFinder.find_spec(first, path) if colon else None
+    folder, runs_dir = folders_of_runs(run)
+    for found in (spec.submodule_search_locations or [spec.origin]) if spec else ():
+        entry = Path(found).parent.resolve()
+        top = Path(found).resolve()
+        place = Path(top, *rest).resolve()
+        # the project's folder may hold the runs, and packages that are on the module path
         is_own = entry.is_relative_to(runs_dir) and (entry != here or entry == project)
-        for top in [*entry.glob(first), *entry.glob(f"{first}.*")]:
-            top, place = top.resolve(), Path(top, *rest).resolve()
-            beside = place.is_relative_to(runs_dir) and not is_own
-            if beside or place.is_relative_to(folder) or folder.is_relative_to(top):
-                raise UnusableError(
-                    f"{environment} would be imported from {place}, in a folder "
-                    "of runs; if you trust that module, move it to where your own ones are"
-                )
+        beside = place.is_relative_to(runs_dir) and not is_own
+        if beside or place.is_relative_to(folder) or folder.is_relative_to(top):
+            raise UnusableError(
+                f"{name} would be imported from {place}, in a folder of runs; "
+                "if you trust that module, move it to where your own ones are"
+            )
 
 
 def check_runs(runs, conditions, bad, storing):
@@ -507,8 +513,14 @@ def main(args):
     if args.render and not works(DISPLAY):
         fail("--render needs a display; --video FOLDER makes videos without one")
     os.environ["OMP_NUM_THREADS"] = "1"  # before the scripts import PyTorch; processes inherit it
-    conditions = read_conditions(args)
     runs, bad = find_runs(args.runs)
+    named = [name for text in args.noises for name in split_noises(text)]
+    try:
+        for run, name in itertools.product(runs, [*named, args.env_id or ""]):
+            refuse_foreign_module(run, name)
+    except UnusableError as error:
+        fail(error)
+    conditions = read_conditions(args)
     here = Path.cwd()  # for what the module of my_envs:MyEnv-v0 imports
     if not any(here.is_relative_to(runs_dir) for run in runs for runs_dir in folders_of_runs(run)):
         sys.path.append(str(here))

@@ -7,7 +7,8 @@ The primary figure is the return under noise that was not in training, averaged 
 conditions. A condition counts if it is not clean, none of its wrappers was in training, and none is
 reward noise or early termination, which change no policy's behaviour in a test. It is compared with
 that of the policies trained without noise under the same conditions, by the test of all verdicts
-(statistics.compare), with Holm's correction over the training configurations of an algorithm.
+(statistics.compare), with Holm's correction over the training configurations of an algorithm; tests
+in another environment than the training's have a correction of their own.
 """
 
 from pathlib import Path
@@ -256,11 +257,20 @@ def stacked(samples):
     return table
 
 
+def tested_elsewhere(scores):
+    """Return the environment of each row's test where it is not the training's, else ""."""
+    names = [name.partition(ELSEWHERE)[2] for name in scores["environment"]]
+    return pd.Series(names, scores.index, dtype=object)
+
+
 def primary(scores):
-    """Return which rows of scores are primary: of all environments, or of the only one."""
+    """Return which rows of scores are primary: of all environments, or of the only one.
+
+    Tests in another environment are apart: they leave those at home as they are.
+    """
     of_all = (scores["scope"] == "all").astype(bool)
-    keys = [*STUDY, "noise", "noise_rate"]
-    return of_all | ~of_all.groupby([scores[name] for name in keys]).transform("any")
+    keys = [scores[name] for name in (*STUDY, "noise", "noise_rate")]
+    return of_all | ~of_all.groupby([*keys, tested_elsewhere(scores)]).transform("any")
 
 
 def robustness_tables(runs):
@@ -269,7 +279,9 @@ def robustness_tables(runs):
         return {}
     table = pd.DataFrame(condition_rows(runs), columns=COLUMNS)
     scores = pd.DataFrame(score_rows(runs), columns=SCORE_COLUMNS)
-    for _, family in scores[primary(scores) & scores["p"].notna()].groupby(STUDY):
+    judged = scores[primary(scores) & scores["p"].notna()]
+    keys = [judged[name] for name in STUDY]
+    for _, family in judged.groupby([*keys, tested_elsewhere(judged)]):
         scores.loc[family.index, "p_holm"] = holm(family["p"].to_numpy(float))
     return {
         name: Table(name, frame, CAPTIONS[name], "robustness", FORMATS, only_csv=ONLY_CSV[name])

@@ -593,6 +593,23 @@ def test_no_module_is_imported_from_a_folder_of_runs(place, trained, tmp_path, m
     assert "in a folder of runs; if you trust that module, move it" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("options", [{"noises": ("evil:Sticky(0.1)",)}, {"env_id": "evil:Mine-v0"}])
+def test_no_noise_is_imported_from_a_folder_of_runs(
+    options, trained, tmp_path, monkeypatch, capsys
+):
+    """Nor another environment; a noise in config.json is not imported at all."""
+    run_dir = tmp_path / "runs/run"
+    shutil.copytree(one(trained, "PPO"), run_dir)
+    (tmp_path / "runs/evil.py").write_text("raise SystemExit('imported')")
+    args = json.loads((run_dir / "config.json").read_text())["args"]
+    edit_config(run_dir, args=args | {"noise": ["evil:Sticky(0.1)"], "noise_rate": [0.5]})
+    monkeypatch.chdir(tmp_path / "runs")
+    monkeypatch.setattr(sys, "path", sys.path[:])
+    refused(Args((run_dir,), **options), "in a folder of runs; if you trust", run_dir, capsys)
+    assert main(Args((run_dir,), episodes=1)) == 0
+    assert "evil:Sticky(0.1)" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("runs_dir", [".", "runs"])
 def test_a_module_of_ones_own_is_imported(runs_dir, trained, tmp_path, monkeypatch):
     """Also where the runs lie in the folder of the project, which is on the module path."""
@@ -605,6 +622,10 @@ def test_a_module_of_ones_own_is_imported(runs_dir, trained, tmp_path, monkeypat
     monkeypatch.setattr(sys, "path", sys.path[:])
     assert main(Args((run_dir,), episodes=1)) == 0
     assert len(stored(run_dir)) == 1
+    (run_dir / "evil.py").write_text("raise SystemExit('imported')")
+    (tmp_path / "link.py").symlink_to(run_dir / "evil.py")
+    other_environment(run_dir, "link:Mine-v0")
+    assert main(Args((run_dir,), episodes=1)) == 2
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ import analysis.robustness
 import analysis.runs
 import analysis.statistics
 import analysis.tables
+from noisy_wrappers import Configuration
 
 SENSOR = "RandomNormalNoisyObservation(0.1)"
 PUSH = "RandomNormalNoisyAction(0.3)"
@@ -119,6 +120,48 @@ def test_score_and_conditions_by_hand(tmp_path, capsys):
     assert f"trained with {SENSOR} at rate 0.20: perhaps less robust" in text
     page = (tmp_path / "results/report.html").read_text()
     assert "Primary figure" in page and "at rate 1.00: perhaps more robust" in page
+
+
+@pytest.mark.parametrize(
+    ("noise", "counts"),
+    [
+        ("RandomDynamics(0.7, 0.7)", True),
+        ("RandomActionDelay(2)", True),
+        ("RandomDynamics(0.7, 0.7) + RandomActionDelay(2)", True),
+        (ENDING, False),
+        (REWARD, False),
+        (f"{ENDING} + RandomDynamics(0.7, 0.7)", False),
+        ("RandomDynamics(1.3, 1.3)", False),  # of the training's wrapper
+    ],
+)
+def test_physics_and_delays_count_and_what_changes_no_behaviour_does_not(noise, counts):
+    trained = "RandomDynamics(0.7, 1.3)" if "1.3" in noise else PUSH
+    rate = " + ".join(["1.0"] * (noise.count("+") + 1))
+    config = Configuration.parse(trained, "1.0")
+    condition = Configuration.parse(noise, rate)
+    assert analysis.robustness.is_unseen(condition, config) == counts
+
+
+def test_tests_elsewhere_never_mix_with_those_at_home(tmp_path):
+    """They are rows of their own, and change nothing of the others."""
+    write_tests(tmp_path / "runs", HOPPER, "Hopper-v5")
+    home = run(tmp_path)
+    for path in (tmp_path / "runs").glob("*/robustness.csv"):
+        header, *lines = path.read_text().splitlines()
+        there = [
+            ",0.0,0,0.5,7,Heavy-v0",
+            '"RandomNormalNoisyObservation(0.1)",0.2,0,0.5,7,Heavy-v0',
+        ]
+        lines = [f"{header},environment", *(f"{line}," for line in lines), *there]
+        path.write_text("\n".join(lines) + "\n")
+    both = run(tmp_path)
+    for name in ("robustness", "robustness_score"):
+        elsewhere = both[name]["environment"].str.contains("Heavy")
+        pd.testing.assert_frame_equal(both[name][~elsewhere].reset_index(drop=True), home[name])
+    rows = both["robustness"]
+    rows = rows[rows["environment"] == "Hopper-v5, tested in Heavy-v0"]
+    assert len(rows) == 2 * len(HOPPER) and set(rows["mean"]) == {0.5}
+    assert set(both["robustness_score"]["scope"]) == {"environment"}
 
 
 def test_environments_count_equally_and_the_test_is_stratified(tmp_path):
