@@ -101,11 +101,6 @@ def is_unseen(condition, config):
     return not condition.is_baseline and changes_behaviour and new
 
 
-def is_seen(condition, config):
-    """Tell whether a test condition consists of wrappers that were in training."""
-    return not condition.is_baseline and set(condition.wrappers) <= set(config.wrappers)
-
-
 def tested_on(condition, config):
     """Say in words how a test condition is related to the training configuration."""
     if condition == CLEAN:
@@ -145,21 +140,21 @@ def condition_rows(runs):
                 yield row
 
 
-def environment_scores(runs, config, counts):
+def environment_scores(runs, config):
     """Score a configuration and the baseline in one environment, or return None.
 
-    runs: those of one study and environment. counts(condition, config) tells which conditions
-    count. The result is a dict: `x` (seeds) and `y` (baseline seeds) are mean returns over the
-    conditions; in percent of the clean return C of the baseline, NaN where that has no percentages,
-    are `percent` (what a difference of 1 is), `scores`, `cvar_scores` (of the worst tenth of the
-    episodes) and `worst_scores` (under each condition), pairs of x and y, and `clean_change`.
+    runs: those of one study and environment. The result is a dict: `x` (seeds) and `y` (baseline
+    seeds) are mean returns over the conditions; in percent of the clean return C of the baseline,
+    NaN where that has no percentages, are `percent` (what a difference of 1 is), `scores`,
+    `cvar_scores` (of the worst tenth of the episodes) and `worst_scores` (under each condition),
+    pairs of x and y, and `clean_change`.
     """
     x, y = by_run(runs, config, "mean"), by_run(runs, BASELINE, "mean")
     if x.empty or y.empty or CLEAN not in x or CLEAN not in y:
         return None
     shared = x.columns.intersection(y.columns)
     whole = [c for c in shared if x[c].notna().all() and y[c].notna().all()]
-    conditions = [condition for condition in whole if counts(condition, config)]
+    conditions = [condition for condition in whole if is_unseen(condition, config)]
     if not conditions:
         return None
     clean, percent = y[CLEAN].mean(), percent_of(1.0, y[CLEAN].to_numpy())
@@ -179,18 +174,15 @@ def environment_scores(runs, config, counts):
     }
 
 
-def score_rows(runs, counts=is_unseen):
-    """Yield the score of every configuration with noise: over all environments, then in each.
-
-    counts(condition, config) tells whether a test condition counts for a training configuration.
-    """
+def score_rows(runs):
+    """Yield the score of every configuration with noise: over all environments, then in each."""
     for study, group in runs.groupby(STUDY):
         for config in sorted(set(group["configuration"])):
             if config == BASELINE:
                 continue
             scores = {}
             for environment, same in group.groupby("environment"):
-                found = environment_scores(same, config, counts)
+                found = environment_scores(same, config)
                 if found:
                     scores[environment] = found
             if len(scores) > 1:

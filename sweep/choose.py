@@ -15,7 +15,7 @@ from typing import NamedTuple
 from analysis.errors import fail
 from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED, read_run
 from analysis.statistics import detectable_shift, holm
-from noisy_wrappers import BASELINE, Configuration
+from noisy_wrappers import BASELINE, Configuration, rounded
 from sweep import halving
 from sweep.grid import NOISES, RATES, PlannedRun, cell, cells, make_run, result
 
@@ -235,7 +235,7 @@ def standing(found):
             yield f"  mean return after round {len(choice.state.rounds)}:"
             scores = choice.state.rounds[-1].scores
             for noise in sorted(choice.state.noises, key=scores.get, reverse=True):
-                yield f"  {scores[noise]:10.2f}  {noise}"
+                yield f"  {rounded(scores[noise]):>10}  {noise}"
     yield total(found)
 
 

@@ -160,18 +160,6 @@ def test_sentences_say_what_the_seeds_could_have_shown(tmp_path, capsys):
     assert "; 2 seeds against 4 cannot show any." in capsys.readouterr().out
 
 
-def test_the_score_on_noise_of_the_training(tmp_path):
-    write_tests(tmp_path, HOPPER, "Hopper-v5")
-    found, _ = analysis.robustness.read_robustness(tmp_path, analysis.runs.read_runs(tmp_path))
-    rows = analysis.robustness.score_rows(found, analysis.robustness.is_seen)
-    by_noise = {line["noise"]: line for line in rows}
-    assert by_noise[PUSH]["conditions"] == 1  # not both together: the sensor noise is new
-    assert by_noise[PUSH]["score_percent"] == pytest.approx(-5)
-    assert by_noise[PUSH]["baseline_score_percent"] == pytest.approx(62.5 - 100)
-    assert by_noise[SENSOR]["conditions"] == 2
-    assert by_noise[SENSOR]["score_percent"] == pytest.approx((5 - 30) / 2)
-
-
 def test_conditions_that_a_run_lacks_do_not_count(tmp_path):
     write_tests(tmp_path / "runs", HOPPER, "Hopper-v5")
     path = next((tmp_path / "runs").glob(f"*{PUSH}*__2")) / "robustness.csv"

@@ -15,7 +15,7 @@ import stub_run
 
 from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED
 from analysis.statistics import Comparison, holm
-from noisy_wrappers import BASELINE, Configuration
+from noisy_wrappers import BASELINE, Configuration, rounded
 from sweep import choose
 from sweep.halving import (
     advance,
@@ -543,8 +543,8 @@ def test_status_says_who_survives(tmp_path):
     assert list(choose.standing(choose.choices(args))) == [
         "PPO on Pendulum-v1, round 2 of 2: 2 of 3 noises, seeds 1 to 3; runs to do: 4",
         "  mean return after round 1:",
-        f"  {scores[best]:10.2f}  {best} at 1.0",
-        f"  {scores[second]:10.2f}  {second} at 1.0",
+        f"  {rounded(scores[best]):>10}  {best} at 1.0",
+        f"  {rounded(scores[second]):>10}  {second} at 1.0",
         # Twelve runs are left; each of the three has taken 36 seconds
         "15 runs in all, 7 to search and 8 to confirm; 3 are done, about 0.1 core-hours are left",
     ]
