@@ -8,29 +8,37 @@ report.html first.
 
 The unit of replication is the seed: a run's value at a step is the mean over its test episodes, and
 every mean, standard deviation (ddof=1) and interval is taken over runs. Only finished runs (those
-with a result.json) count; all others are listed. The paper is Khraishi and Okhrati (2023),
+with a result.json) count; all others are listed, and the exit status is 1 if one is damaged. The
+paper is Khraishi and Okhrati (2023),
 https://arxiv.org/abs/2305.02882; IQM and probability of improvement are those of Agarwal et al.
 (2021), https://arxiv.org/abs/2108.13264.
 """
 
-import os
 import shutil
 import subprocess
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
-from analysis.errors import fail
-from analysis.figures import figures, write_figure
-from analysis.formatting import text_table, wrapped, write_table
+from analysis.errors import fail, take_over_terminal
+from analysis.figures import figures, reword, write_figure
+from analysis.folders import is_run
+from analysis.formatting import in_metric, text_table, wrapped, write_table
 from analysis.paper import read_paper
 from analysis.report import write_report
 from analysis.robustness import read_robustness, robustness_sentences, robustness_tables
-from analysis.runs import left_out, make_studies, read_choice, read_runs
-from analysis.tables import family_notes, make_tables, table_of
-from analysis.verdicts import clear_first, headlines, sentences, tally
+from analysis.runs import SUCCESS, left_out, make_studies, read_choice, read_runs
+from analysis.tables import (
+    family_notes,
+    make_tables,
+    success_table,
+    table_of,
+    unlearned_notes,
+)
+from analysis.verdicts import POINTS, clear_first, headlines, sentences, tally
 
 # Columns that a terminal may have room for, the most important ones first
 BEST_IN_SHORT = ["algorithm, environment", "noise", "noise_rate", "difference", "p_adjusted", "n"]
@@ -49,6 +57,10 @@ class Args:
     """where the tables, the figures and report.html go; by default RUNS_DIR/results"""
     compare: Path | None = None
     """a folder with the paper's tables as csv (results/paper): adds compare_* tables"""
+    latex: bool = False
+    """also write the tables as Markdown and LaTeX, and the figures as pdf"""
+    metric: Literal["return", "success_rate"] = "return"
+    """what the verdicts judge by: final test returns, or rates of success in percent"""
 
 
 def output_folder(args):
@@ -71,7 +83,7 @@ def output_folder(args):
 def no_finished_run(runs_dir):
     """End with an error that says where there are finished runs, if that is below `runs_dir`."""
     paths = [*runs_dir.glob("*/*/result.json"), *runs_dir.glob("*/*/*/result.json")]
-    folders = sorted({path.parent.parent for path in paths})
+    folders = sorted({path.parent.parent for path in paths if is_run(path.parent)})
     if not folders:
         fail(f"no finished run in {runs_dir}")
     found = ", ".join(str(folder) for folder in folders)
@@ -106,15 +118,25 @@ def overview_of(runs, studies):
     return " ".join(parts)
 
 
-def write_results(out, verdicts, tables, studies, overview, problems, notes):
-    """Write all tables, all figures and the report."""
+def write_results(out, latex, verdicts, tables, studies, overview, problems, notes):
+    """Write all tables, all figures and the report; return the names of tables and figures."""
     out.mkdir(parents=True, exist_ok=True)
     for table in tables.values():
-        write_table(out, table)
+        write_table(out, table, latex)
     drawn = list(figures(studies, tables))
+    names = {*tables}
     for drawing in drawn:
-        write_figure(out, drawing)
+        if drawing.kind != "robustness":  # which is about returns
+            reword(drawing, studies[0].metric)
+        write_figure(out, drawing, latex)
+        names |= {drawing.name, drawing.narrow_name}
     write_report(out, verdicts, tables, drawn, overview, problems, notes)
+    return names
+
+
+def left_by_others(out, names):
+    """Return the tables and figures in `out` that this analysis, with its names, did not write."""
+    return sorted({path.stem for path in [*out.glob("*.csv"), *out.glob("*.svg")]} - names)
 
 
 def terminal_width():
@@ -153,7 +175,12 @@ def print_results(out, verdicts, tables, overview, problems, notes):
 
 
 def main(args):
-    """Read the runs, write tables, figures and report, and print verdicts and main table."""
+    """Read the runs, write tables, figures and report, and print verdicts and main table.
+
+    Return the exit status: 1 where a run's files are damaged.
+    """
+    paths = {name: getattr(args, name) for name in ("runs_dir", "out", "compare")}
+    args = replace(args, **{name: path and path.expanduser() for name, path in paths.items()})
     if not args.runs_dir.is_dir():
         fail(f"no folder {args.runs_dir}")
     try:
@@ -166,33 +193,41 @@ def main(args):
     missing, number = left_out(runs)
     counts = ", ".join(f"{n} {status}" for status, n in number.items())
     problems = f"Runs left out: {sum(number.values())} ({counts})." if number else ""
-    studies, notes = make_studies(runs)
+    metric = args.metric.replace("_", " ")
+    studies, notes = make_studies(runs, metric)
+    if not studies and make_studies(runs)[0]:
+        fail("--metric success_rate: no environment here tells it, in `is_success` or `success`")
     if not studies:
         if len(missing):
             print_left_out(table_of("missing", missing), terminal_width())
         no_finished_run(args.runs_dir)
     robustness, unreadable = read_robustness(args.runs_dir, runs)
     notes += unreadable
-    tables = make_tables(studies, paper) | robustness_tables(robustness)
+    tables = {
+        name: replace(table, caption=in_metric(table.caption, metric))
+        for name, table in make_tables(studies, paper).items()
+    }
+    if metric != SUCCESS:
+        tables |= success_table(make_studies(runs, SUCCESS)[0])
+    tables |= robustness_tables(robustness)
     tables["missing"] = table_of("missing", missing)
     if choice is not None:
         tables["choice"] = table_of("choice", choice)
-    verdicts = sentences(tables["statistics"].frame)
-    notes = family_notes(tables["statistics"].frame) + notes
+    unit = POINTS if metric == SUCCESS else ""
+    verdicts = sentences(tables["statistics"].frame, unit)
+    notes = unlearned_notes(studies) + family_notes(tables["statistics"].frame) + notes
     overview = overview_of(runs, studies)
     try:
-        write_results(out, verdicts, tables, studies, overview, problems, notes)
+        names = write_results(out, args.latex, verdicts, tables, studies, overview, problems, notes)
     except OSError as error:
         fail(f"--out: {error}")
-    old = sorted(path.name for path in out.glob("*.csv") if path.stem not in tables)
+    old = left_by_others(out, names)
     if old:
-        notes.append(f"{out} also holds an earlier analysis, not renewed: {', '.join(old)}")
+        notes.append(f"{out} also holds files that this analysis did not write: {', '.join(old)}")
     print_results(out, verdicts, tables, overview, problems, notes)
+    return int(number["corrupt"] > 0)
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args, description=__doc__))
-        sys.stdout.flush()
-    except BrokenPipeError:  # `| head` has read enough; all files are written
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    take_over_terminal()
+    sys.exit(main(tyro.cli(Args, description=__doc__)))

@@ -40,15 +40,18 @@ Grid options replace a preset's values
              runs/demo)
 
 Options of choose
-  --noises paper           the paper's 15 noises at 6 rates: 318 runs. The default is 8 noises at
-                           rates 0.05 and 1.0, in 96 runs (docs/sweeps.md lists them). Both confirm
+  --noises paper           the paper's 15 noises at 6 rates: 318 runs. The default is 10 noises at
+                           rates 0.05 and 1.0, in 105 runs (docs/sweeps.md lists them). Both confirm
                            a true gain of 1.5 standard deviations in 9 of 10 cases
   --exclude "NOISE@RATE"   noises to leave out, for example because they always fail
   --budget N               about how many runs the search may take (default: 3 for each noise)
   --confirm N              fresh seeds for the final comparison (default: 25)
+  --metric success_rate    choose by the rate of success (default: return), where the info of an
+                           episode's last step has is_success or success
 
 Executor options
-  --dry-run             print the commands of the remaining runs and start nothing
+  --dry-run             print the commands of the remaining runs, and what they cost: for that, the
+                        environments are timed; start nothing
   --executor local      (default) runs side by side on this machine
   --executor parallel   GNU parallel, on this machine or over ssh
   --executor slurm      job arrays; submits and returns
@@ -82,7 +85,7 @@ END
 fail() { echo "error: $*" >&2 || true; exit 2; }
 
 caller=$(pwd -P)
-cd "$(dirname "${BASH_SOURCE[0]}")"
+cd "$(dirname -- "$(readlink -f -- "${BASH_SOURCE[0]}")")" # it may be called through a link
 . sweep/executors.sh
 case ${1:-} in # how the executors call this script: run-one SWEEP FOLDER COMMAND
   run-one) # on a machine whose connection may break: the run must outlive its reader
@@ -104,7 +107,7 @@ while [ $# -gt 0 ]; do
       option=${1#--}
       printf -v "${option//-/_}" %s "$2"
       shift 2 ;;
-    --dry-run) dry_run=1 && shift ;;
+    --dry-run) dry_run=dry-run && shift ;;
     --wait) wait=1 && shift ;;
     -h | --help) usage || true; exit ;;
     --) grid+=("$@") && break ;;
@@ -133,17 +136,22 @@ print(*[name for name in sys.argv[1:] if not u.find_spec(name)], sep=', ')" \
 [ -z "$lacking" ] ||
   fail "'$PYTHON' lacks $lacking: set PYTHON, or install requirements.txt into .venv"
 
-show() { "$PYTHON" -m sweep "$1" "$caller" ${grid[@]+"${grid[@]}"}; }
+show() {
+  SWEEP_EXECUTOR=$executor SWEEP_JOBS=$jobs SWEEP_HOSTS=$sshlogin OMP_NUM_THREADS=1 \
+    "$PYTHON" -m sweep "$1" "$caller" ${grid[@]+"${grid[@]}"}
+}
 if [ $view = status ]; then
   show status
   exit
 fi
 
-list_todo() { # sets `lines`, all runs; and `todo`, those that are to do and were not yet tried
-  lines=$(show list) || exit $?
-  todo=$(awk -F'\t' -v OFS='\t' '$2 == "todo" {print $1, $3}' <<<"$lines" |
-    grep -vxFf <(printf '%s\n' "$tried") || true)
-  count=$(grep -c . <<<"$todo" || true)
+# sets `lines`, all runs; and `todo`, those that are to do and were not yet tried. LC_ALL=C: folders
+# may have names that are not UTF-8
+list_todo() {
+  lines=$(show "${dry_run:-list}") || exit $?
+  todo=$(LC_ALL=C awk -F'\t' -v OFS='\t' '$2 == "todo" {print $1, $3}' <<<"$lines" |
+    LC_ALL=C grep -vxFf <(printf '%s\n' "$tried") || true)
+  count=$(LC_ALL=C grep -c . <<<"$todo" || true)
 }
 tried=''
 list_todo
@@ -170,7 +178,16 @@ fi
 
 sweep=$HOSTNAME-$$-$(date +%Y%m%d%H%M%S)
 logs=${first%/*}/logs list=${first%/*}/logs/lines-$sweep.tsv
-mkdir -p "$logs" || fail "--runs-dir: cannot write to ${first%/*}"
+
+write_list() { # the runs to do, for the executor; and the folders of their logs
+  local folders reason
+  mapfile -t folders < <(cut -f1 <<<"$todo" | LC_ALL=C sed 's,/[^/]*$,/logs,' | LC_ALL=C sort -u)
+  reason=$( (mkdir -p "${folders[@]}" && printf '%s\n' "$todo" >"$list") 2>&1) ||
+    fail "--runs-dir: cannot write to $logs: ${reason##*: }"
+}
+trap 'rm -f "$list"' EXIT
+write_list
+locks_work "$list" || fail "--runs-dir: $(no_locks "$logs")"
 
 # Were this command killed, the executor would start run after run: the guard stops it then
 guard() { # a killed command may stay as a zombie: it is dead when the guard has another parent
@@ -195,9 +212,10 @@ stop() { # EXIT_STATUS
 # The executor and its guard have process groups of their own, so that one signal to the executor's
 # reaches every run once.
 run_todo() {
-  local guard watch=''
-  printf '%s\n' "$todo" >"$list"
+  local guard watch
+  write_list
   if [ "$executor" = slurm ]; then
+    trap - EXIT # its tasks read the list later
     submit
     [ -n "$wait" ] || exit "$stopped"
     [ "${#ids[@]}" -gt 0 ] || return 0 # stopped before the first array
@@ -211,18 +229,17 @@ run_todo() {
   set +m
   [ "$stopped" -eq 0 ] || "stop_$executor" &
   trap '' PIPE # whoever reads what this prints may leave first
-  [ ! -t 2 ] || { "$PYTHON" -m sweep watch "$caller" "${grid[@]}" & watch=$!; }
+  "$PYTHON" -m sweep watch "$caller" "${grid[@]}" & watch=$!
   while kill -0 -- "-$group" 2>/dev/null; do
     sleep 1 & wait $! || true # a trap interrupts wait, not sleep
   done
   kill -- "-$guard" || true
-  [ -z "$watch" ] || { kill "$watch" && echo >&2; }
+  kill "$watch" && { [ ! -t 2 ] || echo >&2; } || true
   group='' ids=()
   tried+=$'\n'$todo
 }
 
 if [ "$executor" != slurm ]; then
-  trap 'rm -f "$list"' EXIT
   [ -z "$sshlogin" ] || parallel "${parallel_options[@]}" --nonall --tag \
     "$PYTHON" -c "'import mujoco, torch, tyro, noisy_wrappers'" "&&" test -x benchmark.sh >&2 ||
     fail "a machine of --sshlogin cannot run the project in ${remote_dir:-$PWD} with $PYTHON"

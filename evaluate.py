@@ -1,6 +1,8 @@
 """Test trained policies again: clean and under noise, in a window, or as a video.
 
-    python evaluate.py runs/*Hopper-v5* --noise "RandomNormalNoisyAction(0.2)" --noise-rate 0.5 1
+    python evaluate.py runs/*Hopper-v5* --noises "RandomNormalNoisyAction(0.2)" --noise-rates 0.5 1
+    python evaluate.py runs/*Hopper-v5* --noises "RandomDynamics(0.7, 0.7)" "RandomActionDelay(2)"
+    python evaluate.py runs/*my_envs* --env-id my_envs:MyHeavyEnv-v0
     python evaluate.py runs/baseline_s1__Hopper-v5__sac_continuous_noisy --render
     python evaluate.py runs --video videos
 
@@ -9,13 +11,16 @@ reset(seed = --seed + i), which also seeds the noise: all policies and condition
 initial states. Returns are the environment's own, before noise on the reward. They are stored in
 robustness.csv in the run's folder, and what is stored there is not played again. That file has no
 column for the seed: with any --seed but the default, everything is played and nothing is stored.
+
+The module of a run's environment, as in my_envs:MyEnv-v0, is imported from your own path, never
+from a folder of runs. Runs that cannot be tested are listed; the exit status is 1 then.
 """
 
 import csv
 import fcntl
 import importlib
 import itertools
-import json
+import math
 import multiprocessing
 import os
 import signal
@@ -24,25 +29,34 @@ import sys
 import tempfile
 import traceback
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import closing
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
 import tyro
 from gymnasium.wrappers import RecordVideo
 from tabulate import tabulate
 from tqdm import tqdm
 
-from analysis.errors import fail
-from analysis.runs import (
-    ROBUSTNESS_COLUMNS,
-    differing_settings,
+from analysis.errors import fail, in_words, take_over_terminal
+from analysis.folders import (
+    PHASES,
+    DamageError,
+    difference,
+    has_begun,
     is_run,
     read_config,
+    read_result,
+    runs_of,
+)
+from analysis.formatting import slug
+from analysis.runs import (
+    ROBUSTNESS_COLUMNS,
+    script_name,
     study_name,
+    usual_settings,
+    where_tested,
 )
 from noisy_wrappers import (
     BASELINE,
@@ -51,7 +65,10 @@ from noisy_wrappers import (
     canonical_env_id,
     make_noisy,
     noise_slug,
+    outcome,
     rounded,
+    seed_globals,
+    seeded_globals,
     split_noises,
 )
 
@@ -64,10 +81,12 @@ class Args:
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
     """folders of finished runs, or folders that hold such folders"""
-    noise: tuple[str, ...] = ()
+    noises: tuple[str, ...] = ()
     """noises to test under; "A(..)+B(..)" combines two"""
-    noise_rate: tuple[float | str, ...] = ()
+    noise_rates: tuple[float | str, ...] = (1.0,)
     """noise rates; every noise is tested at every rate"""
+    env_id: str | None = None
+    """another environment to test in, with the same spaces; by default that of the training"""
     episodes: int = 100
     """test episodes per policy and condition"""
     seed: int = 2_000_000
@@ -80,53 +99,54 @@ class Args:
     """write a video of one episode of each condition into this folder and store nothing else"""
 
 
-class FinishedRun(NamedTuple):
-    """A finished run, as analysis.runs.read_config reads and names it."""
+@dataclass(frozen=True, eq=False)
+class FinishedRun:
+    """A finished run, as analysis.folders.read_config reads it."""
 
     folder: Path
     algorithm: str
+    exp_name: str
     environment: str
-    noise: str
-    noise_rate: str
-    arguments: str  # the others, as JSON
+    configuration: Configuration
+    settings: dict  # the other arguments
+    elsewhere: str = ""  # another environment to be tested in
+
+    @property
+    def tested_in(self):
+        """The environment that the policy plays in."""
+        return self.elsewhere or self.environment
 
 
-def reason(error):
-    """Return an exception's text as one line."""
-    return " ".join(str(error).split()) or type(error).__name__
+class UnusableError(Exception):
+    """A run cannot be tested; the text says why."""
 
 
 def find_runs(paths):
-    """Return the runs that the paths name, each once; a folder stands for its finished runs."""
+    """Return the finished runs that the paths name, each once; a folder stands for its runs.
+
+    Also return {run folder: what is damaged in it}, and print how many runs are not finished.
+    """
     if not paths:
         fail("name the runs to test, for example: python evaluate.py runs/*Hopper-v5*")
-    folders = []
-    for path in paths:
-        children = sorted(filter(is_run, path.iterdir())) if path.is_dir() else []
-        if children:
-            finished = [child for child in children if (child / "result.json").exists()]
-            if len(finished) < len(children):
-                print(f"{path}: unfinished runs are left out ({len(children) - len(finished)})")
-            folders += finished
-        elif is_run(path):
-            folders.append(path)
-        elif path.name not in ("logs", "choice.csv") and not (path / "report.html").exists():
-            # What is skipped is written by benchmark.sh and by analyze.py.
+    folders = {}
+    for path in map(Path.expanduser, paths):
+        found = [path] if is_run(path) else runs_of(path)
+        if not os.path.lexists(path) or (len(paths) == 1 and not found):
             fail(f"{path} is neither a run nor a folder of runs")
-    if not folders:
-        fail(f"there is no finished run in {', '.join(map(str, paths))}")
-    return [read_finished(folder) for folder in dict.fromkeys(map(Path.absolute, folders))]
-
-
-def read_finished(folder):
-    """Read what a finished run's config.json says."""
-    if not (folder / "result.json").exists():
-        fail(f"{folder} is not finished: run the command that started it again")
-    try:
-        config = read_config(folder)
-        return FinishedRun(folder, *(config[name] for name in FinishedRun._fields[1:]))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        fail(f"cannot read {folder / 'config.json'}: {type(error).__name__}: {reason(error)}")
+        folders |= dict.fromkeys(map(Path.absolute, found))
+    runs, damaged = [], {}
+    for folder in folders:
+        try:
+            config = read_config(folder) if has_begun(folder) else None
+            if config and read_result(folder, config):
+                names = [field.name for field in fields(FinishedRun)][1:-1]
+                runs.append(FinishedRun(folder, *(config[name] for name in names)))
+        except DamageError as error:
+            damaged[folder] = str(error)
+    unfinished = len(folders) - len(runs) - len(damaged)
+    if unfinished:
+        print(f"unfinished runs are left out: {unfinished}")
+    return runs, damaged
 
 
 def read_conditions(args):
@@ -134,93 +154,175 @@ def read_conditions(args):
 
     That is {(noise, noise rate) as in robustness.csv: (noises, noise rates)}.
     """
-    if bool(args.noise) != bool(args.noise_rate):
-        fail("--noise and --noise-rate go together: every noise is tested at every rate")
     conditions = {BASELINE.columns: BASELINE.texts}
-    for noise, rate in itertools.product(args.noise, args.noise_rate):
+    for noise, rate in itertools.product(args.noises, args.noise_rates):
         try:
             configuration = Configuration.read(split_noises(noise), [rate])
         except ValueError as error:
             fail(error)
         if any(start != end for start, end in configuration.rates):
-            fail(f"--noise-rate {rate}: policies are tested at constant rates")
+            fail(f"--noise-rates {rate}: policies are tested at constant rates")
         conditions.setdefault(configuration.columns, configuration.texts)  # a rate of 0 is clean
     return conditions
 
 
+@contextmanager
 def load(run, render_mode=None):
-    """Return a run's clean environment and its policy, NumPy to NumPy."""
-    name = f"{run.algorithm}_continuous_noisy".lower()
-    try:
-        script = importlib.import_module(name)
-    except ImportError as error:
-        fail(f"{run.folder}: cannot import {name}: {error}")
-    try:
-        canonical_env_id(run.environment)  # imports its module
-    except ValueError as error:
-        fail(error)
-    steps = json.loads(run.arguments).get("max_episode_steps")
-    drawn = {"render_mode": render_mode} if render_mode else {}  # not every class takes it
-    env = script.make_env(run.environment, max_episode_steps=steps, **drawn)
-    try:
-        return env, script.load_policy(run.folder, env)
-    except Exception as error:  # a damaged file may raise anything
-        fail(f"{run.folder / 'policy.pt'} is not a policy for {run.environment}: {reason(error)}")
+    """Yield a run's clean environment, closed at the end, and its policy, NumPy to NumPy.
 
-
-def check_environment(run, conditions):
-    """Exit unless the policy fits its environment and every noise can act on it."""
-    env, _ = load(run)
-    for noises, rates in conditions.values():
+    Raises UnusableError.
+    """
+    script = importlib.import_module(script_name(run.algorithm))
+    for environment in {run.environment, run.tested_in}:
+        refuse_foreign_module(run, environment)
         try:
-            make_noisy(env, noises, rates)
+            canonical_env_id(environment)  # imports its module
         except ValueError as error:
-            fail(f"{run.folder}: {error}")
-    env.close()
+            raise UnusableError(error) from None
+    steps = run.settings.get("max_episode_steps")
+    drawn = {"render_mode": render_mode} if render_mode else {}  # not every class takes it
+    seed_globals(Args.seed)  # as every episode does: the constructor may draw, too
+    with script.make_env(run.tested_in, max_episode_steps=steps, **drawn) as env:
+        if run.elsewhere:
+            with script.make_env(run.environment, max_episode_steps=steps) as trained_in:
+                check_spaces(run, trained_in, env)
+        try:
+            policy = script.load_policy(run.folder, env)
+        except Exception as error:  # a damaged file may raise anything
+            reason = f"policy.pt is not a policy for {run.tested_in}: {in_words(error)}"
+            raise UnusableError(reason) from None
+        yield env, policy
+
+
+def check_spaces(run, trained_in, env):
+    """Raise UnusableError unless both environments have the same spaces."""
+    for name in ("observation_space", "action_space"):
+        here, there = getattr(trained_in, name), getattr(env, name)
+        if here != there:
+            raise UnusableError(
+                f"--env-id {run.elsewhere}: its {name} is {there}, that of {run.environment} is "
+                f"{here}; a policy needs the same"
+            )
+
+
+def folders_of_runs(run):
+    """Return a run's own folder, and the one of all runs beside it."""
+    folder = run.folder.resolve()
+    runs_dir = folder.parent
+    return folder, runs_dir.parent if runs_dir.name in PHASES else runs_dir
+
+
+def refuse_foreign_module(run, environment):
+    """Raise UnusableError if an environment would be imported from a folder of runs.
+
+    Whoever made a folder of runs that somebody downloads has written their config.json, too.
+    """
+    module, colon, _ = environment.rpartition(":")
+    first, *rest = module.split(".")
+    folder, runs_dir = folders_of_runs(run)
+    here, project = Path.cwd(), Path(__file__).resolve().parent
+    for entry in {here, *map(Path, sys.path)} if colon else ():
+        entry = entry.resolve()
+        is_own = entry.is_relative_to(runs_dir) and (entry != here or entry == project)
+        for top in [*entry.glob(first), *entry.glob(f"{first}.*")]:
+            top, place = top.resolve(), Path(top, *rest).resolve()
+            beside = place.is_relative_to(runs_dir) and not is_own
+            if beside or place.is_relative_to(folder) or folder.is_relative_to(top):
+                raise UnusableError(
+                    f"{environment} would be imported from {place}, in a folder "
+                    "of runs; if you trust that module, move it to where your own ones are"
+                )
+
+
+def check_runs(runs, conditions, bad, storing):
+    """Return {run: what is stored of it} of the runs that can be tested.
+
+    Add the others to `bad`, {run folder: why}.
+
+    The policy must fit its environment, and every noise must be able to act on it.
+    """
+    stored = {}
+    for run in runs:
+        try:
+            with load(run) as (env, _):
+                for noises, rates in conditions.values():
+                    make_noisy(env, noises, rates)
+            stored[run] = read_stored(run) if storing else {}
+        except (UnusableError, ValueError) as error:
+            bad[run.folder] = str(error)
+        except Exception as error:  # of the user's environment
+            bad[run.folder] = with_place(error)
+    return stored
+
+
+def tell(bad):
+    """Print each reason why runs cannot be tested, with the first of them; bad: see check_runs."""
+    folders = {}
+    for folder, reason in bad.items():
+        folders.setdefault(reason, []).append(folder)
+    for reason, (first, *others) in folders.items():
+        more = f" and {len(others)} more" if others else ""
+        print(f"error: {first}{more}: {reason}", file=sys.stderr)
+
+
+def with_place(error):
+    """Return an exception as one line that says where it was raised."""
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{in_words(error)} ({place.filename}, line {place.lineno})"
 
 
 def play(run, noises, rates, args):
-    """Play episodes; return their true returns and lengths, [(return, length), ...]."""
-    env, policy = load(run)
-    return play_episodes(make_noisy(env, noises, rates), policy, args.episodes, args.seed)
+    """Play episodes; return what play_episodes does."""
+    with load(run) as (env, policy):
+        return play_episodes(make_noisy(env, noises, rates), policy, args.episodes, args.seed)
 
 
 def draw(run, noises, rates, args):
-    """Play an episode in a window or into a video: (return, length), or in words why it cannot."""
+    """Play an episode in a window or into a video: its result, or in words why it cannot."""
     try:
         if args.video:
             return record(run, noises, rates, args)
-        env, policy = load(run, "human")
-        [result] = play_episodes(make_noisy(env, noises, rates), policy, 1, args.seed)
-        return result
+        with load(run, "human") as (env, policy):
+            [result] = play_episodes(make_noisy(env, noises, rates), policy, 1, args.seed)
+            return result
     except Exception as error:  # of any library that draws, or of the environment
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        return f"{type(error).__name__}: {reason(error)} ({place.filename}, line {place.lineno})"
+        return with_place(error)
 
 
 def record(run, noises, rates, args):
-    """Play one episode into a video; return (return, length)."""
-    name = f"{run.folder.name}__{noise_slug(noises, rates) or 'clean'}.mp4"
+    """Play one episode into a video; return its result."""
+    place = f"__{slug(run.elsewhere)}" if run.elsewhere else ""
+    name = f"{run.folder.name}__{noise_slug(noises, rates) or 'clean'}{place}.mp4"
     with tempfile.TemporaryDirectory(dir=args.video, prefix=".") as temporary:
         folder = Path(temporary, "video")  # a new one: RecordVideo warns of one that exists
-        env, policy = load(run, "rgb_array")
-        env = RecordVideo(env, str(folder), episode_trigger=lambda episode: True)
-        [result] = play_episodes(make_noisy(env, noises, rates), policy, 1, args.seed)
+        with load(run, "rgb_array") as (env, policy):
+            env = make_noisy(env, noises, rates)
+            video = RecordVideo(env, str(folder), episode_trigger=lambda episode: True)
+            try:
+                [result] = play_episodes(video, policy, 1, args.seed)
+            finally:
+                if video.recording:
+                    video.stop_recording()
         (folder / "rl-video-episode-0.mp4").replace(args.video / name)
     return result
 
 
 def play_episodes(env, policy, number, seed):
-    """Play episodes and close the environment; return [(true return, length), ...]."""
+    """Play episodes; return [(true return, length), ...].
+
+    Where the environment tells success, 1 or 0 follows.
+    """
     results = []
-    with closing(env):
-        for episode in range(number):
+    for episode in range(number):
+        with seeded_globals(seed + episode):
             observation, _ = env.reset(seed=seed + episode)
             terminated = truncated = False
             while not (terminated or truncated):
                 observation, _, terminated, truncated, info = env.step(policy(observation))
-            record = info["episode"]  # the return is a sum of numbers or of arrays
-            results.append((np.asarray(record["r"]).item(), int(record["l"])))
+        record = info["episode"]  # the return is a sum of numbers or of arrays
+        success = outcome(info)
+        told = () if math.isnan(success) else (int(success),)
+        results.append((np.asarray(record["r"]).item(), int(record["l"]), *told))
     return results
 
 
@@ -243,28 +345,34 @@ def play_all(play, tasks, args):
 
 
 def read_stored(run):
-    """Read robustness.csv: {(noise, noise rate): [(return, length), ...]}."""
+    """Read robustness.csv: {(noise, noise rate, environment): what play_episodes returns}.
+
+    The environment is empty for that of the training. Raises UnusableError.
+    """
     path = run.folder / "robustness.csv"
     stored = {}
     try:
-        for row in csv.DictReader(path.read_text().splitlines() if path.exists() else []):
-            result = float(row["episodic_return"]), int(row["episodic_length"])
-            stored.setdefault((row["noise"], row["noise_rate"]), []).append(result)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        text = f"{type(error).__name__}: {reason(error)}"
-        fail(f"cannot read {path} ({text}); delete it to play everything again")
+        text = path.read_text("utf-8") if path.exists() else ""
+        for row in csv.DictReader(text.splitlines()):
+            told = (int(row["success"]),) if row.get("success") else ()
+            result = (float(row["episodic_return"]), int(row["episodic_length"]), *told)
+            key = row["noise"], row["noise_rate"], row.get("environment") or ""
+            stored.setdefault(key, []).append(result)
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, csv.Error) as error:
+        text = f"robustness.csv: {in_words(error)}; delete that file to play everything again"
+        raise UnusableError(text) from None
     return stored
 
 
 def store(run, key, results):
     """Add a condition to robustness.csv, beside what other processes have stored meanwhile."""
     try:
-        with open(run.folder / ".robustness.lock", "a") as lock:
+        with open(run.folder / ".robustness.lock", "a", encoding="utf-8") as lock:
             fcntl.lockf(lock, fcntl.LOCK_EX)  # until it is closed
             stored = read_stored(run)
             if len(stored.get(key, [])) < len(results):
                 write_stored(run, stored | {key: results})
-    except OSError as error:
+    except (OSError, UnusableError) as error:
         fail(f"cannot write {run.folder / 'robustness.csv'}: {error}", code=1)
 
 
@@ -273,11 +381,16 @@ def write_stored(run, stored):
     # not *.tmp, which the training command deletes when it is called again
     temporary = run.folder / f".robustness.{os.getpid()}"
     try:
-        with open(temporary, "w") as file:
+        with open(temporary, "w", encoding="utf-8") as file:
             writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(ROBUSTNESS_COLUMNS)
-            for key, results in stored.items():
-                writer.writerows([*key, i, *result] for i, result in enumerate(results))
+            told = any(len(result) > 2 for results in stored.values() for result in results)
+            elsewhere = any(environment for _, _, environment in stored)
+            columns = [*ROBUSTNESS_COLUMNS, *["success"] * told, *["environment"] * elsewhere]
+            writer.writerow(columns)
+            for (*condition, environment), results in stored.items():
+                for i, result in enumerate(results):
+                    row = [*condition, i, *result, *[""] * (told and len(result) == 2)]
+                    writer.writerow([*row, *[environment] * elsewhere])
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(run.folder / "robustness.csv")
@@ -285,21 +398,27 @@ def write_stored(run, stored):
         temporary.unlink(missing_ok=True)
 
 
-def algorithms(runs):
-    """Name the runs' algorithms as analyze.py does: where settings differ, the name says which."""
-    table = pd.DataFrame(runs).assign(status="finished", name="")
-    for algorithm, group in table.groupby("algorithm"):
-        names = [study_name(algorithm, settings) for settings in differing_settings(group)]
-        table.loc[group.index, "name"] = names
-    return table["name"]
+def names_of(runs):
+    """Name each run's study as analyze.py does, and in which arguments the run differs from it."""
+    studies = {}
+    for run in runs:
+        studies.setdefault((run.algorithm, run.exp_name), []).append(run.settings)
+    usual = {key: usual_settings(settings) for key, settings in studies.items()}
+    for run in runs:
+        key = run.algorithm, run.exp_name
+        own = [f"{name}={run.settings[name]}" for name in difference(run.settings, usual[key])]
+        yield ", ".join([study_name(*key), *own])
 
 
 def print_table(runs, conditions, stored, episodes):
     """Print mean and sample standard deviation over seeds: one table for each noise of the test."""
     trained = {}
-    for run, algorithm in zip(runs, algorithms(runs), strict=True):
-        config = (run.environment, algorithm, run.noise or "no noise", run.noise_rate)
-        trained.setdefault(config, []).append(stored[run])
+    for run, name in zip(runs, names_of(runs), strict=True):
+        noise = run.configuration.noise or "no noise"
+        where = where_tested(run.environment, run.elsewhere)
+        config = (where, name, noise, run.configuration.noise_rate)
+        at_hand = {key[:2]: value for key, value in stored[run].items() if key[2] == run.elsewhere}
+        trained.setdefault(config, []).append(at_hand)
     noises = dict.fromkeys(noise for noise, _ in conditions if noise)
     for tested_with in noises or [""]:
         columns = [key for key in conditions if key[0] in ("", tested_with)]
@@ -315,12 +434,20 @@ def print_table(runs, conditions, stored, episodes):
 
 
 def mean_return(seeds, key, episodes):
-    """Spell the mean return under a condition, and its standard deviation if there are seeds."""
-    means = [np.mean(seed[key][:episodes], axis=0)[0] for seed in seeds]
+    """Spell the mean return under a condition, and its standard deviation if there are seeds.
+
+    Behind it is the rate of success, where the environment tells it.
+    """
+    played = [seed[key][:episodes] for seed in seeds]
+    means = [np.mean([result[0] for result in results]) for results in played]
+    solved = ""
+    if any(len(result) > 2 for results in played for result in results):
+        rates = [np.mean([result[2:] == (1,) for result in results]) for results in played]
+        solved = f", {100 * np.mean(rates):.0f} % solved"
     if len(means) == 1:
-        return rounded(means[0])
+        return rounded(means[0]) + solved
     spread = np.std(means, ddof=1)
-    return f"{rounded(np.mean(means), spread)} ± {rounded(spread, spread)}"
+    return f"{rounded(np.mean(means), spread)} ± {rounded(spread, spread)}{solved}"
 
 
 def works(code):
@@ -355,7 +482,7 @@ def make_folder(folder):
 
 
 def show(runs, conditions, args):
-    """Play one episode of each condition in a window or into a video; store nothing else."""
+    """Play an episode of each condition in a window or into a video; return whether one failed."""
     tasks = [(run, *condition) for run in runs for condition in conditions.values()]
     failures = []
     for (run, *condition), result in zip(tasks, play_all(draw, tasks, args), strict=True):
@@ -363,16 +490,15 @@ def show(runs, conditions, args):
         if isinstance(result, str):
             failures.append(f"{name}: {result}")
             continue
-        episodic_return, length = result
+        episodic_return, length, *_ = result
         print(f"{name}: return {rounded(episodic_return)}, {length} steps")
     for failure in failures:
         print(f"error: cannot draw {failure}", file=sys.stderr)
-    if failures:
-        raise SystemExit(1)
+    return bool(failures)
 
 
 def main(args):
-    """Check everything, play what is not stored, print the table."""
+    """Check everything, play what is not stored, print the table; return the exit status."""
     for name, least in (("episodes", 1), ("jobs", 1), ("seed", 0)):
         if getattr(args, name) < least:
             fail(f"--{name} must be at least {least}, not {getattr(args, name)}")
@@ -381,39 +507,57 @@ def main(args):
     if args.render and not works(DISPLAY):
         fail("--render needs a display; --video FOLDER makes videos without one")
     os.environ["OMP_NUM_THREADS"] = "1"  # before the scripts import PyTorch; processes inherit it
-    sys.path.append(os.getcwd())  # my_module:MyEnv-v0 may lie in the folder this is called from
     conditions = read_conditions(args)
-    runs = find_runs(args.runs)
+    runs, bad = find_runs(args.runs)
+    here = Path.cwd()  # for what the module of my_envs:MyEnv-v0 imports
+    if not any(here.is_relative_to(runs_dir) for run in runs for runs_dir in folders_of_runs(run)):
+        sys.path.append(str(here))
     storing = args.seed == Args.seed
-    stored = {run: read_stored(run) if storing else {} for run in runs}
     if args.video:
+        args.video = args.video.expanduser()
         if len({run.folder.name for run in runs}) < len(runs):
             fail("--video: two of these runs have the same name, and so would their videos")
         draw_without_display()
-    for run in runs:
-        check_environment(run, conditions)
+    if args.env_id:
+        try:
+            env_id = canonical_env_id(args.env_id)
+        except ValueError as error:
+            fail(f"--env-id: {error}")
+        runs = [replace(run, elsewhere=env_id * (env_id != run.environment)) for run in runs]
+    stored = check_runs(runs, conditions, bad, storing)
+    runs = list(stored)
+    tell(bad)
+    if not runs and bad:
+        return 2
+    if not runs:
+        fail(f"there is no finished run in {', '.join(map(str, args.runs))}")
     if args.video:
         make_folder(args.video)
     if args.video or args.render:
-        show(runs, conditions, args)
-        return
+        return show(runs, conditions, args) or bool(bad)
     if not storing:
         print(f"--seed {args.seed} is not the default: everything is played, nothing is stored")
     todo = []
     for run, key in itertools.product(runs, conditions):
-        if len(stored[run].get(key, [])) < args.episodes:
+        if len(stored[run].get((*key, run.elsewhere), [])) < args.episodes:
             todo.append((run, key))
     tasks = [(run, *conditions[key]) for run, key in todo]
     for (run, key), results in zip(todo, play_all(play, tasks, args), strict=True):
-        stored[run][key] = results
+        stored[run][*key, run.elsewhere] = results
         if storing:
-            store(run, key, results)
+            store(run, (*key, run.elsewhere), results)
     print_table(runs, conditions, stored, args.episodes)
+    return bool(bad)
 
 
 if __name__ == "__main__":
+    take_over_terminal()
+    for word in sys.argv[1:]:
+        if word.partition("=")[0] in ("--noise", "--noise-rate"):
+            flag = word.partition("=")[0]
+            fail(f"{flag} is {flag}s here: every noise is tested at every rate")
     try:
-        main(tyro.cli(Args, description=__doc__))
+        sys.exit(main(tyro.cli(Args, description=__doc__)))
     except KeyboardInterrupt:
         fail("stopped; what was played is stored, but nothing with another --seed", code=130)
     except NotFiniteError as error:  # from the environment

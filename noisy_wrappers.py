@@ -24,6 +24,7 @@ never touched, so initial states are the same with and without noise.
 
 import ast
 import contextlib
+import copy
 import functools
 import hashlib
 import importlib
@@ -31,23 +32,33 @@ import importlib.machinery
 import inspect
 import math
 import numbers
+import operator
 import os
+import random
 import re
+import signal
+import subprocess
 import sys
+import traceback
 import zlib
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import find_highest_version, get_env_id, parse_env_id
+from gymnasium.envs.registration import (
+    find_highest_version,
+    get_env_id,
+    load_env_creator,
+    parse_env_id,
+)
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 __all__ = [
     "BASELINE",
@@ -61,7 +72,9 @@ __all__ = [
     "NoiseWrapper",
     "NotFiniteError",
     "ObservationNoise",
+    "RandomActionDelay",
     "RandomDropoutObservation",
+    "RandomDynamics",
     "RandomEarlyTermination",
     "RandomMixupObservation",
     "RandomNormalNoisyAction",
@@ -75,37 +88,80 @@ __all__ = [
     "SpaceError",
     "canonical_env_id",
     "canonical_noises",
+    "into_space",
     "make_flat",
     "make_noisy",
     "noise_slug",
     "noise_statistics",
     "noise_wrappers",
+    "note_versions",
+    "outcome",
     "parse_noise",
     "rate_order",
     "refusals",
+    "reset_worker_signals",
     "rounded",
     "run_folder",
     "run_name",
+    "seed_globals",
+    "seeded_globals",
     "set_progress",
     "signatures",
     "split_noises",
+    "success_rate",
 ]
 
 Env = gym.Env[Any, Any]
 Info = dict[str, Any]
 Step = tuple[Any, Any, bool, bool, Info]  # observation, reward, terminated, truncated, info
+Keys = tuple[str | int, ...]  # of a Dict observation; of a Tuple, indices
+EntryPath = tuple[Any, ...]  # the keys that lead to an entry of nested observations
+
+
+# --------------------------------------------------------------------------- the base of all noises
 
 
 class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Base of the noise wrappers: the rate, the random streams and the counters.
+    """Base of the noise wrappers, ours and your own: the rate, the random streams, the counters.
+
+    A wrapper calls two methods: :meth:`acts` at every opportunity, to decide whether the noise acts
+    now, and :meth:`mark` where it has changed something. It draws from ``self.noise``, and passes
+    its own arguments on to ``super().__init__``, which records them. A sticky action:
+
+    >>> class StickyAction(NoiseWrapper):
+    ...     kind = "action"
+    ...
+    ...     def __init__(self, env, noise_rate, longest):
+    ...         super().__init__(env, noise_rate, longest=longest)
+    ...         self.longest = longest  # number of steps
+    ...
+    ...     def reset(self, **kwargs):
+    ...         self.last, self.left = None, 0
+    ...         return super().reset(**kwargs)
+    ...
+    ...     def step(self, action):
+    ...         if self.acts():
+    ...             self.left = self.noise.integers(1, self.longest, endpoint=True)
+    ...         sticks = self.left > 0 and self.last is not None
+    ...         self.left -= 1
+    ...         self.last = self.last if sticks else action
+    ...         *result, info = self.env.step(self.last)
+    ...         return *result, self.mark(info) if sticks else info
+
+    In a file my_noises.py it is ``--noise "my_noises:StickyAction(3)"``. Noise on observations or
+    rewards has less to write: see :class:`ObservationNoise` and :class:`RewardNoise`. To check
+    arguments before there is an environment, the constructor is also called with one that has
+    nothing but spaces; a ValueError is what it has to say about bad ones.
 
     Attributes:
         schedule: the rates at the beginning and at the end of training, both in [0, 1].
         training_progress: the fraction of training done; see :func:`set_progress`. Assigning it
             assigns that of the noise wrappers inside, too.
         parameters: the wrapper's own arguments by name, as its spec records them.
-        opportunities: how often the noise might have acted (episodes for early termination).
-        times_applied: how often it did.
+        noise: the generator to draw noise from.
+        opportunities: how often the noise might have acted: steps, or episodes where it is decided
+            at ``reset()`` whether it acts.
+        times_applied: at how many of them it changed something.
     """
 
     kind: ClassVar[str]  # what it perturbs: "observation", "reward", "action" or "dynamics"
@@ -120,6 +176,7 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.parameters = parameters
         self.opportunities = 0
         self.times_applied = 0
+        self._counted = True  # since the last opportunity, in times_applied
         self._position = sum(1 for _ in _noise_layers(env))
         self._seed(None)
 
@@ -167,17 +224,20 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment; a seed also reseeds the noise. The rate follows its schedule."""
-        self._noise_rate = float(np.interp(self._training_progress, (0.0, 1.0), self.schedule))
+        self._follow_schedule()
         result = self.env.reset(seed=seed, options=options)
         if seed is not None:
             self._seed(seed)
         return result
 
+    def _follow_schedule(self) -> None:
+        self._noise_rate = float(np.interp(self._training_progress, (0.0, 1.0), self.schedule))
+
     def state_dict(self) -> dict[str, Any]:
         """Return the random streams and the counters, to be taken between two episodes."""
         return {
             "gate": self._gate.bit_generator.state,
-            "noise": self._noise.bit_generator.state,
+            "noise": self.noise.bit_generator.state,
             "opportunities": self.opportunities,
             "times_applied": self.times_applied,
         }
@@ -185,7 +245,7 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a :meth:`state_dict`; the next call must be ``reset()``."""
         self._gate.bit_generator.state = state["gate"]
-        self._noise.bit_generator.state = state["noise"]
+        self.noise.bit_generator.state = state["noise"]
         self.opportunities = state["opportunities"]
         self.times_applied = state["times_applied"]
 
@@ -194,16 +254,25 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         entropy = None if seed is None else [seed, name, self._position]
         gate, noise = np.random.SeedSequence(entropy).spawn(2)
         self._gate = np.random.default_rng(gate)
-        self._noise = np.random.default_rng(noise)
+        self.noise = np.random.default_rng(noise)
 
-    def _acts(self) -> bool:
-        acts = self._gate.random() < self._noise_rate
+    def acts(self) -> bool:
+        """Decide with probability p whether the noise acts now: on this step, or in this episode.
+
+        Each call is an opportunity. It draws one uniform number, whatever the rate.
+        """
         self.opportunities += 1
-        self.times_applied += acts
-        return acts
+        self._counted = False
+        return self._gate.random() < self._noise_rate
 
-    def _mark(self, info: Info) -> Info:
-        """Record that the noise acted, in a new dict: the environment may reuse its own."""
+    def mark(self, info: Info) -> Info:
+        """Return a step's info with the name of this noise, which has changed something.
+
+        That is a new dict: the environment may reuse its own. The first mark after an opportunity
+        counts in ``times_applied``.
+        """
+        self.times_applied += not self._counted
+        self._counted = True
         name = type(self).__name__
         below = info.get("noise")
         if isinstance(below, tuple):  # of noise wrappers; anything else is the environment's own
@@ -211,37 +280,60 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return {**info, "noise": (name,)}
 
 
-class ObservationNoise(NoiseWrapper):
-    """Base of the observation wrappers: subclasses define ``_perturb`` on float64 arrays.
+# ---------------------------------------------------------------------------- noise on observations
 
-    The observation has its space's dtype and shape; integers are computed in float64, rounded and
-    clipped to their dtype. The space is widened to what noise can reach. The observation of
-    ``reset()`` is perturbed like any other.
+
+class ObservationNoise(NoiseWrapper):
+    """Base of the observation wrappers: subclasses define ``_perturb``.
+
+    What they perturb are numbers: a Box of floats or integers. In a Dict or Tuple observation these
+    are all entries of this kind, as one vector in the order of the space, with one decision a step;
+    ``keys`` restricts them to some of the top level, ``keys=("observation",)`` (of a Tuple:
+    indices). Categories and all other entries stay as they are.
+
+    Every entry keeps its dtype and shape; integers are computed in float64, rounded and clipped to
+    their dtype. The space is widened to what noise can reach. The observation of ``reset()`` is
+    perturbed like any other.
     """
 
     kind = "observation"
 
-    def __init__(self, env: Env, noise_rate: float | str, **parameters: Any):
-        """Raise ValueError unless observations are a Box of numbers, none of them categories."""
-        super().__init__(env, noise_rate, **parameters)
-        space = env.observation_space
-        flattened = [
-            layer.env.observation_space
-            for layer in _layers(env)
-            if isinstance(layer, gym.wrappers.FlattenObservation)
-        ]
-        if any(_has_categories(part) for part in [space, *flattened]):
+    def __init__(
+        self, env: Env, noise_rate: float | str, *, keys: Keys | None = None, **parameters: Any
+    ):
+        """Raise ValueError unless observations contain numbers, and keys are those of the space."""
+        self.keys = _keys(keys)
+        super().__init__(env, noise_rate, **parameters, keys=self.keys)
+        self._boxes = {} if isinstance(env, _ProbeEnv) else self._find_boxes(env)
+
+    def _find_boxes(self, env: Env) -> dict[EntryPath, gym.spaces.Box]:
+        """Return the entries to perturb: {path in the observation: their space}."""
+        name, space = type(self).__name__, env.observation_space
+        for layer in _layers(env):
+            if isinstance(layer, gym.wrappers.FlattenObservation) and _has_categories(layer.env):
+                raise ValueError(
+                    f"{name} cannot perturb categories, and these observations were flattened with "
+                    "some in them: apply it before gymnasium.wrappers.FlattenObservation"
+                )
+        entries = dict(_entries(space))
+        if self.keys is not None:
+            known = [*dict.fromkeys(path[0] for path in entries if path)]
+            if not set(self.keys) <= set(known):
+                raise ValueError(f"keys={self.keys!r}: these observations have the keys {known}")
+            entries = {path: part for path, part in entries.items() if path[0] in self.keys}
+        boxes = {
+            path: part
+            for path, part in entries.items()
+            if isinstance(part, gym.spaces.Box) and part.dtype.kind in "fiu"
+        }
+        if not boxes and _has_categories(env):
             raise ValueError(
-                f"{type(self).__name__} cannot perturb categories, which this environment's "
-                "observations contain (a Discrete or MultiDiscrete space): use reward noise, "
-                "action noise or early termination"
+                f"{name} cannot perturb categories (Discrete, MultiDiscrete, MultiBinary), and "
+                "finds nothing else here: use reward noise, action noise or early termination"
             )
-        if not isinstance(space, gym.spaces.Box) or space.dtype.kind not in "fiu":
-            raise ValueError(
-                f"{type(self).__name__} needs a Box observation space of floats or integers, got "
-                f"{type(space).__name__}: apply gymnasium.wrappers.FlattenObservation first"
-            )
-        self._dtype: np.dtype[Any] = space.dtype
+        if not boxes:
+            raise ValueError(f"{name} needs observations of floats or integers, got {space}")
+        return boxes
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and perturb the first observation with probability p."""
@@ -253,28 +345,57 @@ class ObservationNoise(NoiseWrapper):
         observation, info = self._observe(observation, info)
         return observation, reward, terminated, truncated, info
 
-    def _observe(self, observation: NDArray[Any], info: Info) -> tuple[NDArray[Any], Info]:
-        if self._acts():
-            noisy = self._perturb(np.asarray(observation, np.float64))
-            return _cast(noisy, self._dtype), self._mark(info)
-        return observation, info
+    def _observe(self, observation: Any, info: Info) -> tuple[Any, Info]:
+        if not self.acts():
+            return observation, info
+        given = self._numbers(observation)
+        noisy = self._with_numbers(observation, self._perturb(given))
+        if (self._numbers(noisy) != given).any():
+            info = self.mark(info)
+        return noisy, info
 
     def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
+        """Return the numbers of an observation with noise, a new array.
+
+        They are float64 in the shape of the Box; those of a Dict or Tuple are one vector.
+        """
         raise NotImplementedError
 
+    def _numbers(self, observation: Any) -> NDArray[Any]:
+        """Return a copy of the entries to perturb, which must not be written to."""
+        if () in self._boxes:
+            numbers = np.array(observation, np.float64)
+        else:
+            parts = [functools.reduce(operator.getitem, path, observation) for path in self._boxes]
+            numbers = np.concatenate([np.asarray(part, np.float64).ravel() for part in parts])
+        numbers.flags.writeable = False
+        return numbers
+
+    def _with_numbers(self, observation: Any, numbers: NDArray[Any]) -> Any:
+        """Return a new observation with these numbers in place of :meth:`_numbers`."""
+        if () in self._boxes:
+            return _cast(numbers, self._boxes[()].dtype)
+        ends = np.cumsum([math.prod(box.shape) for box in self._boxes.values()])
+        parts = {}
+        for (path, box), part in zip(
+            self._boxes.items(), np.split(numbers, ends[:-1]), strict=True
+        ):
+            parts[path] = _cast(part.reshape(box.shape), box.dtype)
+        return _replaced(observation, parts)
+
     def _widen(self, reach: Callable[[NDArray[Any]], Sequence[Any]]) -> None:
-        """Extend the observation space to what ``reach`` says noise makes of its two bounds."""
-        space = self.env.observation_space
-        assert isinstance(space, gym.spaces.Box)
-        with np.errstate(over="ignore", invalid="ignore"):
-            ends = [*reach(space.low.astype(np.float64)), *reach(space.high.astype(np.float64))]
-            reached = np.stack([np.broadcast_to(end, space.shape) for end in ends])
-            reached[np.isnan(reached)] = 0.0  # 0 * inf is 0 here
-            low = np.minimum(space.low, _cast(reached.min(axis=0), self._dtype))
-            high = np.maximum(space.high, _cast(reached.max(axis=0), self._dtype))
-        self.observation_space = gym.spaces.Box(
-            np.asarray(low), np.asarray(high), dtype=space.dtype.type
-        )
+        """Extend the observation space to what ``reach`` says noise makes of its bounds."""
+        widened = {}
+        for path, box in self._boxes.items():
+            with np.errstate(over="ignore", invalid="ignore"):
+                ends = [*reach(box.low.astype(np.float64)), *reach(box.high.astype(np.float64))]
+                reached = np.stack([np.broadcast_to(end, box.shape) for end in ends])
+                reached[np.isnan(reached)] = 0.0  # 0 * inf is 0 here
+                low = np.minimum(box.low, _cast(reached.min(axis=0), box.dtype))
+                high = np.maximum(box.high, _cast(reached.max(axis=0), box.dtype))
+            widened[path] = gym.spaces.Box(np.asarray(low), np.asarray(high), dtype=box.dtype.type)
+        if widened:
+            self.observation_space = _replaced(self.env.observation_space, widened)
 
 
 class RandomNormalNoisyObservation(ObservationNoise):
@@ -299,21 +420,25 @@ class RandomNormalNoisyObservation(ObservationNoise):
         scale: float | tuple[float, ...],
         *,
         loc: float = 0.0,
+        keys: Keys | None = None,
     ):
         """Raise ValueError unless scale >= 0, both are finite and a tuple fits the observation."""
         self.scale = _scale_or_scales(scale)
         self.loc = _number("loc", loc)
-        super().__init__(env, noise_rate, scale=self.scale, loc=self.loc)
-        shape = env.observation_space.shape
-        if isinstance(self.scale, tuple) and shape != (len(self.scale),):
-            raise ValueError(
-                f"scale has {len(self.scale)} numbers and the observation has shape {shape}: give "
-                f"one number for all dimensions or one for each, got {scale!r}"
-            )
+        super().__init__(env, noise_rate, scale=self.scale, loc=self.loc, keys=keys)
+        if isinstance(self.scale, tuple) and self._boxes:
+            shape = (sum(math.prod(box.shape) for box in self._boxes.values()),)
+            if () in self._boxes:
+                shape = self._boxes[()].shape
+            if shape != (len(self.scale),):
+                raise ValueError(
+                    f"scale has {len(self.scale)} numbers and the observation has shape {shape}: "
+                    f"give one number for all dimensions or one for each, got {scale!r}"
+                )
         self._widen(lambda bound: (-np.inf, np.inf))
 
     def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
-        return observation + self._noise.normal(self.loc, self.scale, observation.shape)
+        return observation + self.noise.normal(self.loc, self.scale, observation.shape)
 
 
 class RandomUniformNoisyObservation(ObservationNoise):
@@ -327,14 +452,22 @@ class RandomUniformNoisyObservation(ObservationNoise):
     array([ 0.01826801, -0.01052575, -0.1353507 , -0.00589376], dtype=float32)
     """
 
-    def __init__(self, env: Env, noise_rate: float | str, low: float, high: float):
+    def __init__(
+        self,
+        env: Env,
+        noise_rate: float | str,
+        low: float,
+        high: float,
+        *,
+        keys: Keys | None = None,
+    ):
         """Raise ValueError unless low <= high and both are finite."""
         self.low, self.high = _interval(low, high)
-        super().__init__(env, noise_rate, low=self.low, high=self.high)
+        super().__init__(env, noise_rate, low=self.low, high=self.high, keys=keys)
         self._widen(lambda bound: (bound + self.low, bound + self.high))
 
     def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
-        return observation + self._noise.uniform(self.low, self.high, observation.shape)
+        return observation + self.noise.uniform(self.low, self.high, observation.shape)
 
 
 class RandomUniformScaleObservation(ObservationNoise):
@@ -357,18 +490,24 @@ class RandomUniformScaleObservation(ObservationNoise):
         high: float,
         *,
         per_dimension: bool = False,
+        keys: Keys | None = None,
     ):
         """Raise ValueError unless low <= high, both are finite and per_dimension is a bool."""
         self.low, self.high = _interval(low, high)
         self.per_dimension = _flag("per_dimension", per_dimension)
         super().__init__(
-            env, noise_rate, low=self.low, high=self.high, per_dimension=self.per_dimension
+            env,
+            noise_rate,
+            low=self.low,
+            high=self.high,
+            per_dimension=self.per_dimension,
+            keys=keys,
         )
         self._widen(lambda bound: (bound * self.low, bound * self.high))
 
     def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
         size = observation.shape if self.per_dimension else None
-        return observation * self._noise.uniform(self.low, self.high, size)
+        return observation * self.noise.uniform(self.low, self.high, size)
 
 
 class RandomMixupObservation(ObservationNoise):
@@ -391,12 +530,18 @@ class RandomMixupObservation(ObservationNoise):
     """
 
     def __init__(
-        self, env: Env, noise_rate: float | str, factor: float, *, recursive: bool = False
+        self,
+        env: Env,
+        noise_rate: float | str,
+        factor: float,
+        *,
+        recursive: bool = False,
+        keys: Keys | None = None,
     ):
         """Raise ValueError unless factor is in [0, 1] and recursive is a bool."""
         self.factor = _number("factor", factor, low=0, high=1)
         self.recursive = _flag("recursive", recursive)
-        super().__init__(env, noise_rate, factor=self.factor, recursive=self.recursive)
+        super().__init__(env, noise_rate, factor=self.factor, recursive=self.recursive, keys=keys)
         self._previous: NDArray[Any] | None = None
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
@@ -404,13 +549,12 @@ class RandomMixupObservation(ObservationNoise):
         self._previous = None
         return super().reset(seed=seed, options=options)
 
-    def _observe(self, observation: NDArray[Any], info: Info) -> tuple[NDArray[Any], Info]:
+    def _observe(self, observation: Any, info: Info) -> tuple[Any, Info]:
         returned = observation
         if self._previous is not None:
             returned, info = super()._observe(observation, info)
-        remembered = returned if self.recursive else observation
         # A copy: the environment may write its next observation into the same array.
-        self._previous = np.array(remembered, np.float64)
+        self._previous = self._numbers(returned if self.recursive else observation)
         return returned, info
 
     def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
@@ -432,18 +576,23 @@ class RandomDropoutObservation(ObservationNoise):
     array([0.01369617, 0.        , 0.        , 0.        ], dtype=float32)
     """
 
-    def __init__(self, env: Env, noise_rate: float | str, keep_prob: float):
+    def __init__(
+        self, env: Env, noise_rate: float | str, keep_prob: float, *, keys: Keys | None = None
+    ):
         """Raise ValueError unless keep_prob is in [0, 1]."""
         self.keep_prob = _number("keep_prob", keep_prob, low=0, high=1)
-        super().__init__(env, noise_rate, keep_prob=self.keep_prob)
+        super().__init__(env, noise_rate, keep_prob=self.keep_prob, keys=keys)
         self._widen(lambda bound: (0.0,))
 
     def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
-        return np.where(self._noise.random(observation.shape) < self.keep_prob, observation, 0.0)
+        return np.where(self.noise.random(observation.shape) < self.keep_prob, observation, 0.0)
+
+
+# --------------------------------------------------------------------------------- noise on rewards
 
 
 class RewardNoise(NoiseWrapper):
-    """Base of the reward wrappers: subclasses define ``_perturb`` on the reward, a number.
+    """Base of the reward wrappers: subclasses define ``_perturb``.
 
     The reward may be an array of one number; perturbed it is a float.
     """
@@ -453,12 +602,15 @@ class RewardNoise(NoiseWrapper):
     def step(self, action: Any) -> Step:
         """Step the environment and perturb the reward with probability p."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        if self._acts():
-            number: Any = reward.item() if isinstance(reward, np.ndarray) else reward
-            reward, info = self._perturb(number), self._mark(info)
+        if self.acts():
+            given: Any = reward.item() if isinstance(reward, np.ndarray) else reward
+            reward = self._perturb(given)
+            if reward != given:
+                info = self.mark(info)
         return observation, reward, terminated, truncated, info
 
     def _perturb(self, reward: float) -> float:
+        """Return a reward with noise."""
         raise NotImplementedError
 
 
@@ -481,7 +633,7 @@ class RandomNormalNoisyReward(RewardNoise):
         super().__init__(env, noise_rate, scale=self.scale, loc=self.loc)
 
     def _perturb(self, reward: float) -> float:
-        return reward + self._noise.normal(self.loc, self.scale)
+        return reward + self.noise.normal(self.loc, self.scale)
 
 
 class RandomUniformNoisyReward(RewardNoise):
@@ -502,7 +654,7 @@ class RandomUniformNoisyReward(RewardNoise):
         super().__init__(env, noise_rate, low=self.low, high=self.high)
 
     def _perturb(self, reward: float) -> float:
-        return reward + self._noise.uniform(self.low, self.high)
+        return reward + self.noise.uniform(self.low, self.high)
 
 
 class RandomUniformScaleReward(RewardNoise):
@@ -523,89 +675,14 @@ class RandomUniformScaleReward(RewardNoise):
         super().__init__(env, noise_rate, low=self.low, high=self.high)
 
     def _perturb(self, reward: float) -> float:
-        return reward * self._noise.uniform(self.low, self.high)
+        return reward * self.noise.uniform(self.low, self.high)
 
 
-class RandomEarlyTermination(NoiseWrapper):
-    """Ends an episode early, at a step drawn from the integers low, ..., high (section 3.3).
-
-    At ``reset()`` the episode is chosen with probability p, and its last step is drawn,
-    k = ``noise.integers(low, high, endpoint=True)``; it is drawn for the others too, so that a
-    higher rate leaves the chosen episodes as they are. A chosen episode that is still going at
-    its k-th step ends there: ``terminated`` is set, or ``truncated`` if ``truncate=True``, and
-    ``info["noise"]`` says who did it. ``high`` is ``low`` by default. ``each_step=True``, without
-    low and high, is the paper's alternative: every step ends the episode with probability p.
-
-    ``times_applied`` counts the chosen episodes, also those that end before their k-th step; with
-    ``each_step`` the steps it ended. noisyenv 0.1.1 does not have this wrapper.
-
-    >>> env = RandomEarlyTermination(gym.make("CartPole-v1"), 1.0, 2)
-    >>> _ = env.reset(seed=0)
-    >>> [env.step(0)[2:] for _ in range(2)]
-    [(False, False, {}), (True, False, {'noise': ('RandomEarlyTermination',)})]
-    """
-
-    kind = "dynamics"
-
-    def __init__(
-        self,
-        env: Env,
-        noise_rate: float | str,
-        low: int | None = None,
-        high: int | None = None,
-        *,
-        each_step: bool = False,
-        truncate: bool = False,
-    ):
-        """Raise ValueError unless 1 <= low <= high are integers, or absent with each_step."""
-        self.each_step = _flag("each_step", each_step)
-        self.truncate = _flag("truncate", truncate)
-        if not each_step:
-            low = _step_number("low", low)
-            high = low if high is None else _step_number("high", high)
-            if low > high:
-                raise ValueError(f"low must not exceed high, got low={low}, high={high}")
-        elif low is not None or high is not None:
-            raise ValueError(f"each_step=True excludes low and high, got low={low}, high={high}")
-        self.low = low
-        self.high = high
-        super().__init__(
-            env,
-            noise_rate,
-            low=low,
-            high=None if high == low else high,  # (50, 50) and (50) are one configuration
-            each_step=each_step,
-            truncate=truncate,
-        )
-        self._steps = 0
-        self._last_step: int | None = None
-
-    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        """Reset the environment and decide when the episode ends."""
-        result = super().reset(seed=seed, options=options)
-        self._steps = 0
-        if self.low is not None and self.high is not None:  # that is, without each_step
-            last_step = int(self._noise.integers(self.low, self.high, endpoint=True))
-            self._last_step = last_step if self._acts() else None
-        return result
-
-    def step(self, action: Any) -> Step:
-        """Step the environment and end the episode if its time has come."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        self._steps += 1
-        at_last_step = self._steps == self._last_step
-        ends = self._acts() if self.each_step else at_last_step
-        if ends:
-            info = self._mark(info)
-            if self.truncate:
-                truncated = True
-            else:
-                terminated = True
-        return observation, reward, terminated, truncated, info
+# -------------------------------------------------------------------- noise on actions and dynamics
 
 
 class RandomNormalNoisyAction(NoiseWrapper):
-    """Adds Gaussian noise to the action: a + e with e ~ N(loc, scale^2 I). Ours, not the paper's.
+    """Adds Gaussian noise to the action: a + e with e ~ N(loc, scale^2 I). Not in the paper.
 
     The environment receives a + e clipped to its action space, in the space's dtype; the caller's
     action is left as it is. ``scale`` and ``loc`` are in units of the action, the same in every
@@ -636,15 +713,294 @@ class RandomNormalNoisyAction(NoiseWrapper):
 
     def step(self, action: Any) -> Step:
         """Perturb the action with probability p and step the environment."""
-        if not self._acts():
+        if not self.acts():
             return self.env.step(action)
         space = self._space
-        noise = self._noise.normal(self.loc, self.scale, space.shape)
-        noisy = np.clip(np.asarray(action, np.float64) + noise, space.low, space.high)
-        observation, reward, terminated, truncated, info = self.env.step(
-            np.asarray(noisy, space.dtype)
+        noise = self.noise.normal(self.loc, self.scale, space.shape)
+        unclipped = np.asarray(action, np.float64) + noise
+        noisy = np.asarray(np.clip(unclipped, space.low, space.high), space.dtype)
+        observation, reward, terminated, truncated, info = self.env.step(noisy)
+        if (noisy != np.asarray(action, space.dtype)).any():
+            info = self.mark(info)
+        return observation, reward, terminated, truncated, info
+
+
+class RandomActionDelay(NoiseWrapper):
+    """Delays the actions of an episode by k steps, k uniform on low, ..., high. Not in the paper.
+
+    At ``reset()`` the episode is chosen with probability p, and k is drawn,
+    ``noise.integers(low, high, endpoint=True)``; it is drawn for the others too, so that a higher
+    rate leaves the chosen episodes as they are. In a chosen episode every action takes effect k
+    steps later, and until then the first one acts, as in realworldrl_suite: with k = 2 the
+    environment receives a0 a0 a0 a1 a2. ``high`` is ``low`` by default. Any action space will do.
+
+    ``times_applied`` counts the episodes in which a delayed action took effect. Bouteiller et al.,
+    "Reinforcement Learning with Random Delays", 2021.
+
+    >>> env = RandomActionDelay(gym.make("Pendulum-v1"), 1.0, 2)
+    >>> _ = env.reset(seed=0)
+    >>> for number in range(5):
+    ...     _ = env.step(np.full(1, number / 10, np.float32))
+    ...     print(env.unwrapped.last_u)  # what the environment received
+    0.0
+    0.0
+    0.0
+    0.1
+    0.2
+    """
+
+    kind = "action"
+
+    def __init__(self, env: Env, noise_rate: float | str, low: int, high: int | None = None):
+        """Raise ValueError unless 0 <= low <= high are integers."""
+        self.low, self.high = _whole_interval(low, high, least=0)
+        unlike = None if self.high == self.low else self.high
+        super().__init__(env, noise_rate, low=self.low, high=unlike)
+        self._delay = 0
+        self._actions: deque[Any] = deque()  # the one that acts now, and those that wait
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
+        """Reset the environment and decide by how much the episode's actions are delayed."""
+        result = super().reset(seed=seed, options=options)
+        delay = int(self.noise.integers(self.low, self.high, endpoint=True))
+        self._delay = delay if self.acts() else 0
+        self._actions.clear()
+        return result
+
+    def step(self, action: Any) -> Step:
+        """Step the environment with the action of some steps ago."""
+        if not self._delay:
+            return self.env.step(action)
+        self._actions.append(copy.deepcopy(action))  # the caller may reuse an array
+        if len(self._actions) > self._delay + 1:
+            self._actions.popleft()
+        delayed = copy.deepcopy(self._actions[0])
+        observation, reward, terminated, truncated, info = self.env.step(delayed)
+        if len(self._actions) > 1:  # so this step's action waits
+            info = self.mark(info)
+        return observation, reward, terminated, truncated, info
+
+
+class RandomEarlyTermination(NoiseWrapper):
+    """Ends an episode early, at a step drawn from the integers low, ..., high (section 3.3).
+
+    At ``reset()`` the episode is chosen with probability p, and its last step is drawn,
+    k = ``noise.integers(low, high, endpoint=True)``; it is drawn for the others too, so that a
+    higher rate leaves the chosen episodes as they are. A chosen episode that is still going at
+    its k-th step ends there: ``terminated`` is set, or ``truncated`` if ``truncate=True``, and
+    ``info["noise"]`` says who did it. ``high`` is ``low`` by default. ``each_step=True``, without
+    low and high, is the paper's alternative: every step ends the episode with probability p.
+
+    ``times_applied`` counts the episodes that it ended, which are fewer than the chosen ones where
+    some end before their k-th step. noisyenv 0.1.1 does not have this wrapper.
+
+    >>> env = RandomEarlyTermination(gym.make("CartPole-v1"), 1.0, 2)
+    >>> _ = env.reset(seed=0)
+    >>> [env.step(0)[2:] for _ in range(2)]
+    [(False, False, {}), (True, False, {'noise': ('RandomEarlyTermination',)})]
+    """
+
+    kind = "dynamics"
+
+    def __init__(
+        self,
+        env: Env,
+        noise_rate: float | str,
+        low: int | None = None,
+        high: int | None = None,
+        *,
+        each_step: bool = False,
+        truncate: bool = False,
+    ):
+        """Raise ValueError unless 1 <= low <= high are integers, or absent with each_step.
+
+        Nor may ``env`` record its episodes: the record would miss those that this one ends.
+        """
+        if any(env.has_wrapper_attr(name) for name in _OF_RECORDERS):
+            raise ValueError(_RECORDED_BENEATH_EARLY_TERMINATION)
+        self.each_step = _flag("each_step", each_step)
+        self.truncate = _flag("truncate", truncate)
+        if not each_step:
+            low, high = _whole_interval(low, high, least=1)
+        elif low is not None or high is not None:
+            raise ValueError(f"each_step=True excludes low and high, got low={low}, high={high}")
+        self.low = low
+        self.high = high
+        super().__init__(
+            env,
+            noise_rate,
+            low=low,
+            high=None if high == low else high,  # (50, 50) and (50) are one configuration
+            each_step=each_step,
+            truncate=truncate,
         )
-        return observation, reward, terminated, truncated, self._mark(info)
+        self._steps = 0
+        self._last_step: int | None = None
+        self._warn_if_late()
+
+    def _warn_if_late(self) -> None:
+        """Say if no episode lasts long enough to be ended."""
+        timers = [layer for layer in _layers(self.env) if isinstance(layer, gym.wrappers.TimeLimit)]
+        limit = min((timer._max_episode_steps for timer in timers), default=math.inf)
+        if self.low is not None and self.low >= limit:
+            only = self.low == limit and not self.truncate
+            effect = "only turns truncated into terminated there" if only else "never acts"
+            most = f"episodes have at most {limit} steps"
+            gym.logger.warn(f"RandomEarlyTermination({self.low}) {effect}: {most}", stacklevel=3)
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
+        """Reset the environment and decide when the episode ends."""
+        result = super().reset(seed=seed, options=options)
+        self._steps = 0
+        if self.low is not None and self.high is not None:  # that is, without each_step
+            last_step = int(self.noise.integers(self.low, self.high, endpoint=True))
+            self._last_step = last_step if self.acts() else None
+        return result
+
+    def step(self, action: Any) -> Step:
+        """Step the environment and end the episode if its time has come."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._steps += 1
+        at_last_step = self._steps == self._last_step
+        ends = self.acts() if self.each_step else at_last_step
+        if ends and not (truncated if self.truncate else terminated):
+            info = self.mark(info)
+            truncated, terminated = truncated or self.truncate, terminated or not self.truncate
+        return observation, reward, terminated, truncated, info
+
+
+# Fields of MuJoCo's model that are usually randomized.
+_USUAL_FIELDS = ("body_mass", "body_inertia", "geom_friction", "jnt_stiffness", "dof_armature")
+_USUAL_FIELDS += ("dof_damping", "dof_frictionloss", "actuator_gear")
+# What mj_setConst computes from others (engine_setconst.c), in the model and in model.stat.
+_DERIVED_FIELDS = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "dof_length")
+_DERIVED_FIELDS += ("actuator_acc0", "actuator_length0", "actuator_biasprm", "tendon_invweight0")
+_DERIVED_FIELDS += ("tendon_length0", "tendon_lengthspring", "eq_data", "cam_pos0", "cam_poscom0")
+_DERIVED_FIELDS += ("cam_mat0", "light_pos0", "light_poscom0", "light_dir0", "flexedge_length0")
+_DERIVED_FIELDS += ("flexedge_invweight0", "flex_vertmetric", "flex_vert0")
+_STATISTICS = ("meaninertia", "meanmass", "meansize", "extent", "center")
+
+
+class RandomDynamics(NoiseWrapper):
+    """Scales masses, frictions and the like of a MuJoCo model for an episode. Not in the paper.
+
+    At ``reset()`` the episode is chosen with probability p. In a chosen one, each row of the named
+    ``fields`` of the simulator's model (that of a body, a geom, a joint, an actuator) is its own
+    value times e ~ U(low, high), ``noise.uniform(low, high, number of rows)`` for each field in
+    turn, drawn for the other episodes too. Fields have MuJoCo's own names, as ``dof_damping``;
+    ``body_mass`` takes ``body_inertia`` along, with the same factors. What MuJoCo derives from
+    these values is derived anew. All is undone at the next ``reset()``: other episodes are those of
+    the bare environment. ``info["dynamics"]`` of a chosen episode's reset has the factors,
+    {field: array}.
+
+    The model is found in environments of Gymnasium, Gymnasium-Robotics and dm_control (with
+    shimmy). ``times_applied`` counts episodes. Tobin et al., "Domain Randomization", 2017; Peng et
+    al., "Sim-to-Real Transfer with Dynamics Randomization", 2018.
+
+    >>> env = RandomDynamics(gym.make("InvertedPendulum-v5"), 1.0, 0.5, 1.5)
+    >>> info = env.reset(seed=0)[1]
+    >>> info["noise"], info["dynamics"]["body_mass"].round(2)  # of the world, the cart, the pole
+    (('RandomDynamics',), array([0.84, 0.53, 0.81]))
+    """
+
+    kind = "dynamics"
+
+    def __init__(
+        self,
+        env: Env,
+        noise_rate: float | str,
+        low: float,
+        high: float,
+        *,
+        fields: tuple[str, ...] = ("body_mass", "geom_friction"),
+    ):
+        """Raise ValueError unless 0 <= low <= high and the environment's model has the fields."""
+        self.low, self.high = _interval(low, high, least=0)
+        self.fields = _fields(fields)
+        super().__init__(env, noise_rate, low=self.low, high=self.high, fields=self.fields)
+        if any(isinstance(layer, RandomDynamics) for layer in _noise_layers(env)):
+            raise ValueError("this environment has RandomDynamics already: name all fields in one")
+        self._changed: Any = None  # the model that is not as it was, and its values before
+        self._scratch: Any = None  # a model, and data to compute with
+        if not isinstance(env, _ProbeEnv):
+            model = self._model()
+            for field in self.fields:
+                if not getattr(model, field).any():
+                    raise ValueError(
+                        f"fields: this environment's model has no {field}, or zeros only, which no "
+                        "factor changes"
+                    )
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
+        """Restore the model, perhaps change it anew, and reset the environment."""
+        self._restore()
+        self._follow_schedule()
+        if seed is not None:
+            self._seed(seed)  # before the environment's own reset, which needs the new model
+        model = self._model()
+        factors = {
+            field: self.noise.uniform(self.low, self.high, len(getattr(model, field)))
+            for field in self.fields
+        }
+        chosen = self.acts() and any((values != 1).any() for values in factors.values())
+        if chosen:
+            self._scale(model, factors)
+        observation, info = self.env.reset(seed=seed, options=options)
+        if chosen:
+            if self._model() is not model:  # the environment has built a new one
+                self._scale(self._model(), factors)
+            info = {**self.mark(info), "dynamics": factors}
+        return observation, info
+
+    def step(self, action: Any) -> Step:
+        """Step the environment; every step of a chosen episode is a perturbed one."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if self._changed:
+            info = self.mark(info)
+        return observation, reward, terminated, truncated, info
+
+    def _model(self) -> Any:
+        """Return the environment's mujoco.MjModel."""
+        mujoco = sys.modules.get("mujoco")  # an environment that has a model has imported it
+        base = self.env.unwrapped
+        physics = getattr(getattr(base, "_env", base), "physics", None)  # of dm_control
+        for model in (getattr(base, "model", None), getattr(physics, "model", None)):
+            model = getattr(model, "ptr", model)
+            if mujoco and isinstance(model, mujoco.MjModel):
+                return model
+        raise ValueError(f"RandomDynamics needs an environment with a MuJoCo model, not {self.env}")
+
+    def _scale(self, model: Any, factors: dict[str, NDArray[Any]]) -> None:
+        """Multiply the rows of the fields, and let MuJoCo derive its constants from them."""
+        import mujoco
+
+        scaled = dict(factors)
+        if "body_mass" in factors:
+            scaled["body_inertia"] = factors["body_mass"]
+        arrays = {name: getattr(model, name, None) for name in (*scaled, *_DERIVED_FIELDS)}
+        nominal = {name: array.copy() for name, array in arrays.items() if array is not None}
+        statistics = {name: np.copy(getattr(model.stat, name)) for name in _STATISTICS}
+        self._changed = model, nominal, statistics
+        for name, values in scaled.items():
+            arrays[name][:] = (nominal[name].T * values).T
+        # In data of its own, made once: the environment's are left as they are until its reset.
+        if self._scratch is None or self._scratch[0] is not model:
+            self._scratch = model, mujoco.MjData(model)
+        mujoco.mj_setConst(*self._scratch)
+        for name in ("meansize", "extent", "center"):  # of the picture, as the model's file says
+            setattr(model.stat, name, statistics[name])
+
+    def _restore(self) -> None:
+        if self._changed:
+            model, nominal, statistics = self._changed
+            for name, values in nominal.items():
+                getattr(model, name)[:] = values
+            for name, value in statistics.items():
+                setattr(model.stat, name, value)
+            self._changed = None
+
+
+# -------------------------------------------------------------------- noises in words, and combined
 
 
 WRAPPERS: dict[str, type[NoiseWrapper]] = {
@@ -660,93 +1016,10 @@ WRAPPERS: dict[str, type[NoiseWrapper]] = {
         RandomUniformScaleReward,
         RandomEarlyTermination,
         RandomNormalNoisyAction,
+        RandomActionDelay,
+        RandomDynamics,
     )
 }
-# Noise of these kinds acts before an episode's statistics are recorded, in this order.
-_BEFORE_STATISTICS = ("dynamics", "action")
-# What gives away Gymnasium's RecordEpisodeStatistics and Stable-Baselines3's Monitor.
-_OF_RECORDERS = ("return_queue", "get_episode_rewards")
-_RECORDED = (
-    "this environment records its episodes already (in info['episode'], as RecordEpisodeStatistics "
-    "and Monitor do): take that off, or use make_noisy(..., record_statistics=False)"
-)
-_RECORDED_BENEATH_EARLY_TERMINATION = (
-    "this environment records its episodes already, and the record would miss those that "
-    "RandomEarlyTermination ends: apply that first, as in Monitor(make_noisy(env, "
-    "['RandomEarlyTermination(50)'], [0.5], record_statistics=False)), and the other noises after"
-)
-
-
-class RecordEpisodeStatistics(gym.wrappers.RecordEpisodeStatistics[Any, Any]):
-    """Gymnasium's wrapper, with a clear error if the environment records its episodes itself."""
-
-    def step(self, action: Any) -> Step:
-        """Step the environment; raise ValueError if its info has an "episode" already."""
-        steps = self.episode_lengths
-        try:
-            return super().step(action)
-        except AssertionError as error:
-            if self.episode_lengths == steps:  # it comes from the environment's own step
-                raise
-            raise ValueError(_RECORDED) from error
-
-
-class NotFiniteError(FloatingPointError):
-    """A value that training cannot continue with: NaN, infinite, or not a number at all."""
-
-
-class SpaceError(ValueError):
-    """Observations or actions that are not vectors of numbers."""
-
-
-class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Stops at NaN and infinity, makes rewards floats and observations arrays of their own.
-
-    A learner that receives NaN does not recover, and may never show it. So this raises
-    NotFiniteError, which says whether the action was already NaN, as after a divergence. The
-    reward may be an array of one number but not a string. Observations are copied, because an
-    environment may write the next one into the same array.
-
-    >>> env = FiniteNumbers(gym.make("Pendulum-v1", disable_env_checker=True))
-    >>> _ = env.reset(seed=0)
-    >>> env.step(np.array([np.nan]))
-    Traceback (most recent call last):
-    noisy_wrappers.NotFiniteError: step 1 of an episode: the environment was given the action [nan]
-    """
-
-    def __init__(self, env: Env):
-        """Wrap an environment with Box observations."""
-        gym.Wrapper.__init__(self, env)
-        RecordConstructorArgs.__init__(self)
-        self._steps = 0
-
-    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        """Reset the environment and check the first observation."""
-        self._steps = 0
-        observation, info = self.env.reset(seed=seed, options=options)
-        self._check("returned the observation", observation)
-        return np.array(observation), info
-
-    def step(self, action: Any) -> Step:
-        """Step the environment and check the observation and the reward."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        self._steps += 1
-        if isinstance(reward, str):
-            self._stop("returned the reward", reward)
-        number = float(reward.item() if isinstance(reward, np.ndarray) else reward)
-        if not (math.isfinite(number) and np.isfinite(observation).all()):
-            if isinstance(action, np.ndarray):
-                self._check("was given the action", action)
-            self._check("returned the reward", number)
-            self._check("returned the observation", observation)
-        return np.array(observation), number, terminated, truncated, info
-
-    def _check(self, what: str, value: Any) -> None:
-        if not np.isfinite(value).all():
-            self._stop(what, np.asarray(value).tolist())
-
-    def _stop(self, what: str, value: Any) -> None:
-        raise NotFiniteError(f"step {self._steps} of an episode: the environment {what} {value!r}")
 
 
 @dataclass(frozen=True)
@@ -759,6 +1032,7 @@ class Noise:
     wrapper: type[NoiseWrapper]
     args: tuple[Any, ...] = ()
     kwargs: tuple[tuple[str, Any], ...] = ()
+    module: str = ""  # of a wrapper that is not ours
 
     def __call__(self, env: Env, noise_rate: float | str) -> NoiseWrapper:
         """Wrap an environment."""
@@ -768,20 +1042,22 @@ class Noise:
         """Return the canonical notation, e.g. "RandomMixupObservation(0.0, recursive=True)"."""
         arguments = [repr(value) for value in self.args]
         arguments += [f"{name}={value!r}" for name, value in self.kwargs]
-        return f"{self.wrapper.__name__}({', '.join(arguments)})"
+        module = f"{self.module}:" if self.module else ""
+        return f"{module}{self.wrapper.__name__}({', '.join(arguments)})"
 
 
 def signatures() -> list[str]:
     """Return the wrappers with their parameters, as a noise is written.
 
     >>> signatures()[0]
-    'RandomNormalNoisyObservation(scale, *, loc=0.0)'
+    'RandomNormalNoisyObservation(scale, *, loc=0.0, keys=None)'
     """
     found = []
     for name, wrapper in WRAPPERS.items():
         parameters = [p.replace(annotation=p.empty) for p in _parameters(wrapper)]
         text = f"{name}{inspect.Signature(parameters)}"
-        found.append(text.replace("low=None, high=None", "low, high=low"))  # early termination
+        # as early termination and the delay mean it
+        found.append(re.sub("low(=None)?, high=None", "low, high=low", text))
     return found
 
 
@@ -789,56 +1065,78 @@ def parse_noise(text: str) -> Noise:
     """Read the paper's notation, e.g. "RandomUniformScaleReward(0.5, 1.5)".
 
     Only literals are allowed; nothing is evaluated. The wrapper's constructor checks the arguments.
+    "my_noises:StickyAction(3)" is a wrapper of your own: the module is imported, one of the folder
+    that Python was started in first.
 
     >>> str(parse_noise("RandomUniformScaleReward(.50, high=1.5)"))
     'RandomUniformScaleReward(0.5, 1.5)'
 
     Raises:
         ValueError: unknown name or bad arguments; below the first line, the message lists the
-            wrappers, one on a line.
+            wrappers, one on a line. What a module of your own raises passes through.
     """
     if not isinstance(text, str):
-        raise _bad_noise(text, "expected Name(number, ..., keyword=value)")
+        raise _bad_noise(text, _EXPECTED)
     return _read_noise(text)
 
 
 @functools.cache  # the runs of a large sweep have few different noises
 def _read_noise(text: str) -> Noise:
-    try:
-        name, args, kwargs = _read_call(text)
-    except (MemoryError, RecursionError, SyntaxError, TypeError, ValueError):
-        raise _bad_noise(text, "expected Name(number, ..., keyword=value)") from None
-    if name not in WRAPPERS:
+    module, name, args, kwargs = _read_call(text)
+    wrapper = _import_wrapper(module, name, text) if module else WRAPPERS.get(name)
+    if wrapper is None:
         raise _bad_noise(text, "unknown name")
-    wrapper = WRAPPERS[name]
-    # Any length of a tuple is right for some environment: this one has that length.
-    sizes = [len(value) for value in [*args, *kwargs.values()] if isinstance(value, tuple)]
     try:
-        recorded = wrapper(_ProbeEnv(max(sizes, default=1)), 1.0, *args, **kwargs).parameters
-    except (TypeError, ValueError) as error:
-        raise _bad_noise(text, str(error)) from None
+        inspect.signature(wrapper).bind(None, 1.0, *args, **kwargs)
+    except TypeError as error:
+        raise _bad_noise(text, str(error), module) from None
+    try:
+        recorded = wrapper(_ProbeEnv(), 1.0, *args, **kwargs).parameters
+    except ValueError as error:
+        raise _bad_noise(text, str(error), module) from None
     used = [p for p in _parameters(wrapper) if recorded[p.name] != p.default]
     return Noise(
         wrapper,
         tuple(recorded[p.name] for p in used if p.kind is not p.KEYWORD_ONLY),
         tuple((p.name, recorded[p.name]) for p in used if p.kind is p.KEYWORD_ONLY),
+        module,
     )
 
 
-def _read_call(text: str) -> tuple[str, list[Any], dict[str, Any]]:
-    """Return the name, the positional and the keyword arguments of a call of literals."""
-    call = ast.parse(text.strip(), mode="eval").body
-    if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name):
-        raise ValueError("not a call of a name")
-    kwargs = {}
-    for keyword in call.keywords:
-        if keyword.arg is None or keyword.arg in kwargs:
+def _read_call(text: str) -> tuple[str, str, list[Any], dict[str, Any]]:
+    """Return the module, the name, the positional and the keyword arguments of literals."""
+    try:
+        module, colon, rest = text.strip().partition(":")
+        if not colon or "(" in module:
+            module, rest = "", text.strip()
+        call = ast.parse(rest, mode="eval").body
+        if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name):
+            raise ValueError("not a call of a name")
+        kwargs = {word.arg: ast.literal_eval(word.value) for word in call.keywords}
+        if None in kwargs or len(kwargs) < len(call.keywords):
             raise ValueError("an unpacked or repeated keyword")
-        kwargs[keyword.arg] = ast.literal_eval(keyword.value)
-    return call.func.id, [ast.literal_eval(arg) for arg in call.args], kwargs
+        return module, call.func.id, [ast.literal_eval(arg) for arg in call.args], kwargs
+    except (AttributeError, MemoryError, RecursionError, SyntaxError, TypeError, ValueError):
+        raise _bad_noise(text, _EXPECTED) from None
 
 
-def _bad_noise(text: str, reason: str) -> ValueError:
+def _import_wrapper(module: str, name: str, text: str) -> type[NoiseWrapper]:
+    """Return a wrapper of the user's own."""
+    _import_module(module, f"bad noise {text!r}")
+    wrapper = getattr(sys.modules[module], name, None)
+    if not isinstance(wrapper, type):
+        raise _bad_noise(text, f"{module} has no class {name}", module)
+    if not issubclass(wrapper, NoiseWrapper):
+        raise _bad_noise(text, f"{name} must be a subclass of noisy_wrappers.NoiseWrapper", module)
+    return wrapper
+
+
+_EXPECTED = "expected Name(number, ..., keyword=value)"
+
+
+def _bad_noise(text: str, reason: str, module: str = "") -> ValueError:
+    if module:
+        return ValueError(f"bad noise {text!r}: {reason}")
     return ValueError("\n  ".join([f"bad noise {text!r}: {reason}; valid are", *signatures()]))
 
 
@@ -846,8 +1144,8 @@ def _bad_noise(text: str, reason: str) -> ValueError:
 class Configuration:
     """The noises of a run or of a test, each with its rate; without any it is the baseline.
 
-    It is made once, from what a user writes (:meth:`read`) or from what a program has stored
-    (:meth:`stored`, :meth:`parse`), and then asked: no other code takes such text apart. Equal
+    It is made once, of what a user writes or config.json holds (:meth:`read`) or of two cells of a
+    csv file (:meth:`parse`), and then asked: no other code takes such text apart. Equal
     configurations are equal objects. They are ordered by noise, then by rate, the baseline first.
 
     >>> ending = Configuration.read(["RandomEarlyTermination(50, 50)"], ["1:0"])
@@ -859,8 +1157,14 @@ class Configuration:
     rates: tuple[tuple[float, float], ...] = ()  # of each, at the start and the end of training
 
     @classmethod
-    def read(cls, noises: Sequence[str], rates: Sequence[float | str]) -> "Configuration":
-        """Check noises and rates and make them canonical, as :func:`canonical_noises` says."""
+    def read(
+        cls, noises: Sequence[str], rates: Sequence[float | str], *, stored: bool = False
+    ) -> "Configuration":
+        """Check noises and rates and make them canonical, as :func:`canonical_noises` says.
+
+        ``stored`` are those of a config.json. They are canonical; one of the user's own is taken as
+        it stands, because its module need not be where its runs are analysed.
+        """
         noises = _listed("noises", noises, '["RandomNormalNoisyReward(0.1)"]')
         rates = _listed("rates", rates, "[0.5]")
         if noises and not rates:
@@ -875,21 +1179,22 @@ class Configuration:
         schedules = [_schedule(rate) for rate in rates]
         if len(schedules) == 1:
             schedules = schedules * len(noises)
-        parsed = [parse_noise(noise) for noise in noises]
+        parsed = [n if stored and _read_call(n)[0] else parse_noise(n) for n in noises]
         pairs = [pair for pair in zip(parsed, schedules, strict=True) if pair[1] != (0.0, 0.0)]
-        pairs.sort(key=lambda pair: _place(pair[0].wrapper))
+        if not stored:
+            pairs.sort(key=lambda pair: _place(pair[0].wrapper))
         return cls(tuple(str(noise) for noise, _ in pairs), tuple(rate for _, rate in pairs))
 
     @classmethod
-    def stored(cls, noises: Sequence[str], rates: Sequence[float | str]) -> "Configuration":
-        """Return what :attr:`texts` describe, as config.json holds them; names are not checked."""
-        ends = [[float(end) for end in re.split(":| to ", str(rate))] for rate in rates]
-        return cls(tuple(noises), tuple((rate[0], rate[-1]) for rate in ends))
-
-    @classmethod
     def parse(cls, noise: str, noise_rate: float | str) -> "Configuration":
-        """Read two cells of a csv file, :attr:`columns` or :attr:`noise` and :attr:`noise_rate`."""
-        return cls.stored(noise.split(" + "), str(noise_rate).split(" + ")) if noise else cls()
+        """Read two cells of a csv file, :attr:`columns` or :attr:`noise` and :attr:`noise_rate`.
+
+        Nothing is checked.
+        """
+        if not noise:
+            return cls()
+        rates = [re.split(":| to ", rate) for rate in str(noise_rate).split(" + ")]
+        return cls(tuple(noise.split(" + ")), tuple((float(r[0]), float(r[-1])) for r in rates))
 
     @property
     def texts(self) -> tuple[list[str], list[float | str]]:
@@ -923,13 +1228,16 @@ class Configuration:
 
     @property
     def wrappers(self) -> list[str]:
-        """The names of the wrappers, in order."""
+        """The names of the wrappers, in order, as they are written: perhaps with a module."""
         return [noise.partition("(")[0] for noise in self.noises]
 
     @property
     def kinds(self) -> set[str]:
-        """What the noises perturb: "observation", "reward", "action" or "dynamics"."""
-        return {WRAPPERS[name].kind for name in self.wrappers}
+        """What the noises perturb: "observation", "reward", "action", "dynamics", or "own".
+
+        The last is a noise that is not ours: its module need not be there where runs are analysed.
+        """
+        return {WRAPPERS[name].kind if name in WRAPPERS else "own" for name in self.wrappers}
 
     @property
     def parts(self) -> list["Configuration"]:
@@ -952,12 +1260,14 @@ class Configuration:
         """Stack the noises on an environment, as :func:`make_noisy` says."""
         if not isinstance(env, gym.Env):
             raise TypeError(f"make_noisy takes a single gymnasium.Env, not a {type(env).__name__}")
+        if isinstance(env, gym.wrappers.FlattenObservation) and not isinstance(
+            env.env.observation_space, gym.spaces.Box
+        ):
+            noisy = self.wrap(env.env, record_statistics=record_statistics)
+            return gym.wrappers.FlattenObservation(noisy)
         pairs = [(parse_noise(noise), rate) for noise, rate in zip(*self.texts, strict=True)]
-        recorded = any(env.has_wrapper_attr(name) for name in _OF_RECORDERS)
-        if recorded and record_statistics:
+        if record_statistics and any(env.has_wrapper_attr(name) for name in _OF_RECORDERS):
             raise ValueError(_RECORDED)
-        if recorded and any(noise.wrapper is RandomEarlyTermination for noise, _ in pairs):
-            raise ValueError(_RECORDED_BENEATH_EARLY_TERMINATION)
         for noise, rate in pairs:
             if noise.wrapper.kind in _BEFORE_STATISTICS:
                 env = noise(env, rate)
@@ -999,9 +1309,10 @@ def _listed(name: str, values: Any, example: str) -> list[Any]:
 
 
 def _place(wrapper: type[NoiseWrapper]) -> int:
-    """Return where make_noisy puts a noise: what changes the dynamics comes first."""
-    before = wrapper.kind in _BEFORE_STATISTICS
-    return _BEFORE_STATISTICS.index(wrapper.kind) if before else len(_BEFORE_STATISTICS)
+    """Return where make_noisy puts a noise, counted from the environment."""
+    if wrapper in (RandomDynamics, RandomActionDelay):  # the innermost of their kind
+        return 0 if wrapper is RandomDynamics else 2
+    return {"dynamics": 1, "action": 3}.get(wrapper.kind, 4)
 
 
 def canonical_noises(
@@ -1009,8 +1320,8 @@ def canonical_noises(
 ) -> tuple[list[str], list[float | str]]:
     """Return noises in canonical notation and one rate for each.
 
-    Noises of rate 0 are dropped (they are the baseline). Early termination and action noise come
-    first, where :func:`make_noisy` applies them. One rate serves all noises. A rate is a number in
+    Noises of rate 0 are dropped (they are the baseline). Dynamics and action noise come first,
+    where :func:`make_noisy` applies them. One rate serves all noises. A rate is a number in
     [0, 1], or "start:end" of two such numbers, which is a number if they are equal.
 
     >>> canonical_noises(["RandomNormalNoisyReward(1)", "RandomEarlyTermination(50, 50)"], [0.1])
@@ -1033,11 +1344,13 @@ def make_noisy(
 ) -> Env:
     """Stack noises on an environment, around a record of the true returns.
 
-    Early termination is innermost, then action noise, then
+    Dynamics noise is innermost (:class:`RandomDynamics`, then early termination), then action noise
+    (:class:`RandomActionDelay` first), then
     ``gymnasium.wrappers.RecordEpisodeStatistics``, then the other noises in the order given, so
     ``info["episode"]`` has the return before reward noise. ``record_statistics=False`` leaves the
     record out, for an environment that keeps one itself, such as Stable-Baselines3's Monitor.
     Early termination must then be inside that record, which would miss the episodes that it ends.
+    Where dictionaries or tuples are flattened by the outermost wrapper, all goes inside that one.
 
     >>> make_noisy(gym.make("CartPole-v1").unwrapped, ["RandomNormalNoisyReward(1)"], [0.1])
     <RandomNormalNoisyReward<RecordEpisodeStatistics<CartPoleEnv<CartPole-v1>>>>
@@ -1051,37 +1364,36 @@ def make_noisy(
     return Configuration.read(noises, rates).wrap(env, record_statistics=record_statistics)
 
 
-def make_flat(env: Env) -> Env:
-    """Prepare an environment for networks, whose inputs and outputs are vectors.
+# Noise of these kinds acts before an episode's statistics are recorded.
+_BEFORE_STATISTICS = ("dynamics", "action")
+# What gives away Gymnasium's RecordEpisodeStatistics and Stable-Baselines3's Monitor.
+_OF_RECORDERS = ("return_queue", "get_episode_rewards")
+_RECORDED = (
+    "this environment records its episodes already (in info['episode'], as RecordEpisodeStatistics "
+    "and Monitor do): take that off, or use make_noisy(..., record_statistics=False)"
+)
+_RECORDED_BENEATH_EARLY_TERMINATION = (
+    "this environment records its episodes already, and the record would miss those that "
+    "RandomEarlyTermination ends: apply that first, as in Monitor(make_noisy(env, "
+    "['RandomEarlyTermination(50)'], [0.5], record_statistics=False)), and the other noises after"
+)
 
-    Non-vector observations (dictionaries, tuples, arrays, categories) are flattened by
-    ``gymnasium.wrappers.FlattenObservation``; :class:`FiniteNumbers` makes rewards floats and stops
-    at NaN and infinity. Apply noise to the result: ``make_noisy(make_flat(env), ...)``.
 
-    >>> make_flat(gym.make("Pendulum-v1").unwrapped)
-    <FiniteNumbers<PendulumEnv<Pendulum-v1>>>
-    >>> make_flat(gym.make("CartPole-v1"))  # doctest: +ELLIPSIS
-    Traceback (most recent call last):
-    noisy_wrappers.SpaceError: needs Box actions of floats in one dimension; CartPole-v1 has ...
+class RecordEpisodeStatistics(gym.wrappers.RecordEpisodeStatistics[Any, Any]):
+    """Gymnasium's wrapper, with a clear error if the environment records its episodes itself."""
 
-    Raises:
-        SpaceError: actions are not a vector of floats, or observations cannot become a vector.
-    """
-    name = env.spec.id if env.spec else str(env)
-    space = env.observation_space
-    is_vector = isinstance(space, gym.spaces.Box) and len(space.shape) == 1
-    if space.is_np_flattenable and not is_vector:
-        env = gym.wrappers.FlattenObservation(env)
-    observations, actions = env.observation_space, env.action_space
-    if not isinstance(observations, gym.spaces.Box) or observations.dtype.kind not in "fiu":
-        raise SpaceError(f"needs Box observations of numbers; {name} has {observations}")
-    if (
-        not isinstance(actions, gym.spaces.Box)
-        or actions.dtype.kind != "f"
-        or len(actions.shape) != 1
-    ):
-        raise SpaceError(f"needs Box actions of floats in one dimension; {name} has {actions}")
-    return FiniteNumbers(env)
+    def step(self, action: Any) -> Step:
+        """Step the environment; raise ValueError if its info has an "episode" already."""
+        steps = self.episode_lengths
+        try:
+            return super().step(action)
+        except AssertionError as error:
+            if self.episode_lengths == steps:  # it comes from the environment's own step
+                raise
+            raise ValueError(_RECORDED) from error
+
+
+# ---------------------------------------------------------------------------------- during training
 
 
 def set_progress(env: Any, fraction: float) -> None:
@@ -1169,85 +1481,7 @@ def _call_each(env: Any, method: str, *args: Any, **kwargs: Any) -> Sequence[Any
     raise TypeError(f"needs an environment or a vector of environments, not {type(env).__name__}")
 
 
-class EnvState:
-    """What an environment carries from one episode to the next, to resume training.
-
-    That is the random generators of the environment and of its action space, the random streams and
-    the counters of its noise wrappers, and the returns that RecordEpisodeStatistics remembers.
-    Further ``generators`` are kept with them. After loading, call :func:`set_progress` again. An
-    environment that carries more than its generator ``np_random`` from one episode to the next does
-    not resume exactly.
-
-    >>> env = make_noisy(gym.make("Pendulum-v1"), ["RandomNormalNoisyObservation(1)"], [0.5])
-    >>> _ = env.reset(seed=1)
-    >>> saved = EnvState(env).state_dict()
-    >>> first, _ = env.reset()
-    >>> EnvState(env).load_state_dict(saved)
-    >>> bool((env.reset()[0] == first).all())
-    True
-    """
-
-    def __init__(self, env: Env, *generators: np.random.Generator):
-        """Take an environment that has been reset with a seed."""
-        self.env = env
-        self.generators = generators
-
-    def _generators(self) -> list[Any]:
-        environment, actions = self.env.unwrapped.np_random, self.env.action_space.np_random
-        return [environment, actions, *self.generators]
-
-    def _returns(self) -> deque[float]:
-        recorded = self.env.has_wrapper_attr("return_queue")
-        return self.env.get_wrapper_attr("return_queue") if recorded else deque()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the state in Python's own types, to be taken between two episodes."""
-        return {
-            "generators": [_stream(generator) for generator in self._generators()],
-            "noise": [wrapper.state_dict() for wrapper in noise_wrappers(self.env).values()],
-            "returns": [float(value) for value in self._returns()],
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a :meth:`state_dict`; the next call of the environment must be ``reset()``.
-
-        Raises:
-            ValueError: a state of another number of generators or noise wrappers.
-        """
-        for generator, stream in zip(self._generators(), state["generators"], strict=True):
-            if isinstance(generator, np.random.RandomState):
-                generator.set_state(stream)
-            else:
-                generator.bit_generator.state = stream
-        wrappers = noise_wrappers(self.env).values()
-        for wrapper, part in zip(wrappers, state["noise"], strict=True):
-            wrapper.load_state_dict(part)
-        self._returns().clear()
-        self._returns().extend(state["returns"])
-
-
-def _stream(generator: Any) -> Any:
-    """Return the state of a random generator; dm_control's environments have a RandomState."""
-    if isinstance(generator, np.random.RandomState):
-        return _without_arrays(generator.get_state(legacy=False))
-    return _without_arrays(generator.bit_generator.state)
-
-
-def _without_arrays(value: Any) -> Any:
-    """Turn an array, also in nested dicts, into lists or a number of Python's own types."""
-    if isinstance(value, dict):
-        return {name: _without_arrays(part) for name, part in value.items()}
-    return value.tolist() if isinstance(value, np.ndarray) else value
-
-
-# The scripts' arguments that change nothing about what a run learns. A run may be resumed with
-# others, and a finished one counts as done whatever it had.
-MAY_DIFFER_IN_A_RUN = frozenset(
-    ("runs_dir", "overwrite", "torch_threads", "compile", "checkpoint_frequency")
-)
-# Runs with other values of these may stand in one row of a table, too: a GPU rounds otherwise, and
-# tests do not touch training. But a run keeps to the ones that it began with.
-MAY_DIFFER_IN_A_TABLE = MAY_DIFFER_IN_A_RUN | {"cuda", "eval_frequency"}
+# ----------------------------------------------------------------------- names of files and folders
 
 
 def noise_slug(noises: Sequence[str], rates: Sequence[float | str]) -> str:
@@ -1257,14 +1491,6 @@ def noise_slug(noises: Sequence[str], rates: Sequence[float | str]) -> str:
     'p0.05_UniformScaleReward_0.5_1.5'
     """
     return Configuration.read(noises, rates).slug
-
-
-def _words(noise: str) -> str:
-    return "_".join(re.findall(r"[^(), ]+", noise))
-
-
-def _rate_word(rate: tuple[float, float]) -> str:
-    return str(_spelled(rate)).replace(":", "to")
 
 
 def run_name(
@@ -1309,184 +1535,22 @@ def run_folder(
     return Path(runs_dir, run_name(env_id, exp_name, noises, rates, seed))
 
 
+def _words(noise: str) -> str:
+    """Return a noise as a part of a file's name; different noises have different ones."""
+    plain = noise.replace("=(", "=").replace("', '", "-").replace("'", "")  # keys=a-b
+    words = _safe("_".join(re.findall(r"[^(), ]+", plain)))
+    if re.sub(r"'[A-Za-z_][A-Za-z0-9_.]*'", "", noise).count("'"):  # a key that is no plain name
+        words += "_" + hashlib.sha256(noise.encode()).hexdigest()[:8]
+    return words
+
+
+def _rate_word(rate: tuple[float, float]) -> str:
+    return str(_spelled(rate)).replace(":", "to")
+
+
 def _safe(text: str) -> str:
     """Replace what a folder's name cannot hold: "/" by one dash, anything else by two."""
     return re.sub(r"[^A-Za-z0-9._=+-]", lambda match: "-" if match[0] == "/" else "--", text)
-
-
-def canonical_env_id(env_id: str) -> str:
-    """Return the id of the environment that ``gymnasium.make(env_id)`` makes, with its version.
-
-    "module:Env-v0" imports the module, which registers the environment, and stays "module:Env-v0".
-    A module of the folder that Python was started in wins over one of this project's.
-
-    >>> canonical_env_id("Hopper")
-    'Hopper-v5'
-
-    Raises:
-        ValueError: an environment that is not registered or a module that does not exist; what a
-            module raises while it is imported passes through.
-    """
-    module, colon, name = env_id.rpartition(":")
-    if module:
-        _import_module(module, env_id)
-    try:
-        namespace, base_name, version = parse_env_id(name)
-        if version is None:
-            version = find_highest_version(namespace, base_name)
-        spec = gym.spec(get_env_id(namespace, base_name, version))
-    except gym.error.Error as error:
-        raise ValueError(f"there is no environment {env_id!r}: {error}") from error
-    return f"{module}{colon}{spec.id}"
-
-
-def _import_module(module: str, env_id: str) -> None:
-    """Import the module of an environment, as if this file's folder came last."""
-    here, caller, path = str(Path(__file__).parent), os.getcwd(), sys.path[:]
-    others = [folder for folder in path if folder not in (here, caller)]
-    sys.path[:] = [*others, here] if caller == here else [caller, *others, here]
-    top = module.partition(".")[0]
-    try:
-        if not all(map(str.isidentifier, module.split("."))):
-            raise ValueError(f"there is no environment {env_id!r}: {module!r} is not a module name")
-        loaded, found = sys.modules.get(top), importlib.machinery.PathFinder.find_spec(top)
-        if loaded and found and found.origin != getattr(loaded, "__file__", found.origin):
-            raise ValueError(
-                f"there is no environment {env_id!r}: a module {top!r} is loaded already, from "
-                f"{loaded.__file__}; rename yours"
-            )
-        importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
-            raise  # it exists, and imports another one that does not
-        raise ValueError(f"there is no environment {env_id!r}: {error}") from error
-    finally:
-        sys.path[:] = path
-
-
-def refusals(env_id: str) -> tuple[type[Exception], ...]:
-    """Return the errors that ``make_flat(gymnasium.make(env_id))`` raises on purpose.
-
-    They are Gymnasium's and this module's. Of Gymnasium's own environments a missing dependency is
-    an ImportError; any other error comes from the environment's code.
-    """
-    spec = gym.registry.get(env_id.rpartition(":")[2])
-    maker: Any = spec.entry_point if spec else ""  # "package.module:Class" or a function
-    is_gymnasiums = getattr(maker, "__module__", str(maker)).startswith("gymnasium.")
-    return (gym.error.Error, SpaceError, *([ImportError] if is_gymnasiums else []))
-
-
-def _layers(env: Env) -> Iterator[gym.Wrapper[Any, Any, Any, Any]]:
-    """Yield an environment's wrappers, outermost first."""
-    while isinstance(env, gym.Wrapper):
-        yield env
-        env = env.env
-
-
-def _noise_layers(env: Env) -> Iterator[NoiseWrapper]:
-    """Yield an environment's noise wrappers, outermost first."""
-    for layer in _layers(env):
-        if isinstance(layer, NoiseWrapper):
-            yield layer
-
-
-def _has_categories(space: gym.Space[Any]) -> bool:
-    """Return whether a space contains categories, which flattening makes one-hot vectors."""
-    if isinstance(space, gym.spaces.Dict):
-        return any(_has_categories(part) for part in space.values())
-    if isinstance(space, gym.spaces.Tuple):
-        return any(_has_categories(part) for part in space)
-    return isinstance(space, gym.spaces.Discrete | gym.spaces.MultiDiscrete)
-
-
-class _ProbeEnv(gym.Env[Any, Any]):
-    """Just enough of an environment to construct a wrapper on; it observes `size` numbers."""
-
-    def __init__(self, size: int):
-        self.observation_space = gym.spaces.Box(-1.0, 1.0, (size,))
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,))
-
-
-def _parameters(wrapper: type[NoiseWrapper]) -> list[inspect.Parameter]:
-    """Return a wrapper's own parameters, those after self, env and noise_rate."""
-    return list(inspect.signature(wrapper.__init__).parameters.values())[3:]
-
-
-def _cast(values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Cast float64 values; to an integer dtype they are rounded and clipped to its range."""
-    if dtype.kind in "iu":
-        info = np.iinfo(dtype)
-        # The largest 64-bit integers are no doubles: float(2**63 - 1) would overflow the cast.
-        largest = info.max if info.bits < 64 else np.nextafter(float(info.max), 0.0)
-        values = np.clip(np.rint(values), info.min, largest)
-    return np.asarray(values, dtype)
-
-
-def _number(name: str, value: float, low: float = -math.inf, high: float = math.inf) -> float:
-    number = math.nan
-    plain = _without_arrays(value)
-    if isinstance(plain, numbers.Real) and not isinstance(plain, bool):
-        with contextlib.suppress(OverflowError):  # an integer beyond the range of floats
-            number = float(plain)
-    if not (math.isfinite(number) and low <= number <= high):
-        raise ValueError(f"{name} must be a finite number in [{low}, {high}], got {value!r}")
-    return number + 0.0  # -0.0 becomes 0.0
-
-
-def _schedule(noise_rate: float | str) -> tuple[float, float]:
-    """Return the rates at the beginning and at the end of training."""
-    try:
-        if isinstance(noise_rate, str):
-            start, end = (float(number) for number in noise_rate.split(":"))
-        else:
-            start = end = noise_rate
-        return (
-            _number("noise_rate", start, low=0, high=1),
-            _number("noise_rate", end, low=0, high=1),
-        )
-    except ValueError:
-        raise ValueError(
-            'a noise_rate must be a number in [0, 1], or "start:end" of two such numbers, as '
-            f'"1.0:0.0", got {noise_rate!r}'
-        ) from None
-
-
-def _spelled(schedule: tuple[float, float]) -> float | str:
-    """Return a schedule as it is written: one number, or "start:end" where they differ."""
-    start, end = schedule
-    return start if start == end else f"{start}:{end}"
-
-
-def _interval(low: float, high: float) -> tuple[float, float]:
-    low, high = _number("low", low), _number("high", high)
-    if low > high:
-        raise ValueError(f"low must not exceed high, got low={low}, high={high}")
-    return low, high
-
-
-def _scale_or_scales(value: float | tuple[float, ...] | list[float]) -> float | tuple[float, ...]:
-    """Check one standard deviation for all dimensions, or a tuple (in JSON a list) of them."""
-    scales = _without_arrays(value)
-    if not isinstance(scales, tuple | list):
-        return _number("scale", scales, low=0)
-    if len(scales) < 2:
-        raise ValueError(f"scale must be one number, or a tuple of two or more, got {value!r}")
-    return tuple(_number("every scale", number, low=0) for number in scales)
-
-
-def _step_number(name: str, value: int | None) -> int:
-    plain = _without_arrays(value)
-    if isinstance(plain, numbers.Integral) and not isinstance(plain, bool):
-        number = int(plain)
-        if 1 <= number < 2**63:  # Generator.integers draws 64-bit integers
-            return number
-    raise ValueError(f"{name} must be an integer in [1, 2**63), got {value!r}")
-
-
-def _flag(name: str, value: bool) -> bool:
-    if not isinstance(value, bool):
-        raise ValueError(f"{name} must be True or False, got {value!r}")
-    return value
 
 
 # ------------------------------------------------------------------------------ numbers for people
@@ -1518,3 +1582,628 @@ def rounded(value: float, spread: float | None = None) -> str:
         return "0"
     exponent = int(f"{value:e}".partition("e")[2])
     return f"{value:.{max(0, exponent + decimals)}e}"
+
+
+# ------------------------------------------------------------------------------ wrappers and spaces
+
+
+def _layers(env: Env) -> Iterator[gym.Wrapper[Any, Any, Any, Any]]:
+    """Yield an environment's wrappers, outermost first."""
+    while isinstance(env, gym.Wrapper):
+        yield env
+        env = env.env
+
+
+def _noise_layers(env: Env) -> Iterator[NoiseWrapper]:
+    """Yield an environment's noise wrappers, outermost first."""
+    for layer in _layers(env):
+        if isinstance(layer, NoiseWrapper):
+            yield layer
+
+
+def _entries(space: gym.Space[Any], path: EntryPath = ()) -> Iterator[tuple[EntryPath, Any]]:
+    """Yield the entries of nested Dict and Tuple spaces, in the order in which they are flattened.
+
+    Each is (the keys that lead to it, its space); a space of another kind is one entry.
+    """
+    parts: Any = None
+    if isinstance(space, gym.spaces.Dict):
+        parts = space.items()
+    elif isinstance(space, gym.spaces.Tuple):
+        parts = enumerate(space)
+    if parts is None:
+        yield path, space
+        return
+    for key, part in parts:
+        yield from _entries(part, (*path, key))
+
+
+def _subscript(path: EntryPath) -> str:
+    return "".join(f"[{key!r}]" for key in path)
+
+
+def _replaced(nested: Any, entries: dict[EntryPath, Any]) -> Any:
+    """Return a nested observation, or its space, with other entries in containers of its own."""
+    if () in entries:
+        return entries[()]
+    of_key: dict[Any, dict[EntryPath, Any]] = {}
+    for (key, *path), entry in entries.items():
+        of_key.setdefault(key, {})[tuple(path)] = entry
+    pairs = nested.items() if isinstance(nested, Mapping) else enumerate(nested)
+    parts = {key: _replaced(part, of_key[key]) if key in of_key else part for key, part in pairs}
+    if isinstance(nested, gym.spaces.Dict):
+        return gym.spaces.Dict(list(parts.items()))
+    if isinstance(nested, gym.spaces.Tuple):
+        return gym.spaces.Tuple(list(parts.values()))
+    return parts if isinstance(nested, Mapping) else tuple(parts.values())
+
+
+def _has_categories(env: Env) -> bool:
+    """Return whether observations contain categories, which flattening makes numbers of."""
+    kinds = gym.spaces.Discrete | gym.spaces.MultiDiscrete | gym.spaces.MultiBinary
+    return any(isinstance(part, kinds) for _, part in _entries(env.observation_space))
+
+
+def _cast(values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Cast float64 values; to an integer dtype they are rounded and clipped to its range."""
+    if dtype.kind in "iu":
+        info = np.iinfo(dtype)
+        # The largest 64-bit integers are no doubles: float(2**63 - 1) would overflow the cast.
+        largest = info.max if info.bits < 64 else np.nextafter(float(info.max), 0.0)
+        values = np.clip(np.rint(values), info.min, largest)
+    return np.asarray(values, dtype)
+
+
+# --------------------------------------------------------------------------------------- parameters
+
+
+class _ProbeEnv(gym.Env[Any, Any]):
+    """Stands for an environment that is not known yet, while a wrapper's arguments are read.
+
+    So a wrapper leaves alone what only the environment can tell: its keys, its simulator.
+    """
+
+    def __init__(self) -> None:
+        self.observation_space = gym.spaces.Box(-1.0, 1.0, (1,))
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+
+
+def _parameters(wrapper: type[NoiseWrapper]) -> list[inspect.Parameter]:
+    """Return a wrapper's own parameters, those after self, env and noise_rate."""
+    return list(inspect.signature(wrapper.__init__).parameters.values())[3:]
+
+
+def _number(name: str, value: float, low: float = -math.inf, high: float = math.inf) -> float:
+    number = math.nan
+    plain = _without_arrays(value)
+    if isinstance(plain, numbers.Real) and not isinstance(plain, bool):
+        with contextlib.suppress(OverflowError):  # an integer beyond the range of floats
+            number = float(plain)
+    if not (math.isfinite(number) and low <= number <= high):
+        raise ValueError(f"{name} must be a finite number in [{low}, {high}], got {value!r}")
+    return number + 0.0  # -0.0 becomes 0.0
+
+
+def _interval(low: float, high: float, least: float = -math.inf) -> tuple[float, float]:
+    low, high = _number("low", low, least), _number("high", high, least)
+    if low > high:
+        raise ValueError(f"low must not exceed high, got low={low}, high={high}")
+    return low, high
+
+
+def _whole_interval(low: int | None, high: int | None, least: int) -> tuple[int, int]:
+    """Check two numbers of steps; the second is the first by default."""
+    ends = [_without_arrays(end) for end in (low, low if high is None else high)]
+    for name, end in zip(("low", "high"), ends, strict=True):
+        whole = isinstance(end, numbers.Integral) and not isinstance(end, bool)
+        if not (whole and least <= end < 2**63):  # Generator.integers draws 64-bit integers
+            raise ValueError(f"{name} must be an integer in [{least}, 2**63), got {end!r}")
+    low, high = map(int, ends)
+    if low > high:
+        raise ValueError(f"low must not exceed high, got low={low}, high={high}")
+    return low, high
+
+
+def _scale_or_scales(value: float | tuple[float, ...] | list[float]) -> float | tuple[float, ...]:
+    """Check one standard deviation for all dimensions, or a tuple (in JSON a list) of them."""
+    scales = _without_arrays(value)
+    if not isinstance(scales, tuple | list):
+        return _number("scale", scales, low=0)
+    if len(scales) < 2:
+        raise ValueError(f"scale must be one number, or a tuple of two or more, got {value!r}")
+    return tuple(_number("every scale", number, low=0) for number in scales)
+
+
+def _flag(name: str, value: bool) -> bool:
+    if not isinstance(value, bool):
+        raise ValueError(f"{name} must be True or False, got {value!r}")
+    return value
+
+
+def _keys(keys: Any) -> Keys | None:
+    """Check names or indices of observations; their order does not matter."""
+    if keys is None:
+        return None
+    found = (keys,) if isinstance(keys, str | int) else keys
+    of_one_kind = isinstance(found, tuple | list) and len({*map(type, found)} & {str, int}) == 1
+    if not of_one_kind or len({*map(type, found)}) > 1:
+        raise ValueError(f"keys must be a tuple of names, or of indices of a Tuple, got {keys!r}")
+    return tuple(sorted(set(found)))
+
+
+def _fields(fields: Any) -> tuple[str, ...]:
+    """Check names of arrays of MuJoCo's model."""
+    found = (fields,) if isinstance(fields, str) else fields
+    if not isinstance(found, tuple | list) or not found:
+        raise ValueError(f"fields must be a tuple of names, got {fields!r}")
+    for field in found:
+        if field not in _USUAL_FIELDS and not _is_field(field):
+            usual = ", ".join(_USUAL_FIELDS)
+            raise ValueError(
+                f"fields: {field!r} is not given in MuJoCo's model for each body, geom, joint, "
+                f"degree of freedom, actuator or tendon; usual are {usual}"
+            )
+    if {"body_mass", "body_inertia"} <= set(found):
+        raise ValueError("fields: body_mass takes body_inertia along, so name one of them")
+    return tuple(dict.fromkeys(found))
+
+
+def _is_field(name: Any) -> bool:
+    try:
+        import mujoco
+    except ImportError:  # then there is no environment to apply it to, either
+        return False
+    rows = ("body_", "geom_", "jnt_", "dof_", "actuator_", "tendon_")
+    if not isinstance(name, str) or not name.startswith(rows) or name in _DERIVED_FIELDS:
+        return False
+    array = getattr(mujoco.MjModel.from_xml_string("<mujoco/>"), name, None)
+    return isinstance(array, np.ndarray) and array.dtype == np.float64
+
+
+def _schedule(noise_rate: float | str) -> tuple[float, float]:
+    """Return the rates at the beginning and at the end of training."""
+    try:
+        if isinstance(noise_rate, str):
+            start, end = (float(number) for number in noise_rate.split(":"))
+        else:
+            start = end = noise_rate
+        return (
+            _number("noise_rate", start, low=0, high=1),
+            _number("noise_rate", end, low=0, high=1),
+        )
+    except ValueError:
+        raise ValueError(
+            'a noise_rate must be a number in [0, 1], or "start:end" of two such numbers, as '
+            f'"1.0:0.0", got {noise_rate!r}'
+        ) from None
+
+
+def _spelled(schedule: tuple[float, float]) -> float | str:
+    """Return a schedule as it is written: one number, or "start:end" where they differ."""
+    start, end = schedule
+    return start if start == end else f"{start}:{end}"
+
+
+def _without_arrays(value: Any) -> Any:
+    """Turn an array, also in nested dicts, into lists or a number of Python's own types."""
+    if isinstance(value, dict):
+        return {name: _without_arrays(part) for name, part in value.items()}
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+# ---------------------------------------------------------------------------- modules of the user's
+
+
+def _import_module(module: str, problem: str) -> None:
+    """Import a module of the user's, as if this file's folder came last.
+
+    ``problem`` is what an error says first, as "there is no environment 'a:b'".
+    """
+    here, caller, path = str(Path(__file__).parent), os.getcwd(), sys.path[:]
+    others = [folder for folder in path if folder not in (here, caller)]
+    sys.path[:] = [*others, here] if caller == here else [caller, *others, here]
+    top = module.partition(".")[0]
+    try:
+        if not all(map(str.isidentifier, module.split("."))):
+            raise ValueError(f"{problem}: {module!r} is not a module name")
+        loaded, found = sys.modules.get(top), importlib.machinery.PathFinder.find_spec(top)
+        if loaded and found and found.origin != getattr(loaded, "__file__", found.origin):
+            raise ValueError(
+                f"{problem}: a module {top!r} is loaded already, from "
+                f"{loaded.__file__}; rename yours"
+            )
+        importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+            raise  # it exists, and imports another one that does not
+        raise ValueError(f"{problem}: {error}") from error
+    except Exception as error:
+        _raise_if_of_mujoco(error, module)
+        raise
+    finally:
+        sys.path[:] = path
+
+
+def _raise_if_of_mujoco(error: Exception, name: str) -> None:
+    """Raise ValueError if MuJoCo could not be imported with the renderer that MUJOCO_GL names."""
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    packages = {frame.f_globals.get("__name__", "").partition(".")[0] for frame in frames}
+    renderer = os.environ.get("MUJOCO_GL")
+    if renderer and packages & {"mujoco", "dm_control"}:
+        raise ValueError(
+            f"{name} imports MuJoCo, which fails with MUJOCO_GL={renderer} ({error}): training "
+            "draws nothing, so unset it; drawing needs the library that it names"
+        ) from error
+
+
+# ----------------------------------------------------------------------- what only the scripts need
+
+
+class NotFiniteError(FloatingPointError):
+    """A value that training cannot continue with: NaN, infinite, or not a number at all."""
+
+
+class SpaceError(ValueError):
+    """Observations or actions that are not vectors of numbers, or not what the API asks for."""
+
+
+class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Stops at NaN and infinity, and makes what an environment returns what the API asks for.
+
+    A learner that receives NaN does not recover, and may never show it. So this raises
+    NotFiniteError, which says whether the action was already NaN, as after a divergence. Rewards
+    become floats and the two ends bools; they may be arrays of one element, but not strings.
+    Observations, also in dictionaries and tuples, are copied, because an environment may write the
+    next one into the same array, and actions, because it may write into those. An observation that
+    has not the shape of its space, and a step of four values, raise SpaceError. The spaces are
+    looked up once, because an environment may make new ones, with new generators, at every access.
+
+    >>> env = FiniteNumbers(gym.make("Pendulum-v1", disable_env_checker=True))
+    >>> _ = env.reset(seed=0)
+    >>> env.step(np.array([np.nan]))
+    Traceback (most recent call last):
+    noisy_wrappers.NotFiniteError: step 1 of an episode: the environment was given the action [nan]
+    """
+
+    def __init__(self, env: Env):
+        """Wrap an environment; what is checked of observations are the Boxes, also in parts."""
+        gym.Wrapper.__init__(self, env)
+        RecordConstructorArgs.__init__(self)
+        self.action_space, self.observation_space = env.action_space, env.observation_space
+        self._boxes = {
+            path: part
+            for path, part in _entries(self.observation_space)
+            if isinstance(part, gym.spaces.Box)
+        }
+        self._steps = 0
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
+        """Reset the environment and check the first observation."""
+        self._steps = 0
+        try:
+            observation, info = self.env.reset(seed=seed, options=options)
+        except (TypeError, ValueError) as error:
+            self._refuse_old_api("reset() must return (observation, info)", error)
+            raise
+        return self._checked(observation), info
+
+    def step(self, action: Any) -> Step:
+        """Step the environment and check the observation and the reward."""
+        self._steps += 1
+        try:
+            observation, reward, terminated, truncated, info = self.env.step(copy.copy(action))
+        except (TypeError, ValueError) as error:
+            values = "(observation, reward, terminated, truncated, info)"
+            self._refuse_old_api(f"step() must return {values}", error)
+            raise
+        if isinstance(reward, str):
+            self._stop("returned the reward", reward)
+        number = float(reward.item() if isinstance(reward, np.ndarray) else reward)
+        if not math.isfinite(number):
+            self._blame("returned the reward", number, action)
+        return self._checked(observation, action), number, bool(terminated), bool(truncated), info
+
+    def _checked(self, observation: Any, action: Any = None) -> Any:
+        """Return a copy of an observation."""
+        parts = {}
+        for path, box in self._boxes.items():
+            part = np.array(functools.reduce(operator.getitem, path, observation))
+            if not np.isfinite(part).all():
+                self._blame(f"returned the observation{_subscript(path)}", part, action)
+            if part.shape != box.shape:
+                raise SpaceError(
+                    f"step {self._steps} of an episode: the environment returned an "
+                    f"observation{_subscript(path)} of shape {part.shape}, and its "
+                    f"observation_space has shape {box.shape}"
+                )
+            parts[path] = part
+        return _replaced(observation, parts) if parts else observation
+
+    def _refuse_old_api(self, wanted: str, error: Exception) -> None:
+        """Raise SpaceError if a wrapper, and not the environment's own code, could not unpack."""
+        *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+        place = frame.f_globals.get("__name__", "")
+        if "unpack" in str(error) and place.startswith(("gymnasium.wrappers.", __name__)):
+            at = f"step {self._steps} of an episode"
+            raise SpaceError(f"{at}: the environment's {wanted}: {error}") from error
+
+    def _blame(self, what: str, value: Any, action: Any) -> None:
+        """Stop at a value that is not finite, or rather at an action that was not, either."""
+        if isinstance(action, np.ndarray) and not np.isfinite(action).all():
+            self._stop("was given the action", action.tolist())
+        self._stop(what, np.asarray(value).tolist())
+
+    def _stop(self, what: str, value: Any) -> None:
+        raise NotFiniteError(f"step {self._steps} of an episode: the environment {what} {value!r}")
+
+
+def make_flat(env: Env, step_limit: int | None = None) -> Env:
+    """Prepare an environment for networks, whose inputs and outputs are vectors.
+
+    :class:`FiniteNumbers` makes rewards floats and stops at NaN and infinity; non-vector
+    observations (dictionaries, tuples, arrays, categories) are then flattened by
+    ``gymnasium.wrappers.FlattenObservation``. An environment whose spec has no time limit is cut
+    after ``step_limit`` steps, if that is given. Apply noise to the result,
+    ``make_noisy(make_flat(env), ...)``: it goes in between, so it knows the parts.
+
+    >>> make_flat(gym.make("Pendulum-v1").unwrapped)
+    <FiniteNumbers<PendulumEnv<Pendulum-v1>>>
+    >>> make_flat(gym.make("CartPole-v1"))  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    noisy_wrappers.SpaceError: needs Box actions of floats in one dimension; CartPole-v1 has ...
+
+    Raises:
+        SpaceError: actions are not a vector of floats, or observations cannot become a vector; the
+            environment has been closed.
+    """
+    name = env.spec.id if env.spec else str(env)
+    if step_limit and env.spec and env.spec.max_episode_steps is None:
+        env = gym.wrappers.TimeLimit(env, step_limit)
+    env = FiniteNumbers(env)
+    space = env.observation_space
+    is_vector = isinstance(space, gym.spaces.Box) and len(space.shape) == 1
+    if space.is_np_flattenable and not is_vector:
+        env = gym.wrappers.FlattenObservation(env)
+    observations, actions = env.observation_space, env.action_space
+    if not isinstance(observations, gym.spaces.Box) or observations.dtype.kind not in "fiu":
+        env.close()
+        raise SpaceError(f"needs Box observations of numbers; {name} has {observations}")
+    if (
+        not isinstance(actions, gym.spaces.Box)
+        or actions.dtype.kind != "f"
+        or len(actions.shape) != 1
+    ):
+        env.close()
+        raise SpaceError(f"needs Box actions of floats in one dimension; {name} has {actions}")
+    return env
+
+
+def into_space(action: NDArray[Any], space: gym.spaces.Box) -> NDArray[Any]:
+    """Return an action in its space's dtype and, to the last bit, within its bounds.
+
+    >>> into_space(np.float64([0.1, 2]), gym.spaces.Box(-1, 1, (2,)))
+    array([0.1, 1. ], dtype=float32)
+    """
+    # in this order, because the cast may round a bound up
+    return action.astype(space.dtype).clip(space.low, space.high)
+
+
+def canonical_env_id(env_id: str) -> str:
+    """Return the id of the environment that ``gymnasium.make(env_id)`` makes, with its version.
+
+    "module:Env-v0" imports the module, which registers the environment, and stays "module:Env-v0".
+    A module of the folder that Python was started in wins over one of this project's.
+
+    >>> canonical_env_id("Hopper")
+    'Hopper-v5'
+
+    Raises:
+        ValueError: an environment that is not registered, a module that does not exist, or a
+            renderer that MUJOCO_GL names and MuJoCo lacks; what else a module raises while it is
+            imported passes through.
+    """
+    module, colon, name = env_id.rpartition(":")
+    if module:
+        _import_module(module, f"there is no environment {env_id!r}")
+    try:
+        namespace, base_name, version = parse_env_id(name)
+        if version is None:
+            version = find_highest_version(namespace, base_name)
+        spec = gym.spec(get_env_id(namespace, base_name, version))
+    except gym.error.Error as error:
+        raise ValueError(f"there is no environment {env_id!r}: {error}") from error
+    if os.environ.get("MUJOCO_GL") and isinstance(spec.entry_point, str):
+        try:
+            load_env_creator(spec.entry_point)
+        except Exception as error:  # gymnasium.make() will raise it again
+            _raise_if_of_mujoco(error, env_id)
+    return f"{module}{colon}{spec.id}"
+
+
+def refusals(env_id: str) -> tuple[type[Exception], ...]:
+    """Return the errors that ``make_flat(gymnasium.make(env_id))`` raises on purpose.
+
+    They are Gymnasium's and this module's. Of Gymnasium's own environments a missing dependency is
+    an ImportError, and those of Gymnasium-Robotics fail an assertion where MuJoCo is too new. Any
+    other error comes from the environment's code.
+    """
+    spec = gym.registry.get(env_id.rpartition(":")[2])
+    maker: Any = spec.entry_point if spec else ""  # "package.module:Class" or a function
+    package = getattr(maker, "__module__", str(maker)).partition(".")[0]
+    more = {"gymnasium": (ImportError,), "gymnasium_robotics": (AssertionError,)}
+    return (gym.error.Error, SpaceError, *more.get(package, ()))
+
+
+def seed_globals(seed: int) -> None:
+    """Seed the generators that an environment shares with everybody: Python's, NumPy's, PyTorch's.
+
+    PyTorch's is seeded only where PyTorch is loaded.
+    """
+    random.seed(seed)
+    np.random.seed(seed % 2**32)
+    if torch := sys.modules.get("torch"):
+        torch.manual_seed(seed)
+
+
+@contextlib.contextmanager
+def seeded_globals(seed: int) -> Iterator[None]:
+    """Seed them as :func:`seed_globals` does for some lines of code, and restore them after it.
+
+    >>> with seeded_globals(1):
+    ...     first = random.random()
+    >>> with seeded_globals(1):
+    ...     random.random() == first
+    True
+    """
+    torch: Any = sys.modules.get("torch")
+    python, numpy = random.getstate(), np.random.get_state()
+    pytorch = torch.get_rng_state() if torch else None
+    seed_globals(seed)
+    try:
+        yield
+    finally:
+        random.setstate(python)
+        np.random.set_state(numpy)
+        if torch:
+            torch.set_rng_state(pytorch)
+
+
+def outcome(info: Mapping[str, Any]) -> float:
+    """Return from the info of an episode's last step whether the task was solved.
+
+    That is 1.0 or 0.0 by ``is_success`` or ``success``, the names that Gymnasium-Robotics,
+    Meta-World and Stable-Baselines3 use, and NaN where the environment says nothing.
+
+    >>> outcome({"is_success": np.float32(1)}), outcome({"success": False}), outcome({})
+    (1.0, 0.0, nan)
+    """
+    for name in ("is_success", "success"):
+        if np.size(info.get(name)) == 1 and np.asarray(info.get(name)).dtype.kind in "biuf":
+            return float(np.asarray(info[name]).item() > 0)
+    return math.nan
+
+
+def success_rate(outcomes: Iterable[float]) -> dict[str, float]:
+    """Return the rate of success of episodes by its name; nothing if no :func:`outcome` is known.
+
+    An episode of which the environment says nothing, unlike others, was no success.
+
+    >>> success_rate([1.0, 0.0, math.nan, 0.0]), success_rate([math.nan])
+    ({'success_rate': 0.25}, {})
+    """
+    values = np.asarray(list(outcomes))
+    return {} if np.isnan(values).all() else {"success_rate": float((values > 0).mean())}
+
+
+def note_versions(config: dict[str, Any], matmul_precision: str) -> list[str]:
+    """Note in a run's configuration which versions it uses; say what changed since it began.
+
+    Noted are the versions of Python and of the main packages, the commit of this folder, and the
+    precision of float32 products. Of what changed, all values are kept: ``"2.12.0, 2.13.0"``.
+    """
+    describe = 'git describe --always --dirty --abbrev=40 --exclude="*"'
+    folder = Path(__file__).parent
+    git = subprocess.run(describe, shell=True, cwd=folder, capture_output=True, text=True)
+    now = {"matmul_precision": matmul_precision, "git_commit": git.stdout.strip() or None}
+    modules = [sys.modules.get(name) for name in ("torch", "gymnasium", "mujoco", "numpy")]
+    versions = {module.__name__: module.__version__ for module in modules if module}
+    versions["python"] = sys.version.split()[0]
+    changes = []
+    for old, new in ((config, now), (config.setdefault("versions", {}), versions)):
+        for name, value in new.items():
+            used = str(old.setdefault(name, value))
+            if str(value) not in used.split(", "):
+                changes.append(f"{name} is {value} now; this run had {used} so far")
+                old[name] = f"{used}, {value}"
+    return changes
+
+
+def reset_worker_signals() -> None:
+    """Undo a script's signal handlers in a worker process that an environment forked.
+
+    SIGTERM and SIGHUP end it again, as ``terminate()`` asks; SIGINT is ignored: Ctrl-C is the
+    script's. A script calls ``os.register_at_fork(after_in_child=reset_worker_signals)``.
+    """
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if callable(signal.getsignal(number)):
+            signal.signal(number, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+class EnvState:
+    """What an environment carries from one episode to the next, to resume training.
+
+    That is the random generators of the environment and of its action space, the random streams and
+    the counters of its noise wrappers, the returns that RecordEpisodeStatistics remembers, and the
+    global generators of ``random`` and NumPy, from which an environment may draw. Further
+    ``generators`` are kept with them. After loading, call :func:`set_progress` again. An
+    environment that carries anything else from one episode to the next does not resume exactly.
+
+    >>> env = make_noisy(gym.make("Pendulum-v1"), ["RandomNormalNoisyObservation(1)"], [0.5])
+    >>> _ = env.reset(seed=1)
+    >>> saved = EnvState(env).state_dict()
+    >>> first, _ = env.reset()
+    >>> EnvState(env).load_state_dict(saved)
+    >>> bool((env.reset()[0] == first).all())
+    True
+    """
+
+    def __init__(self, env: Env, *generators: np.random.Generator):
+        """Take an environment that has been reset with a seed."""
+        self.env = env
+        self.generators = generators
+
+    def _generators(self) -> list[Any]:
+        environment, actions = self.env.unwrapped.np_random, self.env.action_space.np_random
+        return [environment, actions, *self.generators]
+
+    def _returns(self) -> deque[float]:
+        recorded = self.env.has_wrapper_attr("return_queue")
+        return self.env.get_wrapper_attr("return_queue") if recorded else deque()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state in Python's own types, to be taken between two episodes."""
+        return {
+            "python": random.getstate(),
+            "numpy": _without_arrays(np.random.get_state(legacy=False)),
+            "generators": [_stream(generator) for generator in self._generators()],
+            "noise": [wrapper.state_dict() for wrapper in noise_wrappers(self.env).values()],
+            "returns": [float(value) for value in self._returns()],
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a :meth:`state_dict`; the next call of the environment must be ``reset()``.
+
+        Raises:
+            ValueError: a state of another number of generators or noise wrappers.
+        """
+        version, words, normal = state["python"]
+        random.setstate((version, tuple(words), normal))
+        np.random.set_state(state["numpy"])
+        for generator, stream in zip(self._generators(), state["generators"], strict=True):
+            if isinstance(generator, np.random.RandomState):
+                generator.set_state(stream)
+            else:
+                generator.bit_generator.state = stream
+        wrappers = noise_wrappers(self.env).values()
+        for wrapper, part in zip(wrappers, state["noise"], strict=True):
+            wrapper.load_state_dict(part)
+        self._returns().clear()
+        self._returns().extend(state["returns"])
+
+
+def _stream(generator: Any) -> Any:
+    """Return the state of a random generator; dm_control's environments have a RandomState."""
+    if isinstance(generator, np.random.RandomState):
+        return _without_arrays(generator.get_state(legacy=False))
+    return _without_arrays(generator.bit_generator.state)
+
+
+# The scripts' arguments that change nothing about what a run learns. A run may be resumed with
+# others, and a finished one counts as done whatever it had.
+MAY_DIFFER_IN_A_RUN = frozenset(
+    ("runs_dir", "overwrite", "torch_threads", "compile", "checkpoint_frequency")
+)
+# Runs with other values of these may stand in one row of a table, too: a GPU rounds otherwise, and
+# tests do not touch training. But a run keeps to the ones that it began with.
+MAY_DIFFER_IN_A_TABLE = MAY_DIFFER_IN_A_RUN | {"cuda", "eval_frequency"}

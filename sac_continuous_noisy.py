@@ -17,10 +17,11 @@ import json
 import math
 import os
 import signal
-import subprocess
 import sys
+import tempfile
 import time
 import zipfile
+from collections import deque
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -29,7 +30,6 @@ if __name__ == "__main__":  # Ctrl-C during the imports below ends the program w
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 import torch
 import torch.nn as nn
@@ -42,6 +42,7 @@ from tqdm import tqdm
 import noisy_wrappers as noisy
 
 TEST_SEED = 1_000_000  # of the first test episode; the same in every run and evaluation
+STEP_LIMIT = 10_000  # of an episode, where neither the environment nor the user sets one
 EVAL_FREQUENCY = 10_000  # default of --eval-frequency; at most a tenth of the run
 LOG_STD_MIN, LOG_STD_MAX = -5, 2
 
@@ -50,7 +51,7 @@ LOG_STD_MIN, LOG_STD_MAX = -5, 2
 class Args:
     """Command-line arguments; the algorithm's are those of CleanRL and the paper (Appendix A.2)."""
 
-    env_id: str = "HalfCheetah-v5"  # Gymnasium environment: Name-v0, or module:Name-v0
+    env_id: str = "HalfCheetah-v5"  # RUN: Gymnasium environment, Name-v0, or module:Name-v0
     seed: int = 1  # seed of everything that is random
     total_timesteps: int = 1_000_000  # environment steps to train for
     max_episode_steps: int | None = None  # time limit of an episode; None: the environment's own
@@ -58,19 +59,19 @@ class Args:
     runs_dir: str = "runs"  # folder in which the run's own folder is made
     overwrite: bool = False  # delete the files in the run's folder and start again
     checkpoint_frequency: int = 50_000  # environment steps between two checkpoints
-    noise: tuple[str, ...] = ()  # noises of the training environment; the baseline has none
+    noise: tuple[str, ...] = ()  # NOISE: noises of the training environment; the baseline has none
     noise_rate: tuple[float | str, ...] = ()  # probability of each noise; 1.0:0.0 falls linearly
+    eval_episodes: int = 10  # TESTS: episodes in each test
     eval_frequency: int | None = None  # steps between tests; None: up to 10,000; 0: only at the end
-    eval_episodes: int = 10  # episodes in each test
 
-    cuda: bool = False  # train on a GPU (not tested on one yet); these networks are small
+    cuda: bool = False  # SPEED: train on a GPU (not tested on one yet); these networks are small
     torch_threads: int = 1  # CPU threads; runs in parallel gain more than extra threads
     compile: bool = True  # compile the updates; needs a C++ compiler
     # precision of float32 products, raised to highest where another would cost accuracy; with bf16
     # the updates are computed in bfloat16, even if this costs accuracy
-    matmul_precision: Literal["highest", "high", "medium", "bf16"] = "medium"
+    matmul_precision: Literal["highest", "medium", "bf16"] = "medium"
 
-    buffer_size: int = 1_000_000  # transitions in the replay buffer
+    buffer_size: int = 1_000_000  # ALGORITHM: transitions in the replay buffer
     gamma: float = 0.99  # discount factor
     tau: float = 0.005  # target smoothing coefficient
     batch_size: int = 256  # transitions in a minibatch
@@ -84,9 +85,10 @@ class Args:
 
 
 def make_env(env_id, **kwargs):
-    """Make the clean environment, whose observations and actions are vectors."""
+    """Make the clean environment: observations and actions are vectors, and every episode ends."""
     with fail_on(noisy.refusals(env_id), f"--env-id {env_id}"):
-        return noisy.make_flat(gym.make(env_id, disable_env_checker=True, **kwargs))
+        env = gym.make(env_id, disable_env_checker=True, **kwargs)
+        return noisy.make_flat(env, STEP_LIMIT)
 
 
 def mlp(linear, inputs, outputs):
@@ -138,6 +140,7 @@ class Actor(nn.Module):
         super().__init__()
         low, high = torch.Tensor(env.action_space.low), torch.Tensor(env.action_space.high)
         self.network = mlp(nn.Linear, env.observation_space.shape[0], 2 * len(low))
+        self.action_space = env.action_space
         self.register_buffer("action_scale", (high - low) / 2)
         self.register_buffer("action_bias", (high + low) / 2)
 
@@ -157,7 +160,8 @@ class Actor(nn.Module):
         scale, bias = self.action_scale.cpu().numpy(), self.action_bias.cpu().numpy()
         mean, log_std = np.split(in_numpy(self.network, observation), 2)
         log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (np.tanh(log_std) + 1)
-        return np.tanh(mean + np.exp(log_std) * eps) * scale + bias
+        action = np.tanh(mean + np.exp(log_std) * eps) * scale + bias
+        return noisy.into_space(action, self.action_space)
 
 
 class ReplayBuffer:
@@ -266,9 +270,8 @@ def updater(loss, network, optimizer, args):
     return update
 
 
-def train(args, stop=lambda: False):
+def learn(args, env, test_env, stop):
     """Train one agent; return False if stop(), asked whenever an episode ends, ended it early."""
-    args, env, test_env = make_envs(args)
     if not np.isfinite([env.action_space.low, env.action_space.high]).all():
         fail(f"SAC needs bounded actions; some actions of {args.env_id} are unbounded")
     torch.set_num_threads(args.torch_threads)
@@ -276,7 +279,6 @@ def train(args, stop=lambda: False):
     run = Run(args, "SAC", use_matmul_precision(args.matmul_precision, device), env)
     if run.is_finished:
         return True
-    args.compile = args.compile and can_compile(device)
 
     # SETUP: torch.func differentiates the losses, so autograd need not follow the networks
     torch.manual_seed(args.seed)
@@ -352,7 +354,7 @@ def train(args, stop=lambda: False):
 
         # NEXT EPISODE
         if terminated or truncated:
-            run.log_episode(global_step, info["episode"])
+            run.log_episode(global_step, info)
             if done:
                 break
             stopping = stop()
@@ -391,7 +393,7 @@ def fail_on(errors, message, code=2):
     except errors as error:
         hidden = isinstance(error.__context__, OSError)  # by torch.save: the disk is full, say
         error = error.__context__ if hidden else error
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = " ".join(str(error).split()) or f"{type(error).__name__}, see docs/training.md"
         fail(f"{message}: {reason}", code)
     except Exception as error:  # of the environment, say: its traceback is what the user needs
         error.add_note(f"({message})")
@@ -402,7 +404,7 @@ def say(text):
     """Print a line; training goes on if its reader has left, as in `... | head`."""
     try:
         print(text, flush=True)
-    except BrokenPipeError:
+    except OSError:  # of a pipe, or of a terminal
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
@@ -426,19 +428,15 @@ def check_numbers(args):
         if type(value) not in (int, float):
             continue
         may_be_zero = type(value) is float or name in ("seed", "eval_frequency", "learning_starts")
-        low, high = 0 if may_be_zero else 1, at_most.get(name, math.inf)
-        wanted = f"at least {low}" if high == math.inf else f"from {low} to {high}"
-        if not math.isfinite(value):
-            wanted = "a finite number"
-        elif value >= 2**63:
-            wanted = "a smaller number"
-        elif low <= value <= high:
-            continue
-        fail(f"--{name.replace('_', '-')} must be {wanted}, not {value}")
+        low, high = 0 if may_be_zero else 1, at_most.get(name, 2**63 - 1)
+        if not low <= value <= high:
+            wanted = f"at most {high}" if value > high else f"at least {low}"
+            fail(f"--{name.replace('_', '-')} must be {wanted}, not {value}")
 
 
+@contextlib.contextmanager
 def make_envs(args):
-    """Return the arguments in full, the noisy environment and a clean one; fail if one is wrong."""
+    """Yield the arguments in full, the noisy environment and a clean one; close both at the end."""
     check_numbers(args)
     if args.exp_name in ("", ".", ".."):
         fail(f"--exp-name must be a name, not {args.exp_name!r}")
@@ -449,30 +447,38 @@ def make_envs(args):
         noise, noise_rate = noisy.canonical_noises(args.noise, args.noise_rate)
     except ValueError as error:
         fail(error)
-    test_env = make_env(env_id, max_episode_steps=args.max_episode_steps)  # never sees noise
-    env = make_env(env_id, max_episode_steps=args.max_episode_steps)
-    with fail_on(ValueError, f"--noise in {env_id}"):
-        env = noisy.make_noisy(env, noise, noise_rate)
-    if not isinstance(env.unwrapped.observation_space, gym.spaces.Box):
-        say(f"{env_id}: observations are flattened to {test_env.observation_space}")
-    if env.spec.max_episode_steps is None:
-        say(f"{env_id} declares no time limit; --max-episode-steps sets one")
-    return replace(args, env_id=env_id, noise=noise, noise_rate=noise_rate), env, test_env
+    limit = {"max_episode_steps": args.max_episode_steps}
+    noisy.seed_globals(args.seed)
+    with make_env(env_id, **limit) as test_env, make_env(env_id, **limit) as env:
+        with fail_on(ValueError, f"--noise in {env_id}"):
+            env = noisy.make_noisy(env, noise, noise_rate)
+        if not isinstance(env.unwrapped.observation_space, gym.spaces.Box):
+            say(f"{env_id}: observations are flattened to {test_env.observation_space}")
+        if not (args.max_episode_steps or gym.spec(env_id.rpartition(":")[2]).max_episode_steps):
+            say(f"{env_id} declares no time limit, so --max-episode-steps is {STEP_LIMIT:,}")
+        yield replace(args, env_id=env_id, noise=noise, noise_rate=noise_rate), env, test_env
+
+
+def train(args, stop=lambda: False):
+    """Train one agent and close its environments; return False if stop() ended it early."""
+    with make_envs(args) as (args, env, test_env):
+        return learn(args, env, test_env, stop)
 
 
 def evaluate(policy, env, episodes, stop=lambda: False):
-    """Play test episodes from fixed initial states -> (N, 2): returns, lengths; None if stopped."""
-    # without a time limit a test may never end: there, and only there, stop() ends it
-    endless = env.spec.max_episode_steps is None
-    results = np.zeros((episodes, 2))
+    """Play test episodes -> (N, 3): returns, lengths, noisy.outcome; None if stopped."""
+    long = env.spec.max_episode_steps >= STEP_LIMIT  # there, and only there, stop() ends a test
+    results = np.zeros((episodes, 3))
     for episode in range(episodes):
-        observation, _ = env.reset(seed=TEST_SEED + episode)
-        terminated = truncated = False
-        while not (terminated or truncated):
-            observation, reward, terminated, truncated, _ = env.step(policy(observation))
-            results[episode] += reward, 1
-            if endless and stop():
-                return None
+        with noisy.seeded_globals(TEST_SEED + episode):
+            observation, _ = env.reset(seed=TEST_SEED + episode)
+            terminated = truncated = False
+            while not (terminated or truncated):
+                observation, reward, terminated, truncated, info = env.step(policy(observation))
+                results[episode, :2] += reward, 1
+                if long and stop():
+                    return None
+            results[episode, 2] = noisy.outcome(info)
     return results
 
 
@@ -487,39 +493,60 @@ def use_matmul_precision(precision, device):
     return precision
 
 
-def can_compile(device):
-    """Return whether torch.compile works here; if it does not, say why."""
+def prepare_compiler():
+    """Remove the empty libraries that killed compilers leave in the cache (pytorch#102539)."""
+    from torch._inductor.runtime.cache_dir_utils import cache_dir  # which takes seconds
+
     say("compiling ...")
-    try:
-        torch.compile(torch.neg)(torch.zeros(8, device=device))
-        torch.compiler.reset()  # forget what earlier runs of this process compiled
-        return True
-    except Exception as error:  # no C++ compiler, no Python headers, ...
+    torch.compiler.reset()  # forget what earlier runs of this process compiled
+    for path in Path(cache_dir()).rglob("*.so"):
+        with contextlib.suppress(OSError):  # another process removed it
+            if path.stat().st_size == 0 and time.time() - path.stat().st_mtime > 60:
+                path.unlink()
+
+
+def start_again(error):
+    """If compiling failed, start again with a new cache for the compiler, and then without it."""
+    if type(error).__module__.startswith(("torch._dynamo", "torch._inductor")):
         reason = str(getattr(error, "inner_exception", error)).strip()
-        say(f"not compiled: {reason.partition(chr(10))[0]}")
-        return False
+        say(f"not compiled, starting again: {reason.partition(chr(10))[0]}")
+        cache = f"torchinductor_{os.getpid()}_"  # os.execv keeps the process number
+        options = ["--no-compile"] if cache in os.environ["TORCHINDUCTOR_CACHE_DIR"] else []
+        os.environ["TORCHINDUCTOR_CACHE_DIR"] = tempfile.mkdtemp(prefix=cache)
+        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:], *options])
 
 
 class Run:
     """The run's folder: what is written into it, and read again to resume."""
 
+    FILES = ("result.json", "policy.pt", "checkpoint.pt", "config.json", "eval.csv")
+    EVENTS = "events.out.tfevents.*"
+
     def __init__(self, args, algorithm, precision, env):
         """Open the folder; fail if another process uses it, or if it holds a different run."""
         configuration = (args.env_id, args.exp_name, args.noise, args.noise_rate, args.seed)
         self.folder = noisy.run_folder(args.runs_dir, *configuration)
-        self.args, self.start, self.saved_step = args, time.time(), 0
+        self.args, self.start = args, time.monotonic() - 1e-6  # not 0 s ago: clocks may stand still
         self.noise, self.returns = noisy.noise_wrappers(env), env.get_wrapper_attr("return_queue")
+        self.outcomes = deque(maxlen=100)  # of the last training episodes
+        if self.folder.is_symlink():
+            fail(f"{self.folder} is a link: remove it, or choose another --exp-name or --runs-dir")
+        in_use = fail_on(BlockingIOError, f"{self.folder} is in use by another process")
+        no_locks = fail_on(OSError, f"--runs-dir: the file system of {self.folder} has no locks")
         with fail_on(OSError, "--runs-dir"):
             self.folder.mkdir(parents=True, exist_ok=True)
-            self.lock = open(self.folder / ".lock", "w")  # noqa: SIM115
-        with fail_on(BlockingIOError, f"{self.folder} is in use by another process"):
-            fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
-        old = self.folder.glob("[!.]*" if args.overwrite else "*.tmp")
-        for path in sorted(filter(Path.is_file, old), reverse=True):  # result.json before policy.pt
-            path.unlink()
-        self.checkpoint, result = self.folder / "checkpoint.pt", self.folder / "result.json"
+            lock = os.open(self.folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+            self.lock = os.fdopen(lock)
+            with no_locks, in_use:
+                fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
+            result, _, self.checkpoint, *_ = ours = [self.folder / name for name in self.FILES]
+            old = [path.with_suffix(".tmp") for path in ours]  # of a process that was killed
+            if args.overwrite:
+                old += [*ours, self.folder / "robustness.csv", *self.folder.glob(self.EVENTS)]
+            for path in old:
+                path.unlink(missing_ok=True)
         self.is_finished = result.exists()
-        if any(self.folder.glob("*.json")) or self.checkpoint.exists():
+        if any(path.exists() for path in ours):
             self.config = self._old_config()
         else:
             if args.eval_frequency is None:
@@ -527,43 +554,28 @@ class Run:
             self.config = {"algorithm": algorithm, "args": asdict(args), "versions": {}}
         if self.is_finished:
             with self._reading(result):
-                self.mean = json.loads(result.read_text())["final_return_mean"]
+                self.result = json.loads(result.read_text())
+                self._say_finished()
             self.checkpoint.unlink(missing_ok=True)
-            self._say_finished()
         else:
-            noises = zip(args.noise, args.noise_rate, strict=True)
-            noises = " + ".join(f"{noise} at {rate}" for noise, rate in noises)
-            say(
-                f"{algorithm} on {args.env_id} | noise: {noises or 'none (baseline)'} | seed "
-                f"{args.seed} | {args.total_timesteps:,} steps | "
-                f"{'cuda' if args.cuda else 'cpu'} | {self.folder}"
-            )
-            self._note_versions(precision)
-
-    def _note_versions(self, precision):
-        describe = 'git describe --always --dirty --abbrev=40 --exclude="*"'
-        here = Path(__file__).parent
-        git = subprocess.run(describe, shell=True, cwd=here, capture_output=True, text=True)
-        now = {"matmul_precision": precision, "git_commit": git.stdout.strip() or None}
-        versions = {module.__name__: module.__version__ for module in (torch, gym, mujoco, np)}
-        versions["python"] = sys.version.split()[0]
-        for old, new in ((self.config, now), (self.config.setdefault("versions", {}), versions)):
-            for name, value in new.items():
-                used = str(old.setdefault(name, value))
-                if str(value) not in used.split(", "):  # changed since the run began: keep both
-                    say(f"{name} is {value} now; this run had {used} so far")
-                    old[name] = f"{used}, {value}"
+            noises = " + ".join(map("{} at {}".format, args.noise, args.noise_rate))
+            begun = f"{algorithm} on {args.env_id} | noise: {noises or 'none (baseline)'}"
+            begun += f" | seed {args.seed} | {args.total_timesteps:,} steps"
+            say(f"{begun} | {'cuda' if args.cuda else 'cpu'} | {self.folder}")
+            for change in noisy.note_versions(self.config, precision):
+                say(change)
+            if args.compile:
+                prepare_compiler()
 
     def _old_config(self):
         path = self.folder / "config.json"
         with self._reading(path):
             config = json.loads(path.read_text())
-            old = {name: config["args"].get(name) for name in asdict(self.args)}
+            # one that an older version did not have is no difference
+            old = {name: config["args"].get(name, own) for name, own in asdict(self.args).items()}
         if self.args.eval_frequency is None:
             self.args.eval_frequency = old["eval_frequency"]
-        new = asdict(self.args)
-        for name in noisy.MAY_DIFFER_IN_A_RUN:
-            del new[name]
+        new = {k: v for k, v in asdict(self.args).items() if k not in noisy.MAY_DIFFER_IN_A_RUN}
         differ = [f"{name} {old[name]}, not {new[name]}" for name in new if old[name] != new[name]]
         if differ:
             advice = "choose another --exp-name or --runs-dir; --overwrite deletes that run"
@@ -572,42 +584,44 @@ class Run:
 
     def resume(self, state):
         """Restore the last checkpoint of the objects in a list; return its step, or 0."""
-        self.state, step = state, 0
+        self.state, step, sizes = state, 0, {}
         self.eval_csv = "step,episode,episodic_return,episodic_length\n"
         if self.checkpoint.exists():
             with self._reading(self.checkpoint):
-                step = self._load()
+                step, sizes = self._load()
             say(f"resumed at step {step}")
-        else:
-            for path in self.folder.glob("events.*"):  # of a start that left no checkpoint
-                path.unlink()
         self._write("config.json", json.dumps(self.config, indent=2) + "\n")
         self._write("eval.csv", self.eval_csv)
-        with self._writing("events.*"):  # what was logged after this step is purged
+        with self._writing("events.*"):
+            # what was logged after the checkpoint is removed, and purged by a TensorBoard that runs
+            for path in self.folder.glob(self.EVENTS):
+                if path.name in sizes:
+                    os.truncate(path, min(path.stat().st_size, sizes[path.name]))
+                else:
+                    path.unlink()
             self.writer = SummaryWriter(str(self.folder), purge_step=step + 1)
         if step == 0:
             table = "".join(f"|{name}|{value}|\n" for name, value in asdict(self.args).items())
             self.writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + table)
-            # for the table HPARAMS: what tells runs apart, and settings that are not the default
+            # for the table HPARAMS: what tells runs apart, and what they achieved
             columns = {name: getattr(self.args, name) for name in ("env_id", "exp_name", "seed")}
             columns["noise"] = " + ".join(self.args.noise) or "none"
             columns["noise_rate"] = " + ".join(map(str, self.args.noise_rate)) or "none"
-            for name, value in asdict(self.args).items():
-                if name not in noisy.MAY_DIFFER_IN_A_TABLE and value != getattr(Args, name):
-                    columns.setdefault(name, value)
-            # Without an experiment of its own (hparams()[0]), TensorBoard shows all runs' columns
-            self.writer.file_writer.add_summary(hparams(columns, {})[1])
-        self.saved_step, self.printed, self.last_test = step, time.time(), ""
-        self.first_step, self.first_time = step, time.time()
+            metrics = "eval/episodic_return_mean", "eval/success_rate", "charts/episodic_return"
+            for summary in hparams(columns, dict.fromkeys(metrics, 0))[:2]:
+                self.writer.file_writer.add_summary(summary)
+        self.first_step, self.first_time = step, time.monotonic() - 1e-6
+        self.printed, self.saved_step = self.first_time, step
+        self.learning, self.last_test = None, ""
         total = self.args.total_timesteps
-        self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None)  # on terminals
+        self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None)
         return step
 
     def _load(self):
         if zipfile.ZipFile(self.checkpoint).testzip():  # torch.load checks no checksums
             raise ValueError("it is damaged")
         checkpoint = torch.load(self.checkpoint, weights_only=True)
-        if checkpoint["format"] != 4:
+        if checkpoint["format"] != 5:
             raise ValueError("another version wrote it: finish the run with that version")
         if checkpoint["run"] != self.folder.name:
             raise ValueError(f"it belongs to {checkpoint['run']}")
@@ -615,78 +629,87 @@ class Run:
             part.load_state_dict(state)
         torch.set_rng_state(checkpoint["torch"])
         self.eval_csv = checkpoint["eval_csv"]
-        self.start = time.time() - checkpoint["seconds"]
-        return checkpoint["step"]
+        self.outcomes.extend(checkpoint.get("outcomes", []))
+        self.start = time.monotonic() - checkpoint["seconds"]
+        return checkpoint["step"], checkpoint["events"]
 
     def save(self, step):
         """Write a checkpoint: all that resuming needs, between two episodes."""
         with self._writing("events.*"):
             self.writer.flush()  # to be no older than the checkpoint
         checkpoint = {
-            "format": 4,
+            "format": 5,
             "run": self.folder.name,
             "step": step,
             "state": [part.state_dict() for part in self.state],
             "torch": torch.get_rng_state(),
             "eval_csv": self.eval_csv,
-            "seconds": time.time() - self.start,
+            "outcomes": list(self.outcomes),
+            "events": {path.name: path.stat().st_size for path in self.folder.glob(self.EVENTS)},
+            "seconds": time.monotonic() - self.start,
         }
         self._write("checkpoint.pt", checkpoint)
         self.saved_step = step
 
     def log(self, step, **groups):
         """Log numbers as group/name to TensorBoard, and the speed; show the progress."""
-        self._add_scalars(step, groups)
-        self._add_scalars(step, {"charts": {"SPS": step / (time.time() - self.start)}})
-        self._show_progress(step)
-
-    def _add_scalars(self, step, groups):
-        tags = {}
-        for group, values in groups.items():
-            tags |= {f"{group}/{name}": float(value) for name, value in values.items()}
+        now = time.monotonic()
+        if "losses" in groups and self.learning:
+            sps = (step - self.learning[0]) / (now - self.learning[1])
+            groups["charts"] = groups.get("charts", {}) | {"SPS": sps}
+        elif "losses" in groups:  # the first ones: the time until now went into compiling
+            self.learning = step, now - 1e-6
+        tags = {f"{g}/{n}": float(x) for g, values in groups.items() for n, x in values.items()}
         if not all(map(math.isfinite, tags.values())):
             reason = f"step {step}: training diverged, some values are not finite: {tags}"
             raise noisy.NotFiniteError(reason)
         with self._writing("events.*"):
             for tag, value in tags.items():
                 self.writer.add_scalar(tag, value, step)
-
-    def _show_progress(self, step):
+        step = max(step, self.bar.n)  # PPO logs a test under the step at which it fell due
         self.bar.update(step - self.bar.n)
+        self.bar.n = step  # update() does nothing where there is no terminal
         taken = step - self.first_step
-        if self.bar.disable and taken and time.time() - self.printed > 10:
-            total, sps = self.args.total_timesteps, taken / (time.time() - self.first_time)
+        if self.bar.disable and taken and now - self.printed > 10:
+            total, sps = self.bar.total, taken / (now - self.first_time)
             eta = tqdm.format_interval((total - step) / sps)
             # sweep/__main__.py reads this line
             say(f"step={step}/{total} sps={sps:.0f} {self.last_test}eta={eta}")
-            self.printed = time.time()
+            self.printed = now
 
-    def log_episode(self, step, episode):
-        """Log a training episode as RecordEpisodeStatistics saw it, before reward noise."""
-        self.log(step, charts={"episodic_return": episode["r"], "episodic_length": episode["l"]})
+    def log_episode(self, step, info):
+        """Log a training episode as the info of its last step tells it."""
+        self.outcomes.append(noisy.outcome(info))
+        charts = {"episodic_return": info["episode"]["r"], "episodic_length": info["episode"]["l"]}
+        self.log(step, charts=charts | noisy.success_rate(self.outcomes))
 
     def log_test(self, step, results):
-        """Log the (N, 2) returns and lengths of a test that fell due at a step."""
-        for i, (episodic_return, length) in enumerate(results.tolist()):
-            self.eval_csv += f"{step},{i},{episodic_return},{length:.0f}\n"
+        """Log the (N, 3) returns, lengths and outcomes of a test that fell due at a step."""
+        told = ",success\n" in self.eval_csv  # by the environment, in an earlier test
+        success = noisy.success_rate(np.nan_to_num(results[:, 2]) if told else results[:, 2])
+        if success and not told:  # earlier tests, of which it said nothing, were no success
+            self.eval_csv = self.eval_csv.replace("\n", ",0\n").replace(",0", ",success", 1)
+        for i, (episodic_return, length, outcome) in enumerate(results.tolist()):
+            column = f",{outcome == 1:d}" if success else ""
+            self.eval_csv += f"{step},{i},{episodic_return},{length:.0f}{column}\n"
         self._write("eval.csv", self.eval_csv)
-        self.mean, length = results.mean(0)
-        self.std = results[:, 0].std(ddof=1) if len(results) > 1 else 0.0
-        self.last_test, self.printed = f"eval_return={self.mean:.1f} ", 0  # 0: print it now
+        mean, length, _ = results.mean(0)
+        std = results[:, 0].std(ddof=1) if len(results) > 1 else 0.0
+        self.result = {"final_return_mean": mean, "final_return_std": std}
+        self.result |= {f"final_{name}": rate for name, rate in success.items()}
+        self.last_test, self.printed = f"eval_return={noisy.rounded(mean, std)} ", -math.inf
+        self.last_test += "".join(f"{name}={rate:.2f} " for name, rate in success.items())
         self.bar.set_description_str(self.last_test)
-        values = {"return_mean": self.mean, "return_std": self.std, "length_mean": length}
-        self._add_scalars(step, {"eval": {f"episodic_{name}": x for name, x in values.items()}})
-        self._show_progress(max(step, self.bar.n))
+        values = {"return_mean": mean, "return_std": std, "length_mean": length}
+        self.log(step, eval={f"episodic_{name}": x for name, x in values.items()} | success)
 
     def finish(self, step, policy):
         """Write policy.pt and, last of all, result.json; the checkpoint has served."""
-        seconds = time.time() - self.start
+        seconds = time.monotonic() - self.start
         with self._writing("events.*"):
             self.writer.file_writer.add_summary(hparams({}, {})[2])  # HPARAMS: success
             self.writer.close()
-        result = {
-            "final_return_mean": self.mean,
-            "final_return_std": self.std,
+        self.result |= {
             "final_return_n": self.args.eval_episodes,
             "total_timesteps": self.args.total_timesteps,
             "trained_timesteps": step,  # PPO: whole rollouts
@@ -697,13 +720,16 @@ class Run:
             "noise_applied": {n: [w.times_applied, w.opportunities] for n, w in self.noise.items()},
         }
         self._write("policy.pt", policy)
-        self._write("result.json", json.dumps(result, indent=2) + "\n")
+        self._write("result.json", json.dumps(self.result, indent=2) + "\n")
         self.checkpoint.unlink(missing_ok=True)
         self.bar.close()
         self._say_finished()
 
     def _say_finished(self):
-        say(f"{self.folder} is finished: mean test return {self.mean:.1f}")
+        mean, std = self.result["final_return_mean"], self.result["final_return_std"]
+        text = f"{self.folder} is finished: mean test return {noisy.rounded(mean, std)}"
+        rate = self.result.get("final_success_rate")
+        say(text if rate is None else f"{text}, success rate {rate:.2f}")
         say(f"See its curves with: tensorboard --logdir {self.args.runs_dir}")
 
     def _reading(self, path):
@@ -740,11 +766,20 @@ if __name__ == "__main__":
         with contextlib.suppress(OSError):  # nobody may be left to read it; print is not safe here
             os.write(1, told)
 
-    signal.signal(signal.SIGTERM, stop_run)
-    signal.signal(signal.SIGINT, stop_run)
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        under_nohup = number == signal.SIGHUP and signal.getsignal(number) == signal.SIG_IGN
+        if not under_nohup:
+            signal.signal(number, stop_run)
+    os.register_at_fork(after_in_child=noisy.reset_worker_signals)
     sys.path.append(os.getcwd())  # for what the module of --env-id module:Name-v0 imports
-    with fail_on(noisy.NotFiniteError, "training stopped", code=1):
-        finished = train(read_args(), stop=lambda: bool(signals))
+    finished = False
+    try:
+        with fail_on((noisy.NotFiniteError, noisy.SpaceError), "training stopped", code=1):
+            finished = train(read_args(), stop=lambda: bool(signals))
+    except Exception as error:
+        if not signals:  # the environment's processes may have got the signal, too
+            start_again(error)
+            raise
     if not finished:
         say("stopped; run the same command again to resume")
         raise SystemExit(128 + signals[0])

@@ -1,9 +1,61 @@
-"""How analyze.py, evaluate.py and the sweep end on bad input, as the training scripts do."""
+"""How analyze.py, evaluate.py and the sweep write to a terminal, and end on bad input."""
 
+import os
+import re
 import sys
+
+CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")  # all but tab and the ends of lines
 
 
 def fail(message, code=2):
     """Exit with one line that says what to do."""
     print("error:", message, file=sys.stderr, flush=True)
     sys.exit(code)
+
+
+def in_words(error):
+    """Return an exception as one line: its type, and its text if it has one."""
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+class Terminal:
+    """A stream of sys that takes any text and outlives its reader, as in `... | head`.
+
+    Logs, config.json and names of folders are other people's: a control character, which could
+    be part of an escape sequence, and a character that the terminal lacks are replaced.
+    """
+
+    def __init__(self, stream):
+        """Take over a stream."""
+        stream.reconfigure(errors="replace")
+        self._stream = stream
+
+    def __getattr__(self, name):
+        """Be the stream in everything else."""
+        return getattr(self._stream, name)
+
+    def write(self, text):
+        """Write text; once the reader has left, into nothing."""
+        try:
+            self._stream.write(CONTROL.sub("?", text))
+        except BrokenPipeError:
+            self._turn_off()
+        return len(text)
+
+    def flush(self):
+        """Pass on what is buffered."""
+        try:
+            self._stream.flush()
+        except BrokenPipeError:
+            self._turn_off()
+
+    def _turn_off(self):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+
+
+def take_over_terminal():
+    """Let everything that is printed from now on pass through a Terminal."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name):  # None where it was closed, as with `>&-`
+            setattr(sys, name, Terminal(getattr(sys, name)))

@@ -8,9 +8,10 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.text import Text
 
 from analysis.effects import effects_caption, effects_figure
-from analysis.formatting import slug
+from analysis.formatting import in_metric, slug
 from analysis.runs import STUDY, rows_of, study_name
 from analysis.style import (
     COLORS,
@@ -79,6 +80,15 @@ def figures(studies, tables):
                 yield ablation_figure(study, summary, wrapper, variants)
     if "robustness" in tables:
         yield from robustness_figures(tables["robustness"].frame)
+
+
+def reword(drawing, metric):
+    """Write of success rates, if they are the metric of a Study."""
+    drawing.caption = in_metric(drawing.caption, metric)
+    for figure in filter(None, (drawing.figure, drawing.narrow)):
+        for text in figure.findobj(Text):
+            text.set_text(in_metric(text.get_text(), metric))
+    return drawing
 
 
 def in_both_widths(drawing, environments, draw, *what):
@@ -359,14 +369,15 @@ def robustness_curves(algorithm, noise, rows):
     return Drawing("robustness", f"curves {algorithm} {noise}", fig, caption)
 
 
-def write_figure(out, drawing):
-    """Write {name}.svg, and .pdf for LaTeX, without dates: equal figures are equal files.
+def write_figure(out, drawing, latex=False):
+    """Write {name}.svg, with `latex` also .pdf; without dates, so equal figures are equal files.
 
     A narrow figure is for the report only, so it is no .pdf.
     """
     fig = drawing.figure
     fig.savefig(out / f"{drawing.name}.svg", metadata={"Date": None})
-    fig.set_layout_engine("none")  # the layout is done
-    fig.savefig(out / f"{drawing.name}.pdf", metadata={"CreationDate": None})
+    if latex:
+        fig.set_layout_engine("none")  # the layout is done
+        fig.savefig(out / f"{drawing.name}.pdf", metadata={"CreationDate": None})
     if drawing.narrow:
         drawing.narrow.savefig(out / f"{drawing.narrow_name}.svg", metadata={"Date": None})

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 from tabulate import tabulate
 
+from analysis.runs import SUCCESS, script_name
 from analysis.verdicts import percent
 from noisy_wrappers import rate_order, rounded
 
@@ -29,6 +30,14 @@ class Table:
     only_csv: tuple = ()  # columns that would make the table wider than a page
     view: pd.DataFrame | None = None  # what people read, if that is not the frame
     rates_beside: bool = False  # a column for each noise rate, with mean, std and n in its cells
+
+
+def in_metric(text, metric):
+    """Write of success rates what was written of returns, if they are the metric of a Study."""
+    if metric != SUCCESS:
+        return text
+    text = text.replace("test return\n(sum of rewards per episode)", "test success rate (%)")
+    return text.replace("return", "success rate")
 
 
 def slug(text):
@@ -116,14 +125,18 @@ def title(column):
 def shown(table):
     """Return a table as a person reads it: all text, related columns in one.
 
-    Settings, phase and environments without percent are shown where a row has any; a row of all
+    The phase and environments without percent are shown where a row has any, and exp_name where one
+    is not its script's; a row of all
     environments says so.
     """
     frame = table.frame if table.view is None else table.view
     frame = frame.reset_index(drop=True).drop(columns=list(table.only_csv))
     if "scope" in frame:
         frame["environment"] = frame["environment"].mask(frame.pop("scope") == "all", "all")
-    for name in ("settings", "phase", "without_percent"):
+    if "exp_name" in frame:
+        names = [script_name(str(algorithm)) for algorithm in frame["algorithm"]]
+        frame["exp_name"] = frame["exp_name"].mask(frame["exp_name"] == names, "")
+    for name in ("exp_name", "phase", "without_percent"):
         if name in frame and (frame[name].isna() | frame[name].eq("")).all():
             frame = frame.drop(columns=name)
     known, cells = spreads(frame), {}
@@ -167,19 +180,22 @@ def wrapped(text, width=0):
     return textwrap.fill(text, width, **style)
 
 
-def write_table(out, table):
-    """Write {name}.csv (all digits), .md and .tex (longtable, as people read them)."""
+def write_table(out, table, latex=False):
+    """Write {name}.csv, with all digits; with `latex` also .md and .tex, as people read it."""
     table.frame.to_csv(
         out / f"{table.name}.csv", index=False, float_format="%.10g", lineterminator="\n"
     )
+    if not latex:
+        return
     text = shown(table)
-    markdown = tabulate(text.values, text.columns, tablefmt="pipe", disable_numparse=True)
+    cells = text.map(lambda cell: cell.replace("|", r"\|").replace("<", "&lt;"))
+    markdown = tabulate(cells.values, text.columns, tablefmt="pipe", disable_numparse=True)
     note = f"\n{table.note}\n" if table.note else ""
-    (out / f"{table.name}.md").write_text(f"{table.caption}\n\n{markdown}\n{note}")
-    latex = tabulate(text.values, text.columns, tablefmt="latex_longtable", disable_numparse=True)
+    (out / f"{table.name}.md").write_text(f"{table.caption}\n\n{markdown}\n{note}", "utf-8")
+    lines = tabulate(text.values, text.columns, tablefmt="latex_longtable", disable_numparse=True)
     escaped = re.sub(r"([%&_#])", r"\\\1", table.caption)
     escaped = escaped.replace("|", r"\textbar{}").replace("\n", " ")
-    latex = latex.replace("\n", f"\n\\caption{{{escaped}}}\\\\\n", 1)
+    lines = lines.replace("\n", f"\n\\caption{{{escaped}}}\\\\\n", 1)
     for sign, command in (("\u00b1", r"$\pm$"), ("\u2013", "--"), (" < ", " $<$ ")):
-        latex = latex.replace(sign, command)
-    (out / f"{table.name}.tex").write_text(latex + "\n")
+        lines = lines.replace(sign, command)
+    (out / f"{table.name}.tex").write_text(lines + "\n", "utf-8")

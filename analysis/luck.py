@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from analysis.runs import STUDY, rows_of
-from analysis.statistics import LEVEL, percent_of
+from analysis.statistics import LEVEL
 from noisy_wrappers import BASELINE
 
 DRAWS = 10_000
@@ -98,7 +98,7 @@ def luck_of_study(study):
     rng = np.random.default_rng(0)
     configs = [config for config in study.returns if config != BASELINE]
     draws = np.full((len(study.environments), len(configs), DRAWS), np.nan)
-    percents = np.array([percent_of(1.0, returns) for returns in study.final(BASELINE).T])
+    percents = np.array([study.percent_of(1.0, e) for e in range(len(study.environments))])
     for e in range(len(study.environments)):
         samples = [study.final(config)[:, e] for config in (BASELINE, *configs)]
         samples = [sample[np.isfinite(sample)] for sample in samples]
@@ -111,7 +111,7 @@ def luck_of_study(study):
 
 
 def luck_of_paper(best, seeds, configurations):
-    """Draw the paper's sweep from its table of best noises: a dict of (algorithm, "", "") -> Luck.
+    """Draw the paper's sweep from its table of best noises: a dict of what STUDY has -> Luck.
 
     The standard deviation is the baseline's. That of the best noise is known, too, but belongs to a
     winner, which had luck with its seeds.
@@ -148,7 +148,7 @@ def add_luck_of_best(best, lucks):
     """
     best = best.assign(luck_median=np.nan, luck_95=np.nan, p_luck=np.nan)
     for row in best.itertuples():
-        draws = lucks[row.algorithm, row.settings, row.phase].best.get(row.environment)
+        draws = lucks[row.algorithm, row.exp_name, row.phase].best.get(row.environment)
         if draws is not None:
             best.loc[row.Index, "luck_median"] = np.median(draws)
             best.loc[row.Index, "luck_95"] = np.quantile(draws, 0.95)

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from analysis.luck import add_luck_of_best, add_luck_of_consistent, luck_of_paper, luck_rows
-from analysis.runs import KEYS, rows_of, split_version
+from analysis.runs import KEYS, rows_of, script_name, split_version
 from noisy_wrappers import BASELINE, Configuration
 
 PAPER_SEEDS = {"SAC": 5, "TD3": 5, "PPO": 10}
@@ -45,7 +45,8 @@ def read_paper(folder):
         table["noise"] = table["noise_as_run"]
         pairs = zip(table["noise"], table["noise_rate"], strict=True)
         table["noise_rate"] = [Configuration.parse(*pair).noise_rate for pair in pairs]
-        tables[name] = table.assign(settings="", phase="")
+        names = [script_name(algorithm) for algorithm in table["algorithm"]]
+        tables[name] = table.assign(exp_name=names, phase="")
     return tables
 
 
@@ -123,13 +124,13 @@ def compare_table(ours, listed, paper, mean, std, number):
     difference is in standard errors: (ours - paper) / sqrt(std^2 / n + paper_std^2 / paper_n).
     """
     keys = [name for name in (*KEYS, "steps_millions") if name in paper]
-    names = [name for name in keys if name not in ("settings", "phase")]
+    names = [name for name in keys if name not in ("exp_name", "phase")]
     ours = ours.assign(key=matching_keys(ours, names))
     paper = paper.assign(key=matching_keys(paper, names))
     shared = ours["key"].isin(paper["key"])
     if listed is None:
         ours["listed"] = shared
-    else:  # a key unites settings and versions, only one of which may be listed
+    else:  # a key unites studies and versions, only one of which may be listed
         listed_rows = pd.MultiIndex.from_frame(listed[keys])
         ours["listed"] = pd.MultiIndex.from_frame(ours[keys]).isin(listed_rows)
     ours = ours[ours["listed"] | shared]

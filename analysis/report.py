@@ -23,6 +23,7 @@ SECTIONS = {
     "consistent": "Consistent noise",
     "consistently_worse": "Consistently worse",
     "luck": "Luck",
+    "success": "Success",
     "statistics": "Statistics",
     "parameters": "Parameters",
     "interactions": "Two noises together",
@@ -111,4 +112,4 @@ def write_report(out, verdicts, tables, drawn, overview, problems, notes):
         notes=[note for note in notes if note not in averaged],
         averaged=averaged,
     )
-    (out / "report.html").write_text(html)
+    (out / "report.html").write_text(html, "utf-8")

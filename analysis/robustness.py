@@ -16,7 +16,14 @@ import numpy as np
 import pandas as pd
 
 from analysis.formatting import P_VALUE, SHARE, WHOLE, Table
-from analysis.runs import KEYS, ROBUSTNESS_COLUMNS, STUDY, study_name
+from analysis.runs import (
+    ELSEWHERE,
+    KEYS,
+    ROBUSTNESS_COLUMNS,
+    STUDY,
+    study_name,
+    where_tested,
+)
 from analysis.statistics import compare, holm, mean_std, percent_of
 from analysis.verdicts import (
     borderline,
@@ -27,7 +34,7 @@ from analysis.verdicts import (
     significant,
     spread_of,
 )
-from noisy_wrappers import BASELINE, Configuration, rounded
+from noisy_wrappers import BASELINE, WRAPPERS, Configuration, rounded
 
 FILES = ("robustness.csv", "robustness.csv.gz")
 CONDITION = ["test_noise", "test_rate"]
@@ -69,24 +76,38 @@ def read_robustness(runs_dir, runs):
         except (OSError, ValueError, EOFError) as error:
             notes.append(f"{run.run}: {paths[0].name} is left out: {' '.join(str(error).split())}")
             continue
-        keys = [getattr(run, name) for name in (*KEYS, "configuration", "seed")]
-        for condition, returns in episodes.items():
+        keys = {name: getattr(run, name) for name in (*KEYS, "configuration", "seed")}
+        for (condition, elsewhere), returns in episodes.items():
+            keys["environment"] = where_tested(run.environment, elsewhere)
             texts = condition.noise, condition.noise_rate
-            rows.append((*keys, *texts, condition, returns.mean(), cvar(returns)))
+            rows.append((*keys.values(), *texts, condition, returns.mean(), cvar(returns)))
     return pd.DataFrame(rows, columns=RUN_COLUMNS), notes
 
 
 def read_episodes(path):
-    """Read one file: a dict of Configuration -> returns of its episodes. Raises ValueError."""
-    text = {"noise": str, "noise_rate": str}
+    """Read one file: {(Configuration, environment): returns of its episodes}.
+
+    The environment is empty for that of the training. Raises ValueError.
+    """
+    text = {"noise": str, "noise_rate": str, "environment": str}
     table = pd.read_csv(path, dtype=text, keep_default_na=False)
-    if list(table.columns) != ROBUSTNESS_COLUMNS:
+    known, more = table.columns[: len(ROBUSTNESS_COLUMNS)], table.columns[len(ROBUSTNESS_COLUMNS) :]
+    if list(known) != ROBUSTNESS_COLUMNS or not set(more) <= {"success", "environment"}:
         raise ValueError("unexpected header")
+    if "environment" not in more:
+        table["environment"] = ""
     returns = pd.to_numeric(table["episodic_return"])
     if not np.isfinite(returns).all() or not len(returns):
         raise ValueError("no episodes, or a return that is not finite")
-    groups = returns.groupby([table["noise"], table["noise_rate"]], sort=False)
-    return {Configuration.parse(*key): group.to_numpy(float) for key, group in groups}
+    keys = [table[name] for name in ("noise", "noise_rate", "environment")]
+    groups = returns.groupby(keys, sort=False)
+    found = {
+        (Configuration.parse(*key[:2]), key[2]): group.to_numpy(float) for key, group in groups
+    }
+    for name in set().union(*(condition.wrappers for condition, _ in found)) - WRAPPERS.keys():
+        if ":" not in name:  # else one of the user's own
+            raise ValueError(f"unknown noise {name!r}")
+    return found
 
 
 def cvar(returns):
@@ -96,7 +117,8 @@ def cvar(returns):
 
 def is_unseen(condition, config):
     """Tell whether a test condition counts in the score of a training configuration."""
-    changes_behaviour = not condition.kinds & {"reward", "dynamics"}
+    ends = "RandomEarlyTermination" in condition.wrappers
+    changes_behaviour = "reward" not in condition.kinds and not ends
     new = set(condition.wrappers).isdisjoint(config.wrappers)
     return not condition.is_baseline and changes_behaviour and new
 
@@ -185,8 +207,9 @@ def score_rows(runs):
                 found = environment_scores(same, config)
                 if found:
                     scores[environment] = found
-            if len(scores) > 1:
-                yield score_row(study, "all", "", config, scores)
+            at_home = {name: found for name, found in scores.items() if ELSEWHERE not in name}
+            if len(at_home) > 1:
+                yield score_row(study, "all", "", config, at_home)
             for environment, found in scores.items():
                 yield score_row(study, "environment", environment, config, {environment: found})
 
@@ -258,7 +281,7 @@ def robustness_sentences(scores):
     """Yield one plain sentence for each training configuration: is it more robust?"""
     for row in scores[primary(scores)].itertuples():
         where = row.environment or "all environments together"
-        study = study_name(row.algorithm, row.settings, row.phase)
+        study = study_name(row.algorithm, row.exp_name, row.phase)
         start = f"{study} on {where}, trained with {row.noise} at rate {row.noise_rate}"
         evidence, limit = difference(row), ""
         if pd.isna(row.p):

@@ -1,9 +1,11 @@
 """Reading a folder of runs for analyze.py: which runs count, and which may be compared.
 
-Runs that may be compared are a study: they have the same algorithm and settings and are of the same
-phase of a choice. Only finished runs (those with a result.json) count.
+Runs that may be compared are a study: those of one algorithm and one exp_name, with the same
+arguments. The two phases of a choice are the folders search/ and confirmation/. Only finished runs
+(those with a result.json) count.
 """
 
+import io
 import json
 import re
 from collections import Counter
@@ -14,25 +16,50 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from noisy_wrappers import BASELINE, MAY_DIFFER_IN_A_TABLE, Configuration
+from analysis.folders import (
+    PHASES,
+    SEARCH,
+    STOPPED,
+    DamageError,
+    difference,
+    flat_choice,
+    has_begun,
+    read_config,
+    read_log,
+    read_result,
+    runs_of,
+)
+from analysis.statistics import percent_of
+from noisy_wrappers import BASELINE, Configuration
 
-STUDY = ["algorithm", "settings", "phase"]  # the columns that name a study: see study_name
+STUDY = ["algorithm", "exp_name", "phase"]  # the columns that name a study: see study_name
 KEYS = [*STUDY, "environment", "noise", "noise_rate"]
-EVAL_HEADER = "step,episode,episodic_return,episodic_length\n"
-# Arguments that have columns of their own, or may differ; the steps of tests are intersected.
-NOT_SETTINGS = {"env_id", "seed", "noise", "noise_rate"} | MAY_DIFFER_IN_A_TABLE
-RUN_COLUMNS = ["run", "status", "reason", *KEYS, "configuration", "seed", "episodes", "total"]
-RUN_COLUMNS += ["arguments", "versions", "steps", "returns"]
+ELSEWHERE = ", tested in "
+SUCCESS = "success rate"  # what a Study may have in place of returns
+EVAL_COLUMNS = ["step", "episode", "episodic_return", "episodic_length"]
+RUN_COLUMNS = ["run", "status", "reason", *KEYS, "configuration", "seed", "total"]
+RUN_COLUMNS += ["settings", "versions", "steps", "returns", "success_rates"]
 CHOICE_COLUMNS = ["algorithm", "environment", "phase", "round", "noise", "noise_rate"]
 CHOICE_COLUMNS += ["seeds", "score", "survives"]
 ROBUSTNESS_COLUMNS = ["noise", "noise_rate", "episode", "episodic_return", "episodic_length"]
-FIRST_CONFIRMATION_SEED = 1001  # of `./benchmark.sh choose`: lower seeds are those of its search
+FIRST_CONFIRMATION_SEED = 1001  # of `./benchmark.sh choose`
+OLDER = "environments"  # before their version, in `phase`: see read_runs
 
 
-def study_name(algorithm, settings="", phase=""):
-    """Name a study for people: "SAC", or "SAC [gamma=0.9, search]"."""
-    parts = [part for part in (settings, phase) if part]
+def study_name(algorithm, exp_name="", phase=""):
+    """Name a study for people: "SAC", or "SAC [my_experiment, search]"."""
+    parts = [part for part in (exp_name, phase) if part and part != script_name(algorithm)]
     return f"{algorithm} [{', '.join(parts)}]" if parts else algorithm
+
+
+def script_name(algorithm):
+    """Return the exp_name that a training script gives its runs by default."""
+    return f"{algorithm.lower()}_continuous_noisy"
+
+
+def where_tested(environment, elsewhere):
+    """Name where runs were tested: in their own environment, or in another one."""
+    return f"{environment}{ELSEWHERE}{elsewhere}" if elsewhere else environment
 
 
 def rows_of(table, key):
@@ -40,127 +67,166 @@ def rows_of(table, key):
     return pd.MultiIndex.from_frame(table[STUDY]).isin([tuple(key)])
 
 
-def read_config(folder):
-    """Read what identifies a run from its config.json."""
-    config = json.loads((folder / "config.json").read_text())
-    args = config["args"]
-    commit = str(config.get("git_commit"))  # 40 digits, perhaps with "-dirty"
-    versions = {
-        **config["versions"],
-        "matmul precision": config.get("matmul_precision"),
-        "git commit": commit[:10] + commit[40:],
-    }
-    for name, value in (("algorithm", config["algorithm"]), ("env_id", args["env_id"])):
-        if not isinstance(value, str):
-            raise ValueError(f"config.json: {name} is {value!r}")
-    settings = {name: value for name, value in args.items() if name not in NOT_SETTINGS}
-    configuration = Configuration.stored(args["noise"], args["noise_rate"])
-    return {
-        "algorithm": config["algorithm"],
-        "environment": args["env_id"],
-        "noise": configuration.noise,
-        "noise_rate": configuration.noise_rate,
-        "configuration": configuration,
-        "seed": int(args["seed"]),
-        "episodes": int(args["eval_episodes"]),
-        "total": int(args["total_timesteps"]),
-        "arguments": json.dumps(settings, sort_keys=True),
-        "versions": versions,
-    }
-
-
 def read_evaluations(folder, episodes, total):
-    """Read eval.csv: the evaluation steps and the mean return over the episodes of each.
+    """Read eval.csv: the steps of the tests, their mean returns, and their rates of success.
 
-    Raises ValueError unless every evaluation is whole, in order, and the last is at step `total`.
+    Rates are in percent of the episodes, or None for an environment that does not tell success.
+    Raises DamageError unless every evaluation is whole, in order, and the last is at step `total`.
     """
-    text = (folder / "eval.csv").read_text()
-    if not text.startswith(EVAL_HEADER):
-        raise ValueError("eval.csv: unexpected header")
+    try:
+        return evaluations((folder / "eval.csv").read_text("utf-8"), episodes, total)
+    except (OSError, ValueError, OverflowError) as error:
+        reason = error.strerror if isinstance(error, OSError) else " ".join(str(error).split())
+        raise DamageError(f"eval.csv: {reason}") from None
+
+
+def evaluations(text, episodes, total):
+    """Read the text of an eval.csv for read_evaluations."""
+    names = text.partition("\n")[0].split(",")
+    if names not in (EVAL_COLUMNS, [*EVAL_COLUMNS, "success"]):
+        raise ValueError("unexpected header")
     if not text.endswith("\n"):
-        raise ValueError("eval.csv: the last line is half-written")
-    if len(text) == len(EVAL_HEADER):
-        raise ValueError("eval.csv: no evaluation")
-    rows = np.loadtxt(folder / "eval.csv", delimiter=",", skiprows=1, ndmin=2, comments=None)
-    if rows.shape[1] != 4 or len(rows) % episodes or not np.isfinite(rows).all():
-        raise ValueError("eval.csv: incomplete or non-numeric lines")
-    step, episode, episodic_return, _ = np.moveaxis(rows.reshape(-1, episodes, 4), 2, 0)
+        raise ValueError("the last line is half-written")
+    if text.count("\n") == 1:
+        raise ValueError("no evaluation")
+    rows = np.loadtxt(io.StringIO(text), delimiter=",", skiprows=1, ndmin=2, comments=None)
+    if rows.shape[1] != len(names) or len(rows) % episodes or not np.isfinite(rows).all():
+        raise ValueError("incomplete or non-numeric lines")
+    table = np.moveaxis(rows.reshape(-1, episodes, len(names)), 2, 0)
+    step, episode, episodic_return, _, *success = table
     if (episode != np.arange(episodes)).any() or (step != step[:, :1]).any():
-        raise ValueError("eval.csv: an evaluation is incomplete")
+        raise ValueError("an evaluation is incomplete")
     if (np.diff(step[:, 0]) <= 0).any() or step[-1, 0] != total:
-        raise ValueError(f"eval.csv: steps do not ascend to {total}")
-    return step[:, 0].astype(int), episodic_return.mean(axis=1)
+        raise ValueError(f"steps do not ascend to {total}")
+    rates = 100 * success[0].mean(axis=1) if success else None
+    return step[:, 0].astype(int), episodic_return.mean(axis=1), rates
 
 
 def read_run(folder):
     """Read one run folder: a dict with some of RUN_COLUMNS."""
-    row = {"run": folder.name}
+    if not has_begun(folder):
+        return {"status": "unfinished", "reason": "no config.json yet"}
+    row = {}
     try:
-        row |= read_config(folder)
-        if not (folder / "result.json").exists():
+        config = read_config(folder)
+        row = {name: config[name] for name in RUN_COLUMNS if name in config}
+        row["noise"] = config["configuration"].noise
+        row["noise_rate"] = config["configuration"].noise_rate
+        result = read_result(folder, config)
+        if result is None:
             reason = f"no result.json; {progress(folder)}"
             return row | {"status": "unfinished", "reason": reason}
-        result = json.loads((folder / "result.json").read_text())
-        steps, returns = read_evaluations(folder, row["episodes"], row["total"])
+        steps, returns, rates = read_evaluations(folder, config["episodes"], config["total"])
         if not np.isclose(returns[-1], result["final_return_mean"], rtol=1e-3, atol=1e-3):
-            raise ValueError("eval.csv and result.json disagree on the final return")
-        return row | {"status": "finished", "steps": steps, "returns": returns}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        return row | {"status": "corrupt", "reason": reason}
-
-
-def is_run(folder):
-    """Tell run folders from others, such as the logs of a sweep."""
-    return folder.is_dir() and ("__" in folder.name or (folder / "config.json").exists())
+            raise DamageError("eval.csv and result.json disagree on the final return")
+        values = {"steps": steps, "returns": returns, "success_rates": rates}
+        return row | {"status": "finished"} | values
+    except DamageError as error:
+        return row | {"status": "corrupt", "reason": str(error)}
 
 
 def read_runs(runs_dir):
-    """Read all run folders; `status` is finished, unfinished, corrupt, duplicate or failed.
+    """Read all run folders: a frame with RUN_COLUMNS.
 
-    `settings` says what sets a run apart from others of its algorithm (differing_settings). For the
-    algorithms and environments in the choice.csv of `./benchmark.sh choose`, `phase` is search or
-    confirmation, by the seed; for others it is empty.
+    `status` is finished, unfinished, corrupt, different (from its study), duplicate or failed.
+    `phase` is search or confirmation for the runs of `./benchmark.sh choose`, "environments v4",
+    say, where their study has a newer version of an environment, and empty for all others.
     """
-    runs_dir = Path(runs_dir)
-    rows = [read_run(folder) for folder in sorted(runs_dir.iterdir()) if is_run(folder)]
+    runs_dir, rows = Path(runs_dir), []
+    for folder in runs_of(runs_dir):
+        row = read_run(folder) | {"run": str(folder.relative_to(runs_dir))}
+        rows.append(row | {"phase": "" if folder.parent == runs_dir else folder.parent.name})
+    leave_out_different(rows)
     rows += failed_without_a_folder(runs_dir)
     runs = pd.DataFrame(rows, columns=RUN_COLUMNS, dtype=object)
-    runs["phase"] = ""
-    choice = read_choice(runs_dir)
-    if choice is not None:
-        chosen = set(zip(choice["algorithm"], choice["environment"], strict=True))
-        pairs = zip(runs["algorithm"], runs["environment"], strict=True)
-        fresh = runs["seed"].fillna(0) >= FIRST_CONFIRMATION_SEED
-        phases = np.where(fresh, "confirmation", "search")
-        runs["phase"] = np.where([pair in chosen for pair in pairs], phases, "")
-    for _, group in runs.groupby("algorithm"):
-        runs.loc[group.index, "settings"] = differing_settings(group)
+    set_older_versions_apart(runs)
     twice = (runs["status"] == "finished") & runs.duplicated(["status", *KEYS, "seed"])
     runs.loc[twice, ["status", "reason"]] = ["duplicate", "same configuration and seed as another"]
     return runs
 
 
+def leave_out_different(rows):
+    """Mark the finished runs whose arguments are not those of most runs of their exp_name.
+
+    rows: dicts of read_run, which are changed.
+    """
+    studies = {}
+    for row in rows:
+        if row["status"] == "finished":
+            studies.setdefault((row["algorithm"], row["exp_name"]), []).append(row)
+    for (_, exp_name), runs in studies.items():
+        usual = usual_settings([run["settings"] for run in runs])
+        for run in runs:
+            differing = difference(run["settings"], usual)
+            if differing:
+                own = run["settings"]
+                said = ", ".join(f"{name} is {own[name]}, not {usual[name]}" for name in differing)
+                said += f" as in most runs of {exp_name}: give such runs another --exp-name"
+                run |= {"status": "different", "reason": said}
+
+
+def usual_settings(settings):
+    """Return the arguments that most runs of a study agree on.
+
+    settings: a dict for each run. An argument that a run lacks, because an older version made it,
+    is no difference. Of equally frequent ones, those of the longest runs are the study.
+    """
+    counts = Counter(json.dumps(each, sort_keys=True) for each in settings)
+    kinds = {text: json.loads(text) for text in sorted(counts)}
+    usual = {}
+    while True:
+        open_to = {
+            text: kind
+            for text, kind in kinds.items()
+            if kind.keys() - usual.keys() and not difference(kind, usual)
+        }
+        if not open_to:
+            return usual
+
+        def support(text, among=open_to):
+            alike = [other for other in among if not difference(among[text], among[other])]
+            return sum(counts[other] for other in alike), among[text].get("total_timesteps", 0)
+
+        usual |= open_to[max(open_to, key=support)]
+
+
+def set_older_versions_apart(runs):
+    """Write into `phase` where there is a newer version of a run's environment in its study.
+
+    So an average over environments has one version of each.
+    """
+    finished = runs[(runs["status"] == "finished") & (runs["phase"] == "")]
+    for _, group in finished.groupby(STUDY):
+        newest = newest_versions(group["environment"])
+        for run in group.itertuples():
+            environment, version = split_version(run.environment)
+            if version != newest[environment]:
+                runs.loc[run.Index, "phase"] = f"{OLDER} v{version}"
+
+
 def failed_without_a_folder(runs_dir):
-    """Return the runs of a sweep that failed before they wrote anything: only their logs tell."""
+    """Return the runs of a sweep that failed before they wrote anything: only their logs tell.
+
+    A run that ended well or was stopped, and has no folder, was moved or deleted by somebody.
+    """
     rows = []
     for path in sorted(runs_dir.glob("logs/*__*.log")):
-        # benchmark.sh frames a run's output by lines with "#"; "(" begins notes below a traceback
-        lines = path.read_text(errors="replace").splitlines()
-        told = [line for line in lines if line.strip() and not line.startswith(("# ", "("))]
-        if not (runs_dir / path.stem).exists() and told:
-            rows.append({"run": path.stem, "status": "failed", "reason": told[-1].strip()})
+        log = read_log(runs_dir / path.stem)
+        if not (runs_dir / path.stem).exists() and log.exit_status not in (None, 0, *STOPPED):
+            rows.append({"run": path.stem, "status": "failed", "reason": log.last_line})
     return rows
 
 
 def read_choice(runs_dir):
     """Read the choice.csv of `./benchmark.sh choose`, or return None where there is none.
 
-    Raises ValueError for a file with other columns.
+    Raises ValueError for a damaged file, and where an earlier version kept all runs in one folder.
     """
     path = Path(runs_dir) / "choice.csv"
     if not path.exists():
         return None
+    if not any((path.parent / phase).exists() for phase in PHASES):
+        raise ValueError(flat_choice(path.parent))
     text = dict.fromkeys(("round", "noise", "noise_rate", "survives"), str)
     choice = pd.read_csv(path, dtype=text, keep_default_na=False)
     if list(choice.columns) != CHOICE_COLUMNS:
@@ -168,34 +234,6 @@ def read_choice(runs_dir):
     pairs = zip(choice["noise"], choice["noise_rate"], strict=True)
     choice["noise_rate"] = [Configuration.parse(*pair).noise_rate for pair in pairs]
     return choice
-
-
-def differing_settings(runs):
-    """Say what sets each run of an algorithm apart, so that unlike runs never share a row.
-
-    It is empty unless finished runs differ in an argument, or there is a newer version of the
-    environment: then it is "gamma=0.9, environments v4", say. A run that is not finished also names
-    its arguments that no finished run has; it changes nothing for the others.
-    """
-    finished = runs[runs["status"] == "finished"]
-    finished = finished if len(finished) else runs
-    arguments = {text: json.loads(text) for text in set(runs["arguments"])}
-    names = sorted(set().union(*arguments.values()))
-    known = {
-        name: {str(arguments[text].get(name)) for text in set(finished["arguments"])}
-        for name in names
-    }
-    newest = newest_versions(runs["environment"]) | newest_versions(finished["environment"])
-    result = []
-    for run in runs.itertuples():
-        own = {name: arguments[run.arguments].get(name) for name in names}
-        apart = [name for name in names if known[name] != {str(own[name])}]
-        parts = [f"{name}={own[name]}" for name in apart]
-        environment, version = split_version(run.environment)
-        if version != newest[environment]:
-            parts.append(f"environments v{version}")
-        result.append(", ".join(parts))
-    return result
 
 
 def newest_versions(environments):
@@ -214,7 +252,7 @@ def split_version(environment):
 def progress(folder):
     """Say in words how far an unfinished run is."""
     try:
-        last = (folder / "eval.csv").read_text().rsplit("\n", 2)[-2]
+        last = (folder / "eval.csv").read_text("utf-8").rsplit("\n", 2)[-2]
         return f"evaluated up to step {int(last.split(',')[0]):,}"
     except (OSError, ValueError, IndexError):
         return "no evaluation yet"
@@ -228,8 +266,9 @@ def missing_runs(runs):
     seeds. The search of `./benchmark.sh choose` gives few noises many seeds: nothing is missing.
     """
     rows = []
-    for study, group in runs[runs["algorithm"].notna()].groupby(STUDY):
-        if group["phase"].iloc[0] == "search":
+    runs = runs[runs["algorithm"].notna() & (runs["status"] != "different")]
+    for study, group in runs.groupby(STUDY):
+        if study[2] == SEARCH:
             continue
         cells = group.groupby(["environment", "configuration"])["seed"].agg(set).to_dict()
         baselines = {(environment, BASELINE) for environment, _ in cells}
@@ -291,35 +330,59 @@ def ranges(numbers):
 
 @dataclass
 class Study:
-    """The finished runs that may be compared: one algorithm with one set of settings."""
+    """The finished runs that may be compared: those of one algorithm and one exp_name."""
 
     algorithm: str
-    settings: str  # what sets it apart from other studies of the algorithm
-    phase: str  # of `./benchmark.sh choose`: search, confirmation, or empty
+    exp_name: str
+    phase: str  # as in read_runs
     environments: list
     seeds: list
     steps: np.ndarray  # the evaluation steps that all runs share
     returns: dict  # Configuration -> array (steps x seeds x envs), NaN where there is no run
+    metric: str = "return"  # or "success rate": then `returns` has rates of success in percent
 
     @property
     def key(self):
         """What tells it from other studies, as the columns STUDY do."""
-        return self.algorithm, self.settings, self.phase
+        return self.algorithm, self.exp_name, self.phase
 
     @property
     def name(self):
         """Its name for people."""
         return study_name(*self.key)
 
+    def percent_of(self, difference, e):
+        """Return a difference in percent of the baseline's mean in an environment, if it has any.
+
+        A rate of success has none: differences of rates are in percentage points.
+        """
+        if self.metric == SUCCESS:
+            return difference * np.nan
+        return percent_of(difference, self.final(BASELINE)[:, e])
+
+    def unlearned(self):
+        """Return the environments where all tests of two or more runs are equal: {name: value}."""
+        found = {}
+        for e, env in enumerate(self.environments):
+            tests = np.concatenate([values[..., e] for values in self.returns.values()], axis=1)
+            tests = tests[:, np.isfinite(tests[-1])]
+            if tests.shape[1] > 1 and (tests == tests[0, 0]).all():
+                found[env] = tests[0, 0]
+        return found
+
     def final(self, config):
         """Return the (seeds x envs) array of final test returns."""
         return self.returns[config][-1]
 
 
-def make_studies(runs):
-    """Arrange the finished runs into a list of Study, and list in words what had to be cut."""
+def make_studies(runs, metric="return"):
+    """Arrange the finished runs into a list of Study, and list in words what had to be cut.
+
+    metric: what is compared, "return" or "success rate"; of the latter, only runs that tell it.
+    """
     studies, notes = [], []
-    finished = runs[runs["status"] == "finished"]
+    column = "success_rates" if metric == SUCCESS else "returns"
+    finished = runs[(runs["status"] == "finished") & runs[column].notna()]
     for key, group in finished.groupby(STUDY):
         name = study_name(*key)
         grids = list({steps.tobytes(): steps for steps in group["steps"]}.values())
@@ -337,11 +400,16 @@ def make_studies(runs):
         for run in group.itertuples():
             place = seeds.index(run.seed), envs.index(run.environment)
             shared = np.isin(run.steps, grid)
-            returns[run.configuration][:, *place] = run.returns[shared]
-        study = Study(*key, envs, seeds, grid, returns)
+            returns[run.configuration][:, *place] = getattr(run, column)[shared]
+        study = Study(*key, envs, seeds, grid, returns, metric)
         for env, values in zip(envs, study.final(BASELINE).T, strict=True):
             if np.isnan(values).all() and study.phase != "search":
                 notes.append(f"{name}: no finished baseline on {env}, so no improvement there")
+        if study.phase.startswith(OLDER):
+            notes.append(
+                f"{name} is apart, because averages over environments take the newest version of "
+                f"each: {', '.join(envs)}"
+            )
         notes += version_notes(name, group["versions"])
         studies.append(study)
     return studies, notes

@@ -6,6 +6,8 @@ from matplotlib.colors import LinearSegmentedColormap
 
 STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
 STYLE["svg.hashsalt"] = "noisy"  # equal figures are equal files
+STYLE["pdf.fonttype"] = 42  # TrueType: ICML and GECCO refuse a paper with Type 3 fonts
+STYLE["text.parse_math"] = False  # names of experiments are no formulas
 STYLE["axes.titley"] = 1.0  # above the axes, without a search for labels that are in the way
 WIDTH = 10  # inches of most figures
 WIDTHS = (5.2, 8, WIDTH, 12, 12)  # with one to five panels in a row

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+from analysis.folders import SEARCH
 from analysis.formatting import P_VALUE, PLAIN, SHARE, TENTH, WHOLE, Table
 from analysis.luck import (
     CONSISTENT_PERCENT,
@@ -17,7 +18,7 @@ from analysis.luck import (
     luck_rows,
 )
 from analysis.paper import compare_tables
-from analysis.runs import KEYS, STUDY, rows_of, study_name
+from analysis.runs import KEYS, STUDY, SUCCESS, rows_of, study_name
 from analysis.statistics import (
     LEVEL,
     bootstrap_iqm,
@@ -26,13 +27,14 @@ from analysis.statistics import (
     holm,
     leave_one_seed_out,
     mean_std,
-    percent_of,
     probability_of_improvement,
     steps_to_reach,
 )
-from analysis.verdicts import counted, difference, listed, seeds_of, verdict
-from noisy_wrappers import BASELINE
+from analysis.verdicts import UNLEARNED, counted, difference, listed, seeds_of, verdict
+from noisy_wrappers import BASELINE, rounded
 
+PERCENTS = ("difference_percent", "iqm_change_percent", "iqm_change_low", "iqm_change_high")
+INTERVAL = ("difference_low", "difference_high")
 SEEDS_FOR_INTERACTION = 3  # of each of the four configurations
 # After those that name a study
 _COLUMNS = {
@@ -48,6 +50,8 @@ _COLUMNS = {
         consistent consistent_by_luck consistent_by_luck_95 p_consistent consistent_beyond_luck
         consistently_worse consistently_worse_by_luck consistently_worse_by_luck_95
         p_consistently_worse consistently_worse_beyond_luck""",
+    "success": """environment noise noise_rate mean std baseline_mean baseline_std difference
+        p p_adjusted n n_baseline""",
     "interactions": """environment noise noise_rate n both_mean first_mean second_mean
         baseline_mean interaction interaction_low interaction_high standard_error
         interaction_percent percent_low percent_high""",
@@ -101,7 +105,7 @@ def summary_rows(study):
         }
         if config != BASELINE:
             row["difference"] = mean - base_mean
-            row["improvement_percent"] = percent_of(mean - base_mean, baseline)
+            row["improvement_percent"] = study.percent_of(mean - base_mean, e)
         curves = study.returns[config][..., e]
         row["steps_to_baseline"] = steps_to_reach(curves, study.steps, base_mean)
         yield row
@@ -121,7 +125,7 @@ def best_rows(study, summary):
             "noisy_std": best["std"],
             "chosen_from": len(group),
             "leave_one_seed_out_mean": held_out,
-            "leave_one_seed_out_percent": percent_of(gain, study.final(BASELINE)[:, e]),
+            "leave_one_seed_out_percent": study.percent_of(gain, e),
         }
 
 
@@ -178,12 +182,15 @@ def statistics_rows(study):
     places = [("environment", env, [e]) for e, env in enumerate(study.environments)]
     if study.phase != "confirmation":  # there each environment has its one comparison
         places.append(("all", "", list(range(len(study.environments)))))
-    limits = baseline_limits(study)
+    limits, unlearned = baseline_limits(study), study.unlearned()
+    learned = np.array([env not in unlearned for env in study.environments])
     for (scope, environment, chosen), config in product(places, study.returns):
         x, y = study.final(config)[:, chosen], study.final(BASELINE)[:, chosen]
         seeds = np.isfinite(x).sum(axis=0)
         fewest = 2 if scope == "all" else 1
         both = (seeds >= fewest) & (np.isfinite(y).sum(axis=0) >= fewest)
+        if scope == "all":
+            both &= learned
         row = row_keys(study, environment, config) | {"scope": scope}
         if scope == "all":
             if config == BASELINE or both.sum() < 2:
@@ -196,6 +203,11 @@ def statistics_rows(study):
         if config != BASELINE and both.any():
             clear = not any(low <= 0 <= high for low, high in limits[:, chosen][:, both].T)
             row |= against_baseline(x[:, both], y[:, both], clear)
+            if study.metric == SUCCESS:  # never percent of a rate
+                row |= dict.fromkeys(PERCENTS, np.nan)
+            if environment in unlearned:
+                row |= dict.fromkeys([*PERCENTS, *INTERVAL, "t", "p"], np.nan)
+                row["verdict"] = UNLEARNED
         yield row
 
 
@@ -240,7 +252,7 @@ def interaction_rows(study):
             continue
         both, first, second, alone = cells
         value, error, low, high = contrast(cells, [1, -1, -1, 1])
-        percent = percent_of(1.0, alone)
+        percent = study.percent_of(1.0, e)
         yield {
             **row_keys(study, environment, config),
             "n": min(map(len, cells)),
@@ -321,7 +333,7 @@ def with_p(table, statistics):
 def family_notes(statistics):
     """Say where the number of seeds is too small to show a difference, if corrected."""
     notes = []
-    compared = statistics[statistics["verdict"].notna()]
+    compared = statistics[statistics["verdict"].notna() & (statistics["verdict"] != UNLEARNED)]
     keys = ["comparisons", "smallest_p"]
     for study, rows in compared.groupby(STUDY):
         best = rows.sort_values("smallest_p", kind="stable")
@@ -345,6 +357,31 @@ def family_notes(statistics):
     return notes
 
 
+def unlearned_notes(studies):
+    """Say where no run has learned anything, so that comparisons say nothing."""
+    notes = []
+    for study in studies:
+        for environment, value in study.unlearned().items():
+            result = f"return {rounded(value)}"
+            if study.metric == SUCCESS:
+                result = f"succeed in {value:.0f} % of the episodes"
+            notes.append(
+                f"{study.name} on {environment}: all runs {result}: nothing was learned in "
+                f"{study.steps[-1]:,} steps, so they say nothing about noise."
+            )
+    return notes
+
+
+def success_table(studies):
+    """Return the table of final success rates as {name: Table}, empty without such studies."""
+    judging = [study for study in studies if study.phase != SEARCH]
+    rows = [row for study in judging for row in summary_rows(study)]
+    if not rows:
+        return {}
+    statistics = frame("statistics", (row for study in judging for row in statistics_rows(study)))
+    return {"success": table_of("success", with_p(frame("success", rows), adjust(statistics)))}
+
+
 # At most two lines in the report; docs/statistics.md says how the numbers are computed.
 CAPTIONS = {
     "best": """The best noise in each environment, which may still be worse than no noise. Mean
@@ -360,6 +397,8 @@ rate (0.00: no noise), with the number of seeds in brackets.""",
 seeds, and the difference from no noise. Here p is not corrected.""",
     "statistics": """Every noise against no noise: the difference of the mean final returns with its
 95 % interval, and its test. The effect size is the difference in standard deviations.""",
+    "success": """Success rate in the final test, in percent of its episodes: mean \u00b1 standard
+deviation over n seeds, and the difference from no noise in percentage points.""",
     "interactions": """What two noises do together beyond the sum of their effects, with 95 %
 intervals. Above zero, both together are better than the sum.""",
     "choice": """How the noise was chosen: each round of the search drops the worse half, and fresh
@@ -371,8 +410,10 @@ seeds confirm the winner or not.""",
 CAPTIONS = {name: " ".join(text.split()) for name, text in CAPTIONS.items()}
 
 
-def percent_note(summary):
+def percent_note(summary, metric):
     """Say in which environments of a summary percentages would mean nothing, or ""."""
+    if metric == SUCCESS:
+        return "Success rates are in percent of the episodes, differences in percentage points."
     without = summary["difference"].notna() & summary["improvement_percent"].isna()
     names = sorted(set(summary.loc[without, "environment"]))
     if not names:
@@ -408,7 +449,8 @@ def make_tables(studies, paper=None):
     failing = bad[bad["fails_at_every_rate"] == "yes"][[*STUDY, "noise"]].drop_duplicates()
     failing = "; ".join(f"{noise} ({study_name(*study)})" for *study, noise in failing.values)
     failing = f"Worse at every rate that was tried: {failing or 'none'}."
-    note = percent_note(judged)
+    metric = studies[0].metric
+    note = percent_note(judged, metric)
     tables = [
         table_of("best", best, view=best_view(best, statistics), note=note),
         table_of("consistent", good, note=note),
@@ -421,7 +463,7 @@ def make_tables(studies, paper=None):
     if len(found):
         tables.append(table_of("interactions", found))
     for algorithm, table in summary.groupby("algorithm"):
-        more = {"name": f"summary_{algorithm}", "note": percent_note(table)}
+        more = {"name": f"summary_{algorithm}", "note": percent_note(table, metric)}
         tables.append(table_of("summary", table, **more))
     if paper:
         lengths = {study.key: study.steps[-1] for study in studies}

@@ -15,8 +15,10 @@ from noisy_wrappers import rounded
 
 UNCLEAR = "no clear difference"
 TOO_FEW = "too few seeds"
+UNLEARNED = "nothing learned"
 CLEAR = ["better", "worse"]
-VERDICTS = [*CLEAR, "perhaps better", "perhaps worse", UNCLEAR, TOO_FEW]  # in this order
+VERDICTS = [*CLEAR, "perhaps better", "perhaps worse", UNCLEAR, TOO_FEW, UNLEARNED]  # in this order
+POINTS = " percentage points of success"
 MAX_SEEDS = 1000  # a difference that would take more seeds is said to take more than these
 
 
@@ -24,6 +26,8 @@ def verdict(row):
     """Name the verdict of a row of statistics: one of VERDICTS, or NaN without a baseline."""
     if pd.isna(row["n_baseline"]):
         return nan
+    if row.get("verdict") == UNLEARNED:
+        return UNLEARNED
     if pd.isna(row["p"]):
         return TOO_FEW
     if not significant(row["p"]):
@@ -66,8 +70,11 @@ def spread_of(row):
     return row.pooled_std if pd.isna(half) else half
 
 
-def difference(row):
-    """Spell what a comparison found: "+11.8 [8.4, 15.3] (+21 %)", of several environments in sd."""
+def difference(row, unit=""):
+    """Spell what a comparison found: "+11.8 [8.4, 15.3] (+21 %)", of several environments in sd.
+
+    unit: of the difference, such as POINTS.
+    """
     if pd.isna(row.difference):
         text = f"{row.effect_size:+z.2f} standard deviations on average"
         if pd.isna(row.effect_size):
@@ -79,6 +86,7 @@ def difference(row):
         if pd.notna(row.difference_low):
             ends = row.difference_low, row.difference_high
             text += f" [{', '.join(rounded(end, spread) for end in ends)}]"
+        text += unit
     if pd.notna(row.difference_percent):
         text += f" ({percent(row.difference_percent)})"
     return text
@@ -110,16 +118,18 @@ def smallest(row):
 # ---------------------------------------------------------------------------------------- sentences
 
 
-def sentence(row):
-    """Say in one sentence what a row of statistics shows."""
+def sentence(row, unit=""):
+    """Say in one sentence what a row of statistics shows; unit: of the difference."""
     where = row["environment"]
     if row["scope"] == "all":
         where = f"all {row['environments']:.0f} environments together"
     study = study_name(*row[STUDY])
     start = f"{study} on {where} with {row['noise']} at rate {row['noise_rate']}"
+    if row["verdict"] == UNLEARNED:
+        return f"{start} cannot be judged: all runs have the same results, nothing was learned."
     if row["verdict"] == TOO_FEW:
-        return f"{start} has too few seeds for a test: {difference(row)}."
-    evidence = f"{difference(row)}, p {p_value(row['p'])}{smallest(row)}"
+        return f"{start} has too few seeds for a test: {difference(row, unit)}."
+    evidence = f"{difference(row, unit)}, p {p_value(row['p'])}{smallest(row)}"
     if row["verdict"] == UNCLEAR:
         return f"{start} shows {UNCLEAR}: {evidence}{power(row)}.{borderline(row)}"
     alone = ", the only comparison" if row["comparisons"] == 1 else ""
@@ -205,7 +215,9 @@ def headlines(statistics, best):
             tried = f"{counted(len(rows), 'comparison')} ({tried})"
         counts = [(word, (rows["verdict"] == word).sum()) for word in VERDICTS]
         counts = [(word, n) for word, n in counts if n or word in CLEAR]
-        luck = luck_sentence(best[rows_of(best, key)])
+        luck = ""
+        if (rows["verdict"] != UNLEARNED).any():
+            luck = luck_sentence(best[rows_of(best, key)])
         lines.append({"name": study_name(*key), "tried": tried, "counts": counts, "luck": luck})
     return lines
 
@@ -219,9 +231,10 @@ def clear_first(verdicts, number=10):
     return clear[:number], verdicts.drop(clear.index[:number])
 
 
-def sentences(statistics):
+def sentences(statistics, unit=""):
     """Return a frame with a verdict and a sentence for all that was compared.
 
+    unit: behind each difference, such as POINTS.
     All environments together come before each alone, and clear differences before others.
     """
     compared = statistics[statistics["verdict"].notna()]
@@ -230,6 +243,6 @@ def sentences(statistics):
         rank=[VERDICTS.index(verdict) for verdict in compared["verdict"]],
     )
     compared = compared.sort_values([*STUDY, "apart", "environment", "rank", "p"], kind="stable")
-    compared["sentence"] = [sentence(row) for _, row in compared.iterrows()]
+    compared["sentence"] = [sentence(row, unit) for _, row in compared.iterrows()]
     columns = [*STUDY, "scope", "environment", "verdict", "sentence"]
     return compared[columns].reset_index(drop=True)

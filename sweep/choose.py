@@ -7,22 +7,21 @@ command computes from the finished runs where each choice stands.
 import csv
 import fcntl
 import itertools
-import json
+import math
 import os
+import sys
 from statistics import fmean
 from typing import NamedTuple
 
 from analysis.errors import fail
-from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED, read_run
+from analysis.folders import CONFIRMATION, SEARCH, flat_choice, read_config
+from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED, SUCCESS, read_run
 from analysis.statistics import detectable_shift, holm
+from analysis.verdicts import POINTS
 from noisy_wrappers import BASELINE, Configuration, rounded
 from sweep import halving
-from sweep.grid import NOISES, RATES, PlannedRun, cell, cells, make_run, result
-
-# What a run takes on one core until the finished ones tell: docs/sweeps.md
-STEPS_PER_SECOND = {"sac": 150, "td3": 265, "ppo": 5700}  # in small MuJoCo environments
-IN_HUMANOID = {"sac": 90, "td3": 130, "ppo": 2900}
-START_UP = 10  # seconds, with compilation
+from sweep.environment import ask_all, remember, remembered, run_seconds, time_left, wall_time
+from sweep.grid import PlannedRun, cell, cells, make_run, of_the_paper, result
 
 
 class Choice(NamedTuple):
@@ -36,11 +35,16 @@ class Choice(NamedTuple):
     state: halving.State
     runs: dict[tuple[Configuration, int], PlannedRun]  # those that have been due so far
     returns: dict[tuple[Configuration, int], float]  # of those that are finished
-    core_hours: float  # about what is left
+    spread: float  # standard deviation over seeds of the search's last tests; NaN if unknown
+    run_seconds: float | None  # about what a run takes, if anything tells
+    metric: str = "return"  # or "success rate": then `returns` has rates of success in percent
 
 
-def choices(args):
-    """Return the choices of one command, or exit if its numbers make no choice."""
+def choices(args, ask=False, keep=False):
+    """Return the choices of one command, or exit if its numbers make no choice.
+
+    ask: make and time the environments of choices that have not begun. keep: what they answer.
+    """
     pairs = list(itertools.product(dict.fromkeys(args.algos), args.envs))
     fewest = halving.fewest_seeds(len(pairs))
     if args.confirm < fewest:
@@ -48,12 +52,39 @@ def choices(args):
             f"--confirm must be at least {fewest}, not {args.confirm}: with fewer seeds no "
             f"difference could be significant (number of verdicts: {len(pairs)})"
         )
-    return [follow(args, algorithm, env_id) for algorithm, env_id in pairs]
+    known = {env_id: remembered(args.runs_dir, env_id) for env_id in args.envs}
+    found = [follow(args, *pair, known[pair[1]]) for pair in pairs]
+    new = [(c.algorithm, c.env_id) for c in found if ask and not c.returns]
+    if not new:
+        return found
+    noises = {env_id: candidates(args, algorithm, env_id) for algorithm, env_id in new}
+    for env_id, answer in ask_all(args, noises).items():
+        leave_out(args, env_id, answer.unfit)
+        known[env_id] = answer
+        if keep:
+            remember(args.runs_dir, env_id, answer)
+    return [follow(args, *pair, known[pair[1]]) for pair in pairs]
 
 
-def follow(args, algorithm, env_id):
-    """Return one choice: where the finished runs have brought it."""
-    noises = candidates(args, algorithm, env_id)
+def leave_out(args, env_id, unfit):
+    """Say which noises cannot act in an environment; exit if the user has named them."""
+    reasons = {}
+    for noise, reason in unfit.items():
+        reason = reason.removeprefix(noise.partition("(")[0]).strip()  # of several noises, often
+        reasons.setdefault(reason, []).append(noise)
+    told = "; ".join(f"{', '.join(noises)} ({reason})" for reason, noises in reasons.items())
+    if told and args.noises and not of_the_paper(args):
+        fail(f"--noises: these cannot act in {env_id}: {told}")
+    if told:
+        print(f"{env_id}: left out, because they cannot act there: {told}", file=sys.stderr)
+
+
+def follow(args, algorithm, env_id, environment):
+    """Return one choice: where the finished runs have brought it.
+
+    environment: what is known of it, or None.
+    """
+    noises = candidates(args, algorithm, env_id, environment.unfit if environment else {})
     budget = 3 * len(noises) if args.budget is None else args.budget
     if budget < len(noises):
         fail(f"--budget must be at least {len(noises)}, a run for each noise, not {budget}")
@@ -61,26 +92,41 @@ def follow(args, algorithm, env_id):
     last_seed = sum(seeds for _, seeds in schedule)
     if last_seed >= FIRST_CONFIRMATION_SEED:
         fail(f"--budget {budget} is too large: the best noises would run with {last_seed} seeds")
-    if not args.noises:
-        check_others(args, algorithm, env_id)
-    runs, returns = {}, {}
+    runs, returns, last_tests, different = {}, {}, {}, set()
+    metric = args.metric.replace("_", " ")
     while True:
         state = halving.advance(noises, budget, args.confirm, returns)
+        phase = SEARCH if len(state.rounds) < len(schedule) else CONFIRMATION
         finished = {}
         for noise, seed in state.due:
-            run = make_run(args, algorithm, env_id, noise, seed)
-            runs[noise, seed] = run
+            run = make_run(args, algorithm, env_id, noise, seed, phase)
+            check_place(run)
             if result(run)[0]:
-                finished[noise, seed] = read_return(run, seed)
+                run, row = with_row(run)
+                tests = tests_of(run, row, metric) if row else ()
+                different |= set(tests)
+                if row and phase == CONFIRMATION:
+                    finished[noise, seed] = tests[-1]
+                elif row:
+                    finished[noise, seed] = halving.score(row["steps"], tests)
+                    last_tests.setdefault(noise, []).append(tests[-1])
+            runs[noise, seed] = run
         if not finished:
             break
         returns |= finished
     check_frequencies(runs[key] for key in returns)
-    left = halving.number_of_runs(len(noises), budget, args.confirm) - len(returns)
-    speeds = IN_HUMANOID if "Humanoid" in env_id else STEPS_PER_SECOND
-    seconds = START_UP + args.total_timesteps / speeds[algorithm]
-    if returns:
-        seconds = fmean(wall_time(runs[key]) for key in returns)
+    if len(different) == 1 and (state.rounds or not state.due):
+        fail(
+            f"{algorithm.upper()} on {env_id}: all {len(returns)} runs have a {metric} of "
+            f"{rounded(*different)} in every test: nothing was learned in "
+            f"{args.total_timesteps:,} steps, so further runs would say nothing about noise; "
+            "train for longer, or leave this out",
+            code=1,
+        )
+    taken = [taken for taken in map(wall_time, map(runs.get, returns)) if taken]
+    seconds = fmean(taken) if taken else None
+    if environment and not taken:
+        seconds = run_seconds(next(iter(runs.values())), environment)
     return Choice(
         name=f"{algorithm.upper()} on {env_id}",
         algorithm=algorithm,
@@ -90,26 +136,10 @@ def follow(args, algorithm, env_id):
         state=state,
         runs=runs,
         returns=returns,
-        core_hours=left * seconds / 3600,
+        spread=halving.spread(last_tests.values()),
+        run_seconds=seconds,
+        metric=metric,
     )
-
-
-def check_others(args, algorithm, env_id):
-    """Exit if the folder holds a search among all of the paper's noises.
-
-    They were the default once. With today's list a search would mix with theirs.
-    """
-    ours = cells(args, algorithm, env_id)
-    for noise, rate in itertools.product(NOISES, args.noise_rates or RATES):
-        found = cell([(noise, rate)])
-        if found in ours:
-            continue
-        if result(make_run(args, algorithm, env_id, found, seed=1))[0]:
-            fail(
-                f"{args.runs_dir} holds a choice among other noises, one of them "
-                f"{found}: continue it (--noises paper tries all 90), "
-                "or choose another --runs-dir"
-            )
 
 
 def runs_of(found):
@@ -120,8 +150,8 @@ def runs_of(found):
     return [run for _, run in sorted(runs, key=lambda pair: pair[0])]
 
 
-def candidates(args, algorithm, env_id):
-    """Return the noises to choose from, each once."""
+def candidates(args, algorithm, env_id, unfit=()):
+    """Return the noises to choose from, each once, but for those that cannot act there."""
     noises = dict.fromkeys(cells(args, algorithm, env_id))
     noises.pop(BASELINE, None)  # at rate 0 a noise is none
     for pairs in args.exclude:
@@ -131,78 +161,119 @@ def candidates(args, algorithm, env_id):
         if excluded not in noises:
             fail(f"--exclude: {excluded} is not among the noises")
         del noises[excluded]
+    noises = [noise for noise in noises if noise.noise not in unfit]
     if not noises:
         fail("there is no noise to choose from")
-    return list(noises)
+    return noises
 
 
-def read_return(run, seed):
-    """Return what a finished run counts for.
+def check_place(run):
+    """Exit if the runs of an earlier version are side by side, not in the folders of the phases."""
+    phase = run.folder.parent
+    if not phase.exists() and (phase.parent / run.folder.name).exists():
+        fail(f"{flat_choice(phase.parent)} (or choose another --runs-dir, if it is another sweep)")
 
-    That is halving.score in the search, and its last test in the confirmation.
-    """
+
+def with_row(run):
+    """Return a finished run and its data; or the run with what is damaged in it, and None."""
     row = read_run(run.folder)
-    if row["status"] != "finished":
-        fail(f"{run.folder} cannot be used ({row['reason']}); delete it to run it again")
-    if seed >= FIRST_CONFIRMATION_SEED:
-        return row["returns"][-1]
-    return halving.score(row["steps"], row["returns"])
+    if row["status"] == "finished":
+        return run, row
+    damage = f"{run.folder}/{row['reason']}; move its folder away to run it again"
+    return run._replace(damage=damage), None
+
+
+def tests_of(run, row, metric):
+    """Return the results of a run's tests (tests,), or exit if the environment tells no success."""
+    if metric != SUCCESS:
+        return row["returns"]
+    if row["success_rates"] is None:
+        fail(f"--metric success_rate: {run.kind[1]} tells no `is_success` or `success`")
+    return row["success_rates"]
 
 
 def check_frequencies(runs):
     """Exit if finished runs were not all tested equally often: their scores do not compare."""
     found = {}
     for run in runs:
-        made_with = json.loads((run.folder / "config.json").read_text())["args"]
-        found.setdefault(made_with.get("eval_frequency"), run.folder)
+        made_with = read_config(run.folder)["args"]
+        if "eval_frequency" in made_with:
+            found.setdefault(made_with["eval_frequency"], run.folder)
     if len(found) > 1:
         (every, one), (other, another), *_ = found.items()
         fail(
             f"{one} was tested every {every} steps and {another} every {other}: choose another "
-            f"--runs-dir, or delete the runs of one kind"
+            f"--runs-dir, or move the runs of one kind away"
         )
-
-
-def wall_time(run):
-    """Return how many seconds a finished run has taken."""
-    return json.loads((run.folder / "result.json").read_text())["wall_time_seconds"]
 
 
 # ---------------------------------------------------------------------------------------- in words
 
 
-def plan(found):
-    """Return lines that say, before a batch starts, what is due and what all of it will take.
+def plan(found, args):
+    """Return lines that say, before a batch starts, what it is for and what all of it will take.
 
-    Before the first batch, also what gain can be confirmed.
+    They also say what gain can be confirmed; before any run only in standard deviations.
     """
     if not any(choice.state.due for choice in found):
         return []
-    begun = any(choice.returns for choice in found)
-    return [*map(describe, found), total(found), *([] if begun else [reach(found)])]
+    lines = list(map(describe, found))
+    if not any(choice.returns for choice in found):
+        lines = [*map(question, found), *lines]
+    lines.append(total(found, args))
+    lines += filter(None, (reach(choice, len(found)) for choice in found))
+    return [*dict.fromkeys(lines), f"runs, logs and the verdict are stored in {args.runs_dir}"]
 
 
-def total(found):
+def question(choice):
+    """Say what a choice will decide."""
+    noises = choice.schedule[0][0] if choice.schedule else 1
+    which = f"the best of {noises} noises" if noises > 1 else "the noise"
+    return (
+        f"{choice.name}: is {which} better than no noise? "
+        f"{choice.confirm} fresh seeds of each will decide"
+    )
+
+
+def total(found, args):
     """Say how many runs all choices take, and what is left of them."""
     search = sum(noises * seeds for choice in found for noises, seeds in choice.schedule)
     confirm = sum(2 * choice.confirm for choice in found)
     finished = sum(len(choice.returns) for choice in found)
-    hours = sum(choice.core_hours for choice in found)
-    hours = f"{hours:.1f}" if hours >= 0.1 else f"{hours:.2g}"
-    return (
+    text = (
         f"{search + confirm} runs in all, {search} to search and {confirm} to confirm; "
-        f"{finished} are done, about {hours} core-hours are left"
+        f"{finished} are done"
     )
+    if any(choice.run_seconds is None for choice in found):
+        return text
+    batches = []
+    for numbers in itertools.zip_longest(*map(left, found), fillvalue=0):  # side by side
+        batches.append([])
+        for choice, runs in zip(found, numbers, strict=True):
+            batches[-1] += runs * [choice.run_seconds]
+    elsewhere = args.elsewhere and not finished
+    return f"{text}, {time_left(batches, args.jobs, elsewhere)}"
 
 
-def reach(found):
-    """Say what gain the confirmations of all choices can show."""
-    seeds = found[0].confirm
-    gain = detectable_shift(seeds, seeds, halving.LEVEL / len(found))
-    together = f", corrected for {len(found)} verdicts" if len(found) > 1 else ""
+def left(choice):
+    """Return the numbers of runs in the batches that are left."""
+    numbers = [noises * seeds for noises, seeds in choice.schedule] + [2 * choice.confirm]
+    return [len(choice.state.due), *numbers[len(choice.state.rounds) + 1 :]]
+
+
+def reach(choice, verdicts):
+    """Say what gain the confirmation can show, or nothing once runs are done without a spread."""
+    gain = detectable_shift(choice.confirm, choice.confirm, halving.LEVEL / verdicts)
+    seeds = f"{choice.confirm} fresh seeds confirm a true gain of"
+    power = "with 80 % power" + (f", corrected for {verdicts} verdicts" if verdicts > 1 else "")
+    if not choice.returns:
+        return f"{seeds} {gain:.1f} standard deviations over seeds {power}"
+    if not choice.spread > 0:
+        return ""
+    shift = gain * choice.spread
     return (
-        f"{seeds} fresh seeds confirm a true gain of {gain:.1f} standard deviations over seeds "
-        f"with 80 % power{together}"
+        f"{choice.name}: {seeds} about {rounded(shift, shift)}{unit(choice)} ({gain:.1f} standard "
+        f"deviations of the last tests in the search) {power}"
     )
 
 
@@ -221,7 +292,7 @@ def describe(choice):
     return f"{choice.name}, confirmation: {winner} against no noise, {due}"
 
 
-def standing(found):
+def standing(found, args):
     """Yield lines that say where each choice stands, which noises survive, and what is left.
 
     When all choices are finished, these are the verdicts.
@@ -232,11 +303,19 @@ def standing(found):
     for choice in found:
         yield describe(choice)
         if choice.state.due and choice.state.rounds:
-            yield f"  mean return after round {len(choice.state.rounds)}:"
+            yield f"  mean {choice.metric} after round {len(choice.state.rounds)}:"
             scores = choice.state.rounds[-1].scores
             for noise in sorted(choice.state.noises, key=scores.get, reverse=True):
                 yield f"  {rounded(scores[noise]):>10}  {noise}"
-    yield total(found)
+    yield total(found, args)
+
+
+def report(found, path):
+    """Print the verdicts, and write choice.csv; or, where runs are left, what to do about them."""
+    finished = rows(found)
+    if finished:
+        write_choice(path, finished)
+    print(*conclusion(found), sep="\n")
 
 
 def conclusion(found):
@@ -263,12 +342,20 @@ def rows(found):
     return result
 
 
+def unit(choice):
+    """Return what stands behind a difference."""
+    return POINTS if choice.metric == SUCCESS else ""
+
+
 def judged(found):
     """Return each finished choice's comparison, and its p corrected for all of them."""
     comparisons = []
     for choice in found:
         [winner] = choice.state.noises
-        comparisons.append(halving.compare(winner, choice.state.seeds, choice.returns))
+        comparison = halving.compare(winner, choice.state.seeds, choice.returns)
+        if choice.metric == SUCCESS:
+            comparison = comparison._replace(difference_percent=math.nan)  # never percent of a rate
+        comparisons.append(comparison)
     corrected = holm([comparison.p for comparison in comparisons])
     return list(zip(comparisons, corrected, strict=True))
 
@@ -278,7 +365,7 @@ def verdicts(found, judgements):
     for choice, (comparison, p) in zip(found, judgements, strict=True):
         noises = choice.schedule[0][0] if choice.schedule else 1
         [winner] = choice.state.noises
-        yield halving.sentence(choice.name, winner, noises, comparison, p, len(found))
+        yield halving.sentence(choice.name, winner, noises, comparison, p, len(found), unit(choice))
 
 
 def obstacle(choice):
@@ -296,7 +383,7 @@ def obstacle(choice):
 def write_choice(path, rows):
     """Write choice.csv whole or not at all; it keeps what other commands have chosen."""
     try:
-        with open(path.with_name(".choice.lock"), "w") as lock:
+        with open(path.with_name(".choice.lock"), "w", encoding="utf-8") as lock:
             fcntl.lockf(lock, fcntl.LOCK_EX)  # until it is closed: commands may end side by side
             replace_choice(path, rows)
     except (OSError, KeyError, ValueError) as error:
@@ -307,11 +394,11 @@ def replace_choice(path, rows):
     """Replace the lines of what was chosen now, and keep the others."""
     ours = {(row["algorithm"], row["environment"]) for row in rows}
     if path.exists():
-        with open(path, newline="") as file:
+        with open(path, newline="", encoding="utf-8") as file:
             old = list(csv.DictReader(file))
         rows = [r for r in old if (r["algorithm"], r["environment"]) not in ours] + rows
     temporary = path.with_suffix(".tmp")
-    with open(temporary, "w", newline="") as file:
+    with open(temporary, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, CHOICE_COLUMNS, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)

@@ -8,6 +8,17 @@
 
 log_of() { echo "${1%/*}/logs/${1##*/}.log"; }
 
+locks_work() { # FILE: flock's status is 1 for a lock that another process holds, more for no locks
+  flock --nonblock "$1" true 2>/dev/null || [ $? -eq 1 ]
+}
+
+no_locks() { # FOLDER
+  local name
+  name=$(df -P "$1" | awk 'NR == 2 {print $1 " on " $NF}') || name='the file system'
+  echo "$name has no locks, without which two processes could write into one run's folder:" \
+    "choose a --runs-dir on another file system, or have its locks turned on"
+}
+
 # FOLDER COMMAND: one run, its output framed by two lines that begin with "#"; returns its status.
 # TERM and INT reach all processes of a run, from whoever sends them. USR1 reaches this shell
 # only, and means: have the run write its checkpoint and end. It sets `asked`.
@@ -15,22 +26,25 @@ log_of() { echo "${1%/*}/logs/${1##*/}.log"; }
 # to start the same run waits for it, and goes on with it if it was stopped.
 run_one() {
   asked=
-  mkdir -p "${1%/*}/logs"
+  mkdir -p "${1%/*}/logs" # on a machine that does not share the folder, too
   exec 9>>"$(log_of "$1")"
-  if ! flock --nonblock 9; then
+  if ! flock --nonblock 9 2>/dev/null; then
+    locks_work "$(log_of "$1")" || { echo "error: $(no_locks "${1%/*}")"; return 2; }
     echo "$1 is running already: waiting for it" >&2
     flock 9 >/dev/null 2>&1 || return
   fi
   [ ! -e "$1/result.json" ] || return 0
   export OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 PYTHONUNBUFFERED=1
-  echo "# $(date '+%F %T') $HOSTNAME: $2"
+  export PYTHONIOENCODING=utf-8:surrogateescape # whatever the locale, and the folder's name
+  echo "# $(date '+%F %T') $HOSTNAME: $2" 2>/dev/null || return # the report says that the disk is full
   bash -c "exec $2" 2>&1 &
   local child=$! status=0
   trap : TERM INT
   trap '[ -n "$asked" ] || kill -TERM "$child" || true; asked=1' USR1
   while kill -0 "$child" 2>/dev/null; do wait "$child" || true; done # a signal interrupts wait
   wait "$child" || status=$?
-  echo "# $(date '+%F %T') $HOSTNAME: exit=$status" # python -m sweep reads this line
+  # analysis/folders.py reads this line
+  echo "# $(date '+%F %T') $HOSTNAME: exit=$status" 2>/dev/null || true
   return "$status"
 }
 
@@ -50,6 +64,7 @@ run_local() { # nproc obeys OMP_NUM_THREADS, which is about the threads of one p
     cores=$(getconf _NPROCESSORS_ONLN)
   while IFS=$'\t' read -r folder command; do
     while [ "$(jobs -pr | wc -l)" -ge "${jobs:-$cores}" ]; do wait -n || true; done
+    : 2>/dev/null >>"$(log_of "$folder")" || continue # the report says why
     run_one "$folder" "$command" >>"$(log_of "$folder")" &
   done <"$list"
   wait
@@ -67,7 +82,7 @@ run_parallel() { # --termseq: where a connection is lost, the runs get TERM and 
   parallel "${parallel_options[@]}" "${options[@]}" --line-buffer --tagstring '{1}' --colsep '\t' \
     ./benchmark.sh run-one "$sweep" '{1}' '{2}' :::: "$list" 2> >(grep -Ev "$chatter" >&2) |
     while IFS= read -r line; do
-      printf '%s\n' "${line#*$'\t'}" >>"$(log_of "${line%%$'\t'*}")"
+      printf '%s\n' "${line#*$'\t'}" 2>/dev/null >>"$(log_of "${line%%$'\t'*}")" || true
     done
 }
 stop_parallel() { # HUP: parallel starts no more runs, and waits for those that USR1 stops

@@ -8,14 +8,15 @@ import csv
 import difflib
 import functools
 import itertools
-import json
 import os
+import re
 import shlex
 import subprocess
 from pathlib import Path
 from typing import NamedTuple
 
 from analysis.errors import fail
+from analysis.folders import PHASES, DamageError, read_config, read_result, runs_of
 from noisy_wrappers import BASELINE, MAY_DIFFER_IN_A_RUN, Configuration, run_folder
 
 PROJECT = Path(__file__).resolve().parent.parent
@@ -49,6 +50,8 @@ CHOOSE_NOISES = [
     "RandomUniformScaleReward(0.5, 1.5)",
     "RandomEarlyTermination(50)",
     "RandomNormalNoisyAction(0.1)",
+    "RandomActionDelay(0, 2)",
+    "RandomDynamics(0.7, 1.3)",
 ]
 CHOOSE_RATES = [0.05, 1.0]
 # The paper shows bars for several beta and names none of them: these are ours.
@@ -91,6 +94,7 @@ class PlannedRun(NamedTuple):
     script: str
     arguments: list[str]
     options: dict[str, object]  # the script's own, by name: what "--" gives, else the defaults
+    damage: str = ""  # what is already known to be wrong with its files
 
 
 # ---------------------------------------------------------------------------- the scripts' options
@@ -107,7 +111,7 @@ def defaults(script):
 
     Options that the grid gives are left out.
     """
-    nodes = ast.parse((PROJECT / script).read_text()).body
+    nodes = ast.parse((PROJECT / script).read_text("utf-8")).body
     [args] = [node for node in nodes if isinstance(node, ast.ClassDef) and node.name == "Args"]
     fields = [field for field in args.body if isinstance(field, ast.AnnAssign)]
     texts = {field.target.id.replace("_", "-"): field.value for field in fields}
@@ -178,18 +182,22 @@ def preset_pairs(preset, algorithm, env_id):
 def best_pairs():
     """Return the paper's best noise and rate for each algorithm and environment."""
     pairs = {}
-    with open(PROJECT / "results" / "paper" / "best.csv", newline="") as file:
+    with open(PROJECT / "results/paper/best.csv", newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
             cell = row["algorithm"].lower(), row["environment"].rpartition("-v")[0]
             pairs[cell] = row["noise_as_run"], float(row["noise_rate"])
     return pairs
 
 
+def of_the_paper(args):
+    """Return whether the noises are given as --noises paper; options.entry reads it so."""
+    return args.noises == [[("paper", None)]]
+
+
 def cells(args, algorithm, env_id):
     """Return the configuration of every noisy cell of the grid, in the order given."""
-    of_the_paper = args.noises == [[("paper", None)]]  # --noises paper, as options.entry reads it
-    given = [] if of_the_paper else args.noises
-    pairs = preset_pairs("paper" if of_the_paper else args.preset, algorithm, env_id)
+    given = [] if of_the_paper(args) else args.noises
+    pairs = preset_pairs("paper" if of_the_paper(args) else args.preset, algorithm, env_id)
     entries, rates = [[pair] for pair in pairs], []
     if given or args.noise_rates:
         names = dict.fromkeys(noise for noise, _ in pairs)
@@ -220,17 +228,18 @@ def cell(pairs, common=None):
         fail(error)
 
 
-def make_run(args, algorithm, env_id, configuration, seed):
-    """Return one run of the grid."""
+def make_run(args, algorithm, env_id, configuration, seed, phase=""):
+    """Return one run of the grid, or of a phase of a choice: that is a folder of its own."""
+    runs_dir = f"{args.runs_dir}/{phase}" if phase else args.runs_dir
     script = script_of(algorithm)
     noises, rates = configuration.texts
     arguments = ["--env-id", env_id, "--seed", str(seed)]
     if noises:
         arguments += ["--noise", *noises, "--noise-rate", *map(str, rates)]
     arguments += ["--total-timesteps", str(args.total_timesteps)]
-    arguments += ["--runs-dir", args.runs_dir, *args.extra]
+    arguments += ["--runs-dir", runs_dir, *args.extra]
     exp_name, kind = script.removesuffix(".py"), (algorithm, env_id)
-    folder = run_folder(args.runs_dir, env_id, exp_name, noises, rates, seed)
+    folder = run_folder(runs_dir, env_id, exp_name, noises, rates, seed)
     options = script_options(script, tuple(args.extra))
     return PlannedRun(folder, kind, args.total_timesteps, script, arguments, options)
 
@@ -254,21 +263,24 @@ def grid(args):
 def runs_in(folder):
     """Return the runs that a folder or its logs tell of, for a status that names no grid."""
     folder = Path(folder)
-    names = {path.parent.name for path in folder.glob("*/config.json")}
-    names |= {path.stem for path in folder.glob("logs/*__*.log")}
-    if not names:
+    places = [folder, *(folder / phase for phase in PHASES)]
+    folders = set(runs_of(folder))
+    for place in places:
+        for log in place.glob("logs/*__*.log"):
+            if not any((other / log.stem).exists() for other in places if other != place):
+                folders.add(place / log.stem)
+    if not folders:
         fail(f"no runs in {folder}; name their folder with --runs-dir")
     runs = []
-    for name in sorted(names):
-        path = folder / name / "config.json"
-        kind, steps = ("", ""), 0  # unknown: it has failed before it began
-        if path.exists():
+    for path in sorted(folders):
+        kind, steps, damage = ("", ""), 0, ""  # unknown: it has failed before it began
+        if (path / "config.json").exists():
             try:
-                args = json.loads(path.read_text())["args"]
-                kind, steps = (args.get("exp_name"), args.get("env_id")), args["total_timesteps"]
-            except (OSError, ValueError, KeyError, TypeError) as error:
-                fail(f"cannot read {path} ({type(error).__name__}: {error}); delete its folder")
-        runs.append(PlannedRun(folder / name, kind, steps, "", [], {}))
+                config = read_config(path)
+                kind, steps = (config["exp_name"], config["environment"]), config["total"]
+            except DamageError as error:
+                damage = f"{path}/{error}"
+        runs.append(PlannedRun(path, kind, steps, "", [], {}, damage))
     return runs
 
 
@@ -277,17 +289,14 @@ def result(run):
 
     Exits if the folder holds a finished run of another length or with other options.
     """
-    path = run.folder / "result.json"
-    if not path.exists():
-        return False, ""
+    if run.damage or not (run.folder / "result.json").exists():
+        return False, run.damage
     try:
-        steps = json.loads(path.read_text())["total_timesteps"]
-        path = run.folder / "config.json"
-        made_with = json.loads(path.read_text())["args"]
-        differences = other_options(run, made_with)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        reason = f"{path} cannot be read ({type(error).__name__}: {error})"
-        return False, f"{reason}; delete the run's folder to run it again"
+        config = read_config(run.folder)
+        read_result(run.folder, config)
+    except DamageError as error:
+        return False, f"{run.folder}/{error}; move its folder away to run it again"
+    steps, differences = config["total"], other_options(run, config["args"])
     if steps != run.total_timesteps:
         fail(f"{run.folder} holds a finished run of {steps} steps; choose another --runs-dir")
     if differences:
@@ -301,16 +310,15 @@ def result(run):
 def other_options(run, made_with):
     """Say in which options that change its result a run differs from the one that made its folder.
 
-    made_with: the arguments in the folder's config.json. One that an older version did not have
-    counts as today's default.
+    made_with: the arguments in the folder's config.json. One that an older version did not have is
+    no difference.
     """
     differences = []
     for name, wanted in run.options.items():
-        default = defaults(run.script)[name]
         field = name.replace("-", "_")
-        made = made_with.get(field, default)
         if field in MAY_DIFFER_IN_A_RUN or (field == "eval_frequency" and wanted is None):
             continue  # where no frequency of tests is asked for, a run keeps its own
+        made = made_with.get(field, wanted)
         if made != wanted:
             differences.append(f"--{name} {made}, not {wanted}")
     return differences
@@ -319,7 +327,8 @@ def other_options(run, made_with):
 def command_line(run):
     """Return a run's command, complete: it can be pasted into a shell in the project's folder."""
     words = [os.environ.get("PYTHON", "python"), run.script, *run.arguments]
-    if ":" in run.kind[1] and "PYTHONPATH" in os.environ:  # where the environment's module lies
+    own = any(re.match(r"[\w.]+:[A-Za-z_]", word) for word in run.arguments)  # module:Name
+    if own and "PYTHONPATH" in os.environ:  # where a module of the user's lies
         words = ["env", f"PYTHONPATH={os.environ['PYTHONPATH']}", *words]
     return shlex.join(words)
 
@@ -341,7 +350,7 @@ def check_extra(runs):
     for run in {run.script: run for run in runs}.values():
         code = read.format(run.script.removesuffix(".py"), run.script)
         command = [os.environ.get("PYTHON", "python"), "-c", code, *run.arguments]
-        answer = subprocess.run(command, capture_output=True, text=True)
+        answer = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace")
         if answer.returncode:
             fail(f"{run.script}: {script_error(answer.stderr)}")
 

@@ -14,7 +14,7 @@ baseline on fresh seeds, in one comparison that is fixed beforehand.
 """
 
 import math
-from statistics import fmean
+from statistics import fmean, variance
 from typing import NamedTuple
 
 import numpy as np
@@ -112,6 +112,17 @@ def score(steps, returns):
     return float(returns[steps[-1] - steps < SCORED * steps[-1]].mean())
 
 
+def spread(groups):
+    """Return the standard deviation of returns over the seeds of a noise, pooled over noises.
+
+    groups: for each noise its returns. NaN if none has two.
+    """
+    groups = [values for values in groups if len(values) > 1]
+    freedom = sum(len(values) - 1 for values in groups)
+    squares = sum((len(values) - 1) * variance(values) for values in groups)
+    return math.sqrt(squares / freedom) if freedom else math.nan
+
+
 def missing(noises, seeds, returns):
     """Return the runs that have no return yet, the first seed of every noise first."""
     wanted = [(noise, seed) for seed in seeds for noise in noises]
@@ -140,14 +151,15 @@ def helps(comparison, p_corrected):
     return significant(p_corrected) and comparison.t > 0
 
 
-def sentence(name, winner, noises, comparison, p_corrected, verdicts):
+def sentence(name, winner, noises, comparison, p_corrected, verdicts, unit=""):
     """Say in one plain sentence what came out.
 
     name: the algorithm and the environment. noises: how many were searched. verdicts: for how many
-    verdicts p is corrected.
+    verdicts p is corrected. unit: of the difference.
     """
     start = f"{name}:"
-    evidence = f"{comparison.n} fresh seeds, {difference(comparison)}, p {p_value(comparison.p)}"
+    evidence = f"{comparison.n} fresh seeds, {difference(comparison, unit)}"
+    evidence += f", p {p_value(comparison.p)}"
     evidence += smallest(comparison) + corrected(p_corrected, verdicts, "verdict")
     end = f".{borderline(comparison)}"
     if helps(comparison, p_corrected):
@@ -160,7 +172,9 @@ def sentence(name, winner, noises, comparison, p_corrected, verdicts):
         return f"{start}, is worse than no noise: {evidence}{end}"
     if comparison.detectable > 0:
         found = rounded(comparison.detectable, spread_of(comparison))
-        evidence += f"; with {comparison.n} seeds a difference of {found} would have been seen"
+        evidence += (
+            f"; with {comparison.n} seeds a difference of {found}{unit} would have been seen"
+        )
         evidence += " (80 % power before the correction)" if verdicts > 1 else " (80 % power)"
     return f"{start}: {evidence}{end}"
 

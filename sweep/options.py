@@ -11,9 +11,10 @@ from noisy_wrappers import canonical_env_id, split_noises
 from sweep.grid import ENVS, GIVEN_BY_THE_GRID, PRESETS, PROJECT, SEEDS, defaults, script_of
 
 GRID_OPTIONS = ["--algos", "--envs", "--noises", "--noise-rates", "--seeds", "--total-timesteps"]
-GRID_OPTIONS += ["--runs-dir", "--combine", "--exclude", "--budget", "--confirm"]
+GRID_OPTIONS += ["--runs-dir", "--combine", "--exclude", "--budget", "--confirm", "--metric"]
 EXECUTOR_OPTIONS = ["--dry-run", "--executor", "--jobs", "--sshlogin", "--remote-dir"]
 EXECUTOR_OPTIONS += ["--slurm-args", "--wait", "--help"]  # benchmark.sh reads these
+MOST_SEEDS = 10_000  # in a range
 
 
 def parse_args(view, caller, argv):
@@ -32,6 +33,7 @@ def parse_args(view, caller, argv):
     parser.add_argument("--exclude", nargs="+", type=entry, default=[])
     parser.add_argument("--budget", type=whole_number)
     parser.add_argument("--confirm", type=whole_number, default=25)
+    parser.add_argument("--metric", choices=("return", "success_rate"), default="return")
     split = argv.index("--") if "--" in argv else len(argv)
     words, extra = argv[:split], argv[split + 1 :]
     given = {word.partition("=")[0] for word in words if word.startswith("--")}
@@ -44,8 +46,21 @@ def parse_args(view, caller, argv):
     parser.set_defaults(**PRESETS.get(preset, {}))
     args = parser.parse_args(words)
     args.given, args.extra = given, extra
+    args.jobs, args.elsewhere = machines()
     args.runs_dir = from_project(caller, args.runs_dir)
     return args
+
+
+def machines():
+    """Return how many runs go on at a time, None if unknown, and whether on other machines.
+
+    benchmark.sh, which reads the executor's options, tells it by environment variables.
+    """
+    jobs, hosts = os.environ.get("SWEEP_JOBS"), os.environ.get("SWEEP_HOSTS")
+    elsewhere = bool(hosts) or os.environ.get("SWEEP_EXECUTOR") == "slurm"
+    if jobs:
+        return int(jobs) * (hosts.count(",") + 1 if hosts else 1), elsewhere
+    return None if elsewhere else len(os.sched_getaffinity(0)), elsewhere
 
 
 def unknown_option(name):
@@ -68,7 +83,7 @@ def from_project(caller, text):
 
     It is relative where it lies in the project, so that it means the same on other machines.
     """
-    path = os.path.normpath(os.path.join(caller, text))
+    path = os.path.normpath(os.path.join(caller, os.path.expanduser(text)))
     if Path(path).is_relative_to(os.getcwd()):
         path = os.path.relpath(path)
     if not re.fullmatch(r"[^-\t\n][^\t\n]*", path):
@@ -95,6 +110,8 @@ def seeds(text):
     if match:
         first, last = match.groups(default=match[1])
         values = range(int(first), int(last) + 1)
+    if values.stop - values.start > MOST_SEEDS:
+        fail(f"--seeds {text} is a range of more than {MOST_SEEDS:,} seeds")
     if not values:
         fail(f"--seeds takes numbers and ranges, separated by spaces: 1 2 3 or 1-3, not {text!r}")
     return values
@@ -140,7 +157,7 @@ def check_arguments(args):
         args.envs = list(dict.fromkeys(map(canonical_env_id, args.envs)))
     except ValueError as error:
         fail(f"--envs: {error}")
-    for name in ("--exclude", "--budget", "--confirm"):
+    for name in ("--exclude", "--budget", "--confirm", "--metric"):
         if name in args.given and args.preset != "choose":
             fail(f"{name} is an option of choose")
     if args.combine and args.preset != "custom":

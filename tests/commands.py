@@ -43,6 +43,8 @@ def at(target, number, action):
 def child(path, words, stdout, stderr, cwd, before, moments):
     os.dup2(stdout.fileno(), 1)
     os.dup2(stderr.fileno(), 2)
+    sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115
+    sys.stderr = open(2, "w", 1, closefd=False)  # noqa: SIM115
     os.chdir(cwd)
     before()
     tqdm.set_lock(threading.RLock())  # a kill would leave the default one's semaphore behind

@@ -8,6 +8,7 @@ fail.
 """
 
 import argparse
+import fcntl
 import fnmatch
 import json
 import os
@@ -85,6 +86,8 @@ def train(argv):
     configuration = (args.env_id, exp_name, args.noise, args.noise_rate, args.seed)
     folder = run_folder(args.runs_dir, *configuration)
     folder.mkdir(parents=True, exist_ok=True)
+    lock = open(folder / ".lock", "w")  # noqa: SIM115
+    fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # as the scripts do
     config = {"algorithm": exp_name[:3].upper(), "versions": {}}
     config["args"] = vars(args) | {"eval_episodes": EPISODES, "exp_name": exp_name}
     (folder / "config.json").write_text(json.dumps(config))
@@ -93,15 +96,20 @@ def train(argv):
     pretend_to_train(args.total_timesteps, folder / "checkpoint.pt")
 
     tests = episodes_of(exp_name[:3], args.env_id, args.noise, args.noise_rate, args.seed)
-    rows = ["step,episode,episodic_return,episodic_length"]
+    tells = "Success" in args.env_id  # whether an episode returned more than 100
+    rows = ["step,episode,episodic_return,episodic_length" + ",success" * tells]
     for test, episodes in enumerate(tests, start=1):
         for episode, value in enumerate(episodes):
-            rows.append(f"{test * args.total_timesteps // 10},{episode},{value},100")
+            rows.append(
+                f"{test * args.total_timesteps // 10},{episode},{value},100"
+                + f",{value > 100:d}" * tells
+            )
     (folder / "eval.csv").write_text("\n".join(rows) + "\n")
     result = {"total_timesteps": args.total_timesteps, "wall_time_seconds": 36.0}
     result["final_return_mean"] = fmean(tests[-1])
     (folder / "result.tmp").write_text(json.dumps(result))
     (folder / "result.tmp").rename(folder / "result.json")
+    lock.close()
 
 
 if __name__ == "__main__":

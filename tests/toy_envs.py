@@ -1,5 +1,7 @@
 """Environments of the tests, for `--env-id toy_envs:Tiny-v0` and the like."""
 
+import time
+
 import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
@@ -75,6 +77,17 @@ class Other(Count):
     def __init__(self, **spaces):
         super().__init__()
         vars(self).update(spaces)
+
+
+class Category(Other):
+    """Observes one of three categories."""
+
+    def reset(self, **kwargs):
+        super().reset(**kwargs)
+        return 1, {}
+
+    def step(self, action):
+        return 1, *super().step(action)[1:]
 
 
 class Buggy(Count):
@@ -160,6 +173,59 @@ class Endless(Count):
         return observation, reward, self.steps >= self.length, False, info
 
 
+class Slow(Count):
+    """A step takes 5 ms."""
+
+    def step(self, action):
+        time.sleep(0.005)
+        return super().step(action)
+
+
+class OneReset(Count):
+    """Its author forgot something when an episode begins anew."""
+
+    resets = 0
+
+    def reset(self, **kwargs):
+        self.resets += 1
+        if self.resets == 2:
+            raise RuntimeError("the window is open already")
+        return super().reset(**kwargs)
+
+
+class Talks(Count):
+    """Its author left a print in it."""
+
+    def reset(self, **kwargs):
+        print("reset!")
+        return super().reset(**kwargs)
+
+
+class Solves(Count):
+    """Tells whether it is solved: in two of five episodes, or in the fifth and sixth.
+
+    `only` tells it only where it is solved, as some do.
+    """
+
+    resets = 0
+
+    def __init__(self, key, kind, only=False):
+        super().__init__()
+        self.key, self.kind, self.only = key, kind, only
+
+    def reset(self, **kwargs):
+        observation, info = super().reset(**kwargs)
+        self.resets += 1
+        self.solved = self.resets in (5, 6) if self.only else self.np_random.random() < 0.4
+        return observation, info
+
+    def step(self, action):
+        *rest, info = super().step(action)
+        if self.solved or not self.only:
+            info[self.key] = self.kind(self.solved)
+        return *rest, info
+
+
 def register(name, entry_point, steps, **kwargs):
     gym.register(f"{name}-v0", entry_point, max_episode_steps=steps, kwargs=kwargs)
 
@@ -174,6 +240,7 @@ register("NanObservation", Count, 8, break_observation_at=70)
 register("NanLate", Count, 8, break_reward_at=130)
 register("DictObservation", Parts, 8)
 register("OneHotObservation", Parts, 8, categories=True)
+register("CategoryObservation", Category, 8, observation_space=gym.spaces.Discrete(3))
 register("SequenceObservation", Other, 8, observation_space=sequence)
 register("ArrayReward", ArrayReward, 8)
 register("Endless", Endless, None)
@@ -190,3 +257,9 @@ register("BuggyStep", Buggy, 8, where="step")
 register("BadValue", BadValue, 8)
 register("Overflow", Overflow, 8)
 register("TextReward", TextReward, 8)
+register("Slow", Slow, 100)
+register("OneReset", OneReset, 8)
+register("Talks", Talks, 8)
+register("IsSuccess", Solves, 8, key="is_success", kind=np.bool_)
+register("Success", Solves, 8, key="success", kind=int)
+register("SuccessOnly", Solves, 8, key="is_success", kind=np.float32, only=True)

@@ -22,6 +22,8 @@ than six pairs: the smallest and the largest ratio). CleanRL's pinned Gymnasium 
 (Humanoid-v4: 376 observations, -v5: 348). SBX gets the sizes of our networks, batches and updates;
 it logs nothing, and in PPO it normalizes neither observations nor rewards.
 --jobs N compares N runs side by side, on a core each, with one alone.
+--estimate compares the speed with the one that `benchmark.sh --dry-run` counts on; the exit status
+is 1 if it is wrong by more than 1.5 times.
 --checkpoint measures one checkpoint, after --stored steps (at least one rollout). SAC and TD3 keep
 all of them in the replay buffer.
 """
@@ -45,6 +47,7 @@ from statistics import median
 PROJECT = Path(__file__).resolve().parent.parent
 ALGOS = ("sac", "td3", "ppo")
 ROLLOUT = 2048  # the steps of PPO's rollout, the default of all programs here
+LARGEST_ERROR = 1.5  # of an estimated speed: LEARNING in sweep/environment.py
 TOTAL_TIMESTEPS = 2_000_000  # more than any program takes before it is ended
 
 
@@ -309,6 +312,22 @@ def checkpoint(algo, env_id, options):
     return [row]
 
 
+def estimate(algo, env_id, options):
+    """Compare the speed with the one that `benchmark.sh --dry-run` counts on."""
+    sys.path.insert(0, str(PROJECT))
+    from sweep.environment import ask, learning_seconds
+
+    with ours(algo, env_id, options) as program:
+        warm_up(program)
+        for _ in range(options.pairs):
+            measure(options, program)
+    clock = time.process_time if options.clock == "cpu" else time.perf_counter
+    environment = ask(env_id, clock=clock)
+    seconds = learning_seconds(algo, environment) + environment.step_seconds
+    speed = median(program.speeds)
+    return [{"steps/s": speed, "estimated": 1 / seconds, "real / estimated": speed * seconds}]
+
+
 def table(rows):
     """Return the rows as text; the lists in them are for --json only."""
     from tabulate import tabulate  # here, since the children's interpreters may not have it
@@ -343,6 +362,7 @@ def parse(argv):
     add("--against-sbx", type=interpreter, metavar="PYTHON", help="with sbx-rl")
     add("--against-checkout", type=Path, metavar="PATH", help="another version of this project")
     add("--jobs", type=int, metavar="N", help="compare N runs side by side with one")
+    add("--estimate", action="store_true", help="check what benchmark.sh --dry-run counts on")
     add("--checkpoint", action="store_true", help="size and time of checkpoints")
     add("--json", type=Path, metavar="FILE", help="write all figures, block by block, to a file")
     end = argv.index("--") if "--" in argv else len(argv)
@@ -374,6 +394,8 @@ def main(argv):
         modes.append(side_by_side)
     if options.checkpoint:
         modes.append(checkpoint)
+    if options.estimate:
+        modes.append(estimate)
     if not modes or options.against_cleanrl or options.against_sbx or options.against_checkout:
         modes.append(compare)
     for mode in modes:
@@ -387,6 +409,9 @@ def main(argv):
         figures[mode.__name__] = rows
     if options.json:
         options.json.write_text(json.dumps(figures, indent=2) + "\n")
+    ratios = [row["real / estimated"] for row in figures.get("estimate", [])]
+    if any(not 1 / LARGEST_ERROR <= ratio <= LARGEST_ERROR for ratio in ratios):
+        fail(f"an estimated speed is wrong by more than {LARGEST_ERROR} times", code=1)
 
 
 if __name__ == "__main__":

@@ -113,7 +113,7 @@ def main():
         ("noises", "returns", *columns),
         *(
             (n, draw.__name__.replace("_", " "), *power(n, schedule(n, 3 * n), 25, draw))
-            for n in (16, 90, 10, 4, 1)
+            for n in (20, 90, 10, 4, 1)
             for draw in (normal, high_peak, failing)
         ),
     )

@@ -55,7 +55,7 @@ def write_run(
     folder.mkdir(parents=True)
     settings = {
         "env_id": env,
-        "exp_name": algorithm,
+        "exp_name": f"{algorithm.lower()}_continuous_noisy",
         "seed": seed,
         "noise": noise,
         "noise_rate": rate,
@@ -112,8 +112,9 @@ def main(args, drawn=False):
 
 def run(tmp_path, runs="runs", out="results", compare=None, drawn=False):
     """Analyse and read the csv tables."""
-    main(analyze.Args(runs_dir=tmp_path / runs, out=tmp_path / out, compare=compare), drawn)
-    empty = dict.fromkeys(("settings", "phase", "environment", "noise"), "")
+    args = analyze.Args(runs_dir=tmp_path / runs, out=tmp_path / out, compare=compare, latex=True)
+    main(args, drawn)
+    empty = dict.fromkeys(("exp_name", "phase", "environment", "noise"), "")
     text = dict.fromkeys((*empty, "noise_rate", "test_rate"), str)
     files = sorted((tmp_path / out).glob("*.csv"))
     return {f.stem: pd.read_csv(f, dtype=text).fillna(empty) for f in files}
@@ -222,7 +223,7 @@ def test_consistent_is_80_percent_or_more_best_first():
     }
     names = ("noise", "percent_of_environments", "average_improvement_percent")
     rows = [dict(zip(names, (noise, *v), strict=True)) for noise, v in shares.items()]
-    study = {"algorithm": "SAC", "settings": "", "phase": ""}
+    study = {"algorithm": "SAC", "exp_name": "", "phase": ""}
     rows = [study | {"environments": 5} | row for row in rows]
     rows.append(rows[2] | {"noise": "in one environment only", "environments": 1})
     table = analysis.tables.frame("consistency", rows)
@@ -354,20 +355,16 @@ def test_an_unfinished_run_renames_no_other(tmp_path):
     write_run(tmp_path / "runs", [1], env="Hopper-v9", finished=False)
     write_run(tmp_path / "runs", [1], gamma=0.5, finished=False, folder="other__1")
     tables = run(tmp_path)
-    assert set(tables["statistics"]["settings"]) == {""}
+    assert set(tables["statistics"]["phase"]) == {""}
     assert f"SAC on Hopper-v5 with {SCALE}" in (tmp_path / "results/report.html").read_text()
-    left = tables["missing"]
-    assert set(left[left["status"] == "unfinished"]["settings"]) == {
-        "environments v9",
-        "gamma=0.5",
-    }
+    assert list(tables["missing"]["status"]).count("unfinished") == 2
 
 
 def test_several_noises_are_one_configuration(tmp_path):
     write_run(tmp_path / "runs", [10])
-    write_run(tmp_path / "runs", [20], noise=(SCALE, ENDING), rate=(0.05, 0.125))
+    write_run(tmp_path / "runs", [20], noise=(ENDING, SCALE), rate=(0.05, 0.125))
     best = run(tmp_path)["best"].iloc[0]
-    assert best["noise"] == f"{SCALE} + {ENDING}" and best["noise_rate"] == "0.05 + 0.125"
+    assert best["noise"] == f"{ENDING} + {SCALE}" and best["noise_rate"] == "0.05 + 0.125"
 
 
 def test_seeds_are_replicates_and_episodes_are_not(tmp_path):
@@ -517,7 +514,7 @@ def test_shuffling_the_run_folders_changes_nothing(sweep, tmp_path):
 
 @pytest.mark.slow
 def test_a_second_analysis_gives_the_same_bytes(sweep):
-    command = [sys.executable, analyze.__file__, "--runs-dir", "runs", "--out", "again"]
+    command = [sys.executable, analyze.__file__, "--runs-dir", "runs", "--out", "again", "--latex"]
     env = os.environ | {"PYTHONHASHSEED": "7"}
     done = subprocess.run(
         command, cwd=sweep.path, env=env, capture_output=True, text=True, check=True
@@ -593,22 +590,21 @@ def test_unfinished_missing_and_duplicate_runs_are_listed(tmp_path, capsys):
     shutil.rmtree(root / f"Pusher-v5__SAC__{SCALE}+0.05__3")
     write_run(root, [-1, -1, -1, -1, 1e6], seed=3, finished=False, **args)
     write_run(root, [-1, -1, -1, -1, 1e6], seed=4, folder="copy", **args)
-    (root / "Pusher-v5__empty").mkdir()
-    (root / "logs").mkdir()  # no run
+    (root / "Pusher-v5__empty").mkdir()  # no run
+    (root / "logs").mkdir()
     (root / "a file").write_text("")
     tables = run(tmp_path)
     missing = tables["missing"].set_index("status")
-    assert sorted(missing.index) == ["corrupt", "duplicate", "missing", "unfinished"]
+    assert sorted(missing.index) == ["duplicate", "missing", "unfinished"]
     assert missing.loc["missing", "seeds"] == 2 and missing.loc["missing", "noise"] == SCALE
     assert missing.loc["unfinished", "seeds"] == 3
     assert "50,000" in missing.loc["unfinished", "reason"]
-    assert missing.loc["corrupt", "run"] == "Pusher-v5__empty"
     noisy = row(tables["summary_SAC"], environment="Pusher-v5", noise=SCALE, noise_rate="0.05")
     assert noisy["n"] == 2  # seeds 1 and 4
     printed = capsys.readouterr().out
-    assert "WARNING: Runs left out: 4 (" in printed and "copy" in printed
+    assert "WARNING: Runs left out: 3 (" in printed and "copy" in printed
     html = (tmp_path / "results/report.html").read_text()
-    assert "Runs left out: 4 (" in html and "1 missing" in html
+    assert "Runs left out: 3 (" in html and "1 missing" in html
 
 
 def test_runs_left_out_have_one_row_per_configuration(tmp_path):
@@ -647,13 +643,13 @@ def test_more_seeds_for_the_baseline_or_for_one_noise_are_nothing_missing(tmp_pa
 def test_only_the_older_versions_of_an_environment_are_labelled(tmp_path):
     for env in ("Hopper-v5", "Walker2d-v9", "Walker2d-v10", "Ant", "Ant-v4"):
         write_run(tmp_path, [10], env=env)
-    runs = analysis.runs.read_runs(tmp_path).set_index("environment")["settings"]
+    runs = analysis.runs.read_runs(tmp_path).set_index("environment")["phase"]
     assert runs["Walker2d-v9"] == "environments v9"
     assert runs["Ant"] == "environments v"
     assert set(runs[["Hopper-v5", "Walker2d-v10", "Ant-v4"]]) == {""}
     for env in ("Grid-v0", "Maze-v0", "Maze-v1"):
         write_run(tmp_path, [10], env=env)
-    runs = analysis.runs.read_runs(tmp_path).set_index("environment")["settings"]
+    runs = analysis.runs.read_runs(tmp_path).set_index("environment")["phase"]
     assert runs["Grid-v0"] == "" and runs["Maze-v0"] == "environments v0"
 
 
@@ -683,31 +679,24 @@ def test_a_missing_baseline_is_said(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("change", "study"),
     [
-        ({"env": "Hopper-v4"}, ("SAC", "environments v4")),
-        ({"every": 20_000}, ("SAC", "total_timesteps=20000")),
-        ({"gamma": 0.9}, ("SAC", "gamma=0.9")),
-        ({"tau": 0.1}, ("SAC", "tau=0.1")),
-        ({"exp_name": "other"}, ("SAC", "exp_name=other")),
-        ({"algorithm": "TD3", "exp_name": "SAC"}, ("TD3", "")),
+        ({"env": "Hopper-v4"}, ("SAC", "sac_continuous_noisy", "environments v4")),
+        ({"exp_name": "other"}, ("SAC", "other", "")),
+        ({"algorithm": "TD3"}, ("TD3", "td3_continuous_noisy", "")),
     ],
 )
-def test_runs_that_differ_never_share_a_row(change, study, tmp_path):
+def test_studies_never_share_a_row(change, study, tmp_path):
     for seed in (1, 2):
         write_run(tmp_path / "runs", [10], seed=seed, folder=f"a{seed}")
         write_run(tmp_path / "runs", [99], seed=seed, folder=f"b{seed}", **change)
         write_run(tmp_path / "runs", [50], seed=seed, folder=f"c{seed}", noise=SCALE, rate=0.1)
-    runs = analysis.runs.read_runs(tmp_path / "runs")
-    assert set(runs["status"]) == {"finished"}
-    assert study in set(zip(runs["algorithm"], runs["settings"], strict=True))
     tables = run(tmp_path)
     summary = pd.concat([t for name, t in tables.items() if name.startswith("summary_")])
     assert list(summary["n"]) == [2, 2, 2] and sorted(summary["std"]) == [0, 0, 0]
-    algorithm, settings = study
-    other = row(summary, algorithm=algorithm, settings=settings)
+    other = row(summary, **dict(zip(analysis.runs.STUDY, study, strict=True)))
     assert other["mean"] == 99 and np.isnan(other["improvement_percent"])
     noisy = row(summary, noise=SCALE)
-    assert noisy["baseline_mean"] == 10 and (noisy["algorithm"], noisy["settings"]) != study
-    assert noisy["settings"] == "" or change.keys() <= {"every", "gamma", "tau", "exp_name"}
+    assert noisy["baseline_mean"] == 10
+    assert tuple(noisy[analysis.runs.STUDY]) == ("SAC", "sac_continuous_noisy", "")
     assert "all" not in set(tables["statistics"]["scope"])
 
 
@@ -745,10 +734,12 @@ def test_changed_code_is_another_commit(tmp_path):
 def test_what_an_earlier_analysis_left_is_said(tmp_path, capsys):
     write_run(tmp_path / "runs", [1])
     run(tmp_path)
-    assert "earlier analysis" not in capsys.readouterr().out
-    (tmp_path / "results/summary_TD3.csv").touch()
+    assert "did not write" not in capsys.readouterr().out
+    for name in ("summary_TD3.csv", "curves_TD3_no_noise.svg", "README.md"):
+        (tmp_path / "results" / name).touch()
     main(analyze.Args(runs_dir=tmp_path / "runs", out=tmp_path / "results"))
-    assert "earlier analysis, not renewed: summary_TD3.csv\n" in capsys.readouterr().out
+    left = "files that this analysis did not write: curves_TD3_no_noise, summary_TD3\n"
+    assert left in capsys.readouterr().out
 
 
 # ------------------------------------------------------------------------------ comparing, drawing
@@ -809,20 +800,20 @@ def test_a_difference_needs_equal_steps_and_a_listing_one_version(tmp_path):
             for env in ("Hopper", "HalfCheetah"):
                 write_run(tmp_path / "runs", 5 * [final], env=f"{env}-v5", **more)
                 write_run(tmp_path / "runs", 5 * [12 + seed], env=f"{env}-v4", **more)
-            write_run(tmp_path / "runs", [final], env="Walker2d-v5", **more)
+            write_run(tmp_path / "runs", [final], env="Walker2d-v5", exp_name="short", **more)
     tables = run(tmp_path, compare=RESULTS / "paper")
-    best = tables["compare_best"].set_index(["settings", "environment", "noise"]).sort_index()
-    whole, short = "total_timesteps=1000000", "total_timesteps=200000"
+    best = tables["compare_best"].set_index(["exp_name", "environment", "noise"]).sort_index()
+    whole = "sac_continuous_noisy"
     assert np.isfinite(best.loc[(whole, "Hopper-v5", ""), "difference_se"])
-    assert best.loc[(short, "Walker2d-v5", ""), "mean"] == 11
-    assert np.isnan(best.loc[(short, "Walker2d-v5", ""), "difference_se"])
+    assert best.loc[("short", "Walker2d-v5", ""), "mean"] == 11
+    assert np.isnan(best.loc[("short", "Walker2d-v5", ""), "difference_se"])
     early = tables["compare_early_performance"]
-    early = early[(early["settings"] == short) & (early["steps_millions"] == 0.2)]
+    early = early[(early["exp_name"] == "short") & (early["steps_millions"] == 0.2)]
     assert len(early) == 2 and early["difference_se"].notna().all()
     table = tables["compare_consistent"]  # the paper lists this noise: SAC, 100 %
     table = table[(table["noise"] == SCALE) & (table["noise_rate"] == "0.05")]
-    listed = table.set_index("settings")["listed_by"]
-    assert listed[whole] == "paper" and listed[f"{whole}, environments v4"] == "both"
+    listed = table.set_index(["exp_name", "phase"])["listed_by"]
+    assert listed[whole, ""] == "paper" and listed[whole, "environments v4"] == "both"
 
 
 def drawn_of(runs_dir):
@@ -875,11 +866,13 @@ def test_effects_of_many_configurations_are_a_heatmap(tmp_path):
     assert [round(x - 0.35) for x in dots] == [0]
 
 
-def test_a_label_may_be_longer_than_a_file_name(tmp_path):
-    settings = {f"a_long_name_of_a_setting_{i}": i for i in range(12)}
-    write_run(tmp_path / "runs", [1.0], folder="b")
-    write_run(tmp_path / "runs", [1.0], folder="c", noise=SCALE, rate=0.1)
-    write_run(tmp_path / "runs", [1.0], folder="d", noise=SCALE, rate=0.1, **settings)
+def test_odd_sweeps_are_analysed_too(tmp_path):
+    """A label longer than a file name may be, and no formula."""
+    name = r"$\frac$" + 30 * "a_long_name_"
+    write_run(tmp_path / "runs", [1.0], folder="b", exp_name=name)
+    write_run(tmp_path / "runs", [1.0], folder="c", noise=SCALE, rate=0.1, exp_name=name)
+    write_run(tmp_path / "runs", [1.0], folder="d")
+    write_run(tmp_path / "runs", [1.0], folder="e", noise=SCALE, rate=0.1)
     run(tmp_path, drawn=True)
     assert len(list((tmp_path / "results").glob("curves_*.svg"))) == 2
 

@@ -1,6 +1,7 @@
 """What analyze.py says of noise that was chosen, that changes during training, or that combines."""
 
-from pathlib import Path
+import json
+import subprocess
 
 import numpy as np
 import pandas as pd
@@ -22,17 +23,18 @@ def write_choice(root, env="Hopper-v5", seeds=range(1001, 1006), gain=30.0):
     """Runs of a search in two rounds, which flatters its winner, and of a confirmation."""
     for noise, n, final in ((SCALE, 3, 900.0), (ENDING, 1, 100.0)):
         for seed in range(1, n + 1):
-            write_run(root, [final + seed], "PPO", env, noise, 1.0, seed)
+            write_run(root / "search", [final + seed], "PPO", env, noise, 1.0, seed)
+    fresh = root / "confirmation"
     for seed in seeds:
-        write_run(root, [100.0 + seed - 1000], "PPO", env, seed=seed)
-        write_run(root, [100.0 + gain + seed - 1000], "PPO", env, SCALE, 1.0, seed)
+        write_run(fresh, [100.0 + seed - 1000], "PPO", env, seed=seed)
+        write_run(fresh, [100.0 + gain + seed - 1000], "PPO", env, SCALE, 1.0, seed)
     lines = [
         f'PPO,{env},search,1,"{SCALE}",1.0,1,901.0,yes\n',
         f'PPO,{env},search,1,"{ENDING}",1.0,1,101.0,no\n',
         f"PPO,{env},confirmation,,,0.0,5,103.0,\n",
         f'PPO,{env},confirmation,,"{SCALE}",1.0,5,133.0,yes\n',
     ]
-    path = Path(root) / "choice.csv"
+    path = root / "choice.csv"
     path.write_text((path.read_text() if path.exists() else HEADER) + "".join(lines))
 
 
@@ -73,12 +75,39 @@ def test_confirmations_are_one_family_of_holms(tmp_path):
     assert set(table["comparisons"]) == {3}
 
 
-def test_without_choice_csv_high_seeds_are_seeds(tmp_path):
+def test_the_phases_are_folders_and_high_seeds_are_seeds(tmp_path):
+    """A choice that is not finished has no choice.csv."""
     write_choice(tmp_path / "runs")
     (tmp_path / "runs/choice.csv").unlink()
+    for seed in (1, 1001):
+        write_run(tmp_path / "runs", [5.0], "PPO", "Pusher-v5", seed=seed)
     tables = run(tmp_path)
-    assert set(tables["summary_PPO"]["phase"]) == {""} and "choice" not in tables
-    assert row(tables["summary_PPO"], noise=SCALE)["n"] == 8
+    summary = tables["summary_PPO"].groupby("phase")["n"].agg(list).to_dict()
+    assert summary == {"": [2], "search": [1, 3], "confirmation": [5, 5]}
+    assert "choice" not in tables
+
+
+def test_the_flat_folder_of_an_earlier_version_is_refused_with_the_commands(tmp_path, capsys):
+    """After them, the tables are those of a choice that was never flat."""
+    for style in ("p1.0_s{}_A__Hopper-v5__ppo", "Hopper-v5__ppo__A_p1.0__{}"):
+        root = tmp_path / style[0] / "my runs"
+        write_choice(root)
+        expected = run(tmp_path / style[0], "my runs")
+        for phase in ("search", "confirmation"):
+            for i, folder in enumerate(sorted((root / phase).iterdir())):
+                seed = json.loads((folder / "config.json").read_text())["args"]["seed"]
+                folder.rename(root / (style.format(seed).replace("A", f"A{phase[0]}{i}")))
+            (root / phase).rmdir()
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as error:
+            run(tmp_path / style[0], "my runs")
+        printed = capsys.readouterr().err
+        assert error.value.code == 2 and printed.count("\n") == 1 and printed.count("mv ") == 2
+        command = printed.partition("now: ")[2]
+        subprocess.run(command, shell=True, check=True, executable="/bin/bash")
+        for name, table in run(tmp_path / style[0], "my runs", "again").items():
+            if name != "missing":
+                pd.testing.assert_frame_equal(table, expected[name])
 
 
 def test_other_sweeps_in_the_folder_of_a_choice_stay_as_they_are(tmp_path):
@@ -100,10 +129,10 @@ def test_a_choice_in_a_folder_of_its_own_disturbs_no_other_sweep(tmp_path):
     for seed in (1, 2, 3):
         write_run(tmp_path / "runs", [100.0 + seed], "PPO", seed=seed)
         write_run(tmp_path / "runs", [110.0 + seed], "PPO", noise=SCALE, rate=1.0, seed=seed)
-    before = [run.folder.name for run in evaluate.find_runs([tmp_path / "runs"])]
+    before = [run.folder for run in evaluate.find_runs([tmp_path / "runs"])[0]]
     tables = run(tmp_path)
     write_choice(tmp_path / "runs/choose")
-    assert [run.folder.name for run in evaluate.find_runs([tmp_path / "runs"])] == before
+    assert [run.folder for run in evaluate.find_runs([tmp_path / "runs"])[0]] == before
     again = run(tmp_path, out="again")
     assert tables.keys() == again.keys() and "choice" not in again
     for name, table in tables.items():
@@ -125,22 +154,22 @@ def test_rates_that_change_are_read_sorted_and_shown(tmp_path):
         for seed in (1, 2, 3):
             write_run(tmp_path / "runs", [10 + seed], seed=seed, noise=SCALE, rate=rate)
             write_run(tmp_path / "runs", [12 + seed], seed=seed, noise=PUSH, rate=rate)
-    both = {"noise": (SCALE, PUSH), "rate": ("1.0:0.0", 0.5)}
+    both = {"noise": (PUSH, SCALE), "rate": (0.5, "1.0:0.0")}
     for seed in (1, 2, 3):
         write_run(tmp_path / "runs", [10], seed=seed)
         write_run(tmp_path / "runs", [20], seed=seed, **both)
     tables = run(tmp_path)
     rates = tables["summary_SAC"].query("noise == @PUSH")["noise_rate"].tolist()
     assert rates == ["0.00 to 1.00", "0.05", "1.00 to 0.00", "1.00"]
-    combined = row(tables["summary_SAC"], noise=f"{SCALE} + {PUSH}")
-    assert combined["noise_rate"] == "1.00 to 0.00 + 0.50"
+    combined = row(tables["summary_SAC"], noise=f"{PUSH} + {SCALE}")
+    assert combined["noise_rate"] == "0.50 + 1.00 to 0.00"
     studies, _ = analysis.runs.make_studies(analysis.runs.read_runs(tmp_path / "runs"))
     figures = analysis.figures.figures(studies, analysis.tables.make_tables(studies))
     drawn = {drawing.name: drawing.figure for drawing in figures}
     lines = [text.get_text() for text in drawn["effects_SAC"].axes[0].get_yticklabels()]
     lines = [line.replace("\n(", "(") for line in lines]  # broken where there is little room
     changing = [f"{PUSH}, {rate}" for rate in ("0.00 to 1.00", "0.05", "1.00 to 0.00", "1.00")]
-    assert lines[:4] == changing and f"{SCALE} +\n{PUSH}, 1.00 to 0.00 +\n0.50" in lines
+    assert lines[:4] == changing and f"{PUSH} +\n{SCALE}, 0.50 +\n1.00 to 0.00" in lines
     legend = drawn[f"curves_SAC_{analysis.formatting.slug(PUSH)}"].legends[0].get_texts()
     named = [text.get_text().partition(" (")[0] for text in legend]
     assert named == ["no noise", *(f"rate {rate}" for rate in rates)]
@@ -151,16 +180,16 @@ def test_interactions_by_hand(tmp_path):
         ((), ()): [100, 104, 108],  # mean 104, variance 16
         ((SCALE,), (0.5,)): [110, 120, 130],  # mean 120, variance 100
         ((PUSH,), (1.0,)): [90, 92, 94, 96],  # mean 93, variance 20 / 3
-        ((SCALE, PUSH), (0.5, 1.0)): [140, 150, 160],  # mean 150, variance 100
-        ((SCALE, PUSH), (0.2, 1.0)): [1, 2, 3],  # there is no 0.2 alone
-        ((SCALE, ENDING), (0.5, 1.0)): [1, 2, 3],
+        ((PUSH, SCALE), (1.0, 0.5)): [140, 150, 160],  # mean 150, variance 100
+        ((PUSH, SCALE), (1.0, 0.2)): [1, 2, 3],  # there is no 0.2 alone
+        ((ENDING, SCALE), (1.0, 0.5)): [1, 2, 3],
         ((ENDING,), (1.0,)): [1, 2],  # too few seeds
     }
     for (noise, rate), finals in cells.items():
         for seed, final in enumerate(finals):
             write_run(tmp_path / "runs", [final], noise=noise, rate=rate, seed=seed)
     [found] = run(tmp_path)["interactions"].to_dict("records")
-    assert found["noise"] == f"{SCALE} + {PUSH}" and found["noise_rate"] == "0.50 + 1.00"
+    assert found["noise"] == f"{PUSH} + {SCALE}" and found["noise_rate"] == "1.00 + 0.50"
     assert found["n"] == 3 and found["environment"] == "Hopper-v5"
     assert found["interaction"] == 150 - 120 - 93 + 104  # 41
     parts = np.array([16 / 3, 100 / 3, 20 / 3 / 4, 100 / 3])

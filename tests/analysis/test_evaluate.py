@@ -1,6 +1,7 @@
 """evaluate.py as a user meets it: stored returns, the table, videos, bad input."""
 
 import csv
+import importlib
 import json
 import os
 import re
@@ -22,6 +23,7 @@ import ppo_continuous_noisy as ppo
 import sac_continuous_noisy as sac
 import td3_continuous_noisy as td3
 from evaluate import Args, main
+from noisy_wrappers import Configuration, rounded
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = {"SAC": sac, "TD3": td3, "PPO": ppo}
@@ -89,7 +91,7 @@ def run(*options, cwd=None, **environment):
 @pytest.mark.parametrize("algorithm", SCRIPTS)
 def test_clean_returns_are_those_of_the_last_evaluation(runs, algorithm):
     run_dir = one(runs, algorithm)
-    [finished] = evaluate.find_runs([run_dir])
+    [finished], _ = evaluate.find_runs([run_dir])
     played = evaluate.play(finished, [], [], Args((run_dir,), episodes=10, seed=1_000_000))
     with open(run_dir / "eval.csv", newline="") as file:
         last = list(csv.DictReader(file))[-10:]
@@ -107,7 +109,7 @@ def streams(name, seed, position):
 @pytest.mark.parametrize("algorithm", SCRIPTS)
 def test_noisy_returns_are_those_of_a_loop_with_the_documented_seeds(runs, algorithm):
     run_dir = one(runs, algorithm)
-    main(Args((run_dir,), noise=(OBSERVATION, COMBINED), noise_rate=(0.5,), episodes=6))
+    main(Args((run_dir,), noises=(OBSERVATION, COMBINED), noise_rates=(0.5,), episodes=6))
     env = gym.make("InvertedPendulum-v5")
     policy = SCRIPTS[algorithm].load_policy(run_dir, env)
 
@@ -155,7 +157,7 @@ def test_the_time_limit_of_training_holds(runs):
 
 
 def test_what_is_stored_is_not_played_again(runs, monkeypatch, capsys):
-    args = Args((runs,), noise=(OBSERVATION,), noise_rate=(0.5, 1.0), episodes=4)
+    args = Args((runs,), noises=(OBSERVATION,), noise_rates=(0.5, 1.0), episodes=4)
     main(args)
     table, before = capsys.readouterr().out, files(runs)
     monkeypatch.setattr(evaluate, "play", None)
@@ -168,14 +170,14 @@ def test_what_is_stored_is_not_played_again(runs, monkeypatch, capsys):
     for run_dir in runs.iterdir():
         first = [row for row in stored(run_dir) if int(row["episode"]) < 2 and not row["noise"]]
         means[run_dir] = np.mean([float(row["episodic_return"]) for row in first])
-    assert f" {means[one(runs, 'TD3')]:.1f} " in capsys.readouterr().out  # of the first two
+    assert f" {rounded(means[one(runs, 'TD3')])} " in capsys.readouterr().out  # of the first two
 
 
 def test_more_episodes_replay_only_the_conditions_that_have_fewer(runs, monkeypatch):
     run_dir = one(runs, "PPO")
-    main(Args((run_dir,), noise=(OBSERVATION,), noise_rate=(0.5, 1.0), episodes=2))
+    main(Args((run_dir,), noises=(OBSERVATION,), noise_rates=(0.5, 1.0), episodes=2))
     first = stored(run_dir)
-    main(Args((run_dir,), noise=(OBSERVATION, ACTION), noise_rate=(0.5,), episodes=3))
+    main(Args((run_dir,), noises=(OBSERVATION, ACTION), noise_rates=(0.5,), episodes=3))
     again = stored(run_dir)
     counts = {}
     for row in again:
@@ -200,11 +202,11 @@ def test_another_seed_plays_everything_and_stores_nothing(runs, capsys):
     said, *table = capsys.readouterr().out.splitlines()
     assert said == "--seed 7 is not the default: everything is played, nothing is stored"
     assert files(runs) == before
-    [finished] = evaluate.find_runs([run_dir])
+    [finished], _ = evaluate.find_runs([run_dir])
     means = []
     for rate in (0, 0.5, 1.0):
         played = evaluate.play(finished, [OBSERVATION], [rate], args)
-        means.append(f"{np.mean(played, axis=0)[0]:.1f}")
+        means.append(rounded(np.mean(played, axis=0)[0]))
     assert table[-1].split()[-3:] == means
     assert means[0] != default.split()[-2]
 
@@ -212,7 +214,7 @@ def test_another_seed_plays_everything_and_stores_nothing(runs, capsys):
 @pytest.mark.slow
 def test_a_kill_leaves_whole_conditions_and_the_same_command_goes_on(runs):
     run_dir = one(runs, "PPO")
-    options = ["--noise", OBSERVATION, ACTION, "--noise-rate", "0.3", "0.6", "--episodes", "30"]
+    options = ["--noises", OBSERVATION, ACTION, "--noise-rates", "0.3", "0.6", "--episodes", "30"]
     process = commands.start(evaluate.__file__, [run_dir, *options])
     while not (run_dir / "robustness.csv").exists():
         assert process.is_alive()
@@ -244,7 +246,7 @@ def test_two_processes_on_one_run_lose_nothing(runs):
     noises = ("RandomNormalNoisyReward(1.0)", "RandomUniformNoisyReward(0.0, 1.0)")
     slow, processes = ("os.fsync", None, wait), []
     for noise, episodes in zip(noises, ("1", "2"), strict=True):
-        options = ["--noise", noise, "--noise-rate", *rates, "--episodes", episodes]
+        options = ["--noises", noise, "--noise-rates", *rates, "--episodes", episodes]
         processes.append(commands.start(evaluate.__file__, [run_dir, *options], slow))
     for process in processes:
         result = commands.ended(process)
@@ -258,11 +260,11 @@ def test_two_processes_on_one_run_lose_nothing(runs):
 
 
 def test_the_longer_of_two_results_is_kept(runs):
-    [finished] = evaluate.find_runs([one(runs, "PPO")])
+    [finished], _ = evaluate.find_runs([one(runs, "PPO")])
     short, long = [(1.0, 1)], [(1.0, 1), (2.0, 2)]
     for results in (short, long, short):
-        evaluate.store(finished, ("", "0.0"), results)
-    assert evaluate.read_stored(finished) == {("", "0.0"): long}
+        evaluate.store(finished, ("", "0.0", ""), results)
+    assert evaluate.read_stored(finished) == {("", "0.0", ""): long}
 
 
 def test_training_again_deletes_nothing_of_a_write(runs, monkeypatch):
@@ -302,7 +304,8 @@ def test_a_full_disk_leaves_the_previous_file(runs, monkeypatch, capsys):
 
 def test_the_table_of_known_returns(capsys):
     def a_run(noise, rate):
-        return evaluate.FinishedRun(Path(str(len(cells))), "PPO", "E", noise, rate, "{}")
+        config = Configuration.parse(noise, rate)
+        return evaluate.FinishedRun(Path(str(len(cells))), "PPO", "", "E", config, {})
 
     cells = {}
     for noise, rate, clean, noisy in [
@@ -313,9 +316,9 @@ def test_the_table_of_known_returns(capsys):
     ]:
         # A third episode is stored and not asked for; the second number is the length.
         cells[a_run(noise, rate)] = {
-            ("", "0.0"): [(value, 1) for value in (*clean, 1000)],
-            ("A(1) + B(2)", "0.1 + 0.1"): [(value, 1) for value in (*noisy, 1000)],
-            ("C(3)", "0.5"): [(-value, 1) for value in (*noisy, 1000)],
+            ("", "0.0", ""): [(value, 1) for value in (*clean, 1000)],
+            ("A(1) + B(2)", "0.1 + 0.1", ""): [(value, 1) for value in (*noisy, 1000)],
+            ("C(3)", "0.5", ""): [(-value, 1) for value in (*noisy, 1000)],
         }
     conditions = [("", "0.0"), ("A(1) + B(2)", "0.1 + 0.1"), ("C(3)", "0.5")]
     evaluate.print_table(list(cells), conditions, cells, episodes=2)
@@ -324,12 +327,12 @@ def test_the_table_of_known_returns(capsys):
     assert lines[1] == ["Mean return, tested with A(1) + B(2)"]
     assert lines[2][-2:] == ["clean", "at 0.1 + 0.1"]
     assert lines[4:6] == [
-        ["E", "PPO", "no noise", "0.00", "3", "33.3 ± 15.3", "0.8 ± 3.1"],
-        ["E", "PPO", "A(1)", "0.50", "1", "5.0", "7.5"],
+        ["E", "PPO", "no noise", "0.00", "3", "33 ± 15", "0.8 ± 3.1"],
+        ["E", "PPO", "A(1)", "0.50", "1", "5.000", "7.500"],
     ]
     assert lines[7] == ["Mean return, tested with C(3)"]
     assert lines[8][-2:] == ["clean", "at 0.5"]
-    assert lines[10][-2:] == ["33.3 ± 15.3", "-0.8 ± 3.1"]
+    assert lines[10][-2:] == ["33 ± 15", "-0.8 ± 3.1"]
     evaluate.print_table(list(cells), conditions[:1], cells, episodes=2)
     alone = capsys.readouterr().out
     assert "tested with" not in alone and alone.splitlines()[0].endswith("clean")
@@ -339,11 +342,13 @@ def test_trainings_with_other_settings_are_other_rows_of_the_table(runs, capsys)
     first, second = sorted(runs.glob("*ppo_continuous_noisy*"))
     args = json.loads((second / "config.json").read_text())["args"]
     edit_config(second, args=args | {"total_timesteps": 2560, "gamma": 0.9})
+    result = (second / "result.json").read_text()
+    (second / "result.json").write_text(result.replace('_timesteps": 256,', '_timesteps": 2560,'))
     main(Args((first, second, one(runs, "TD3")), episodes=1))
     table = [re.split(r" {2,}", line) for line in capsys.readouterr().out.splitlines()]
     assert [(row[1], row[4]) for row in table[2:]] == [
-        ("PPO [gamma=0.99, total_timesteps=256]", "1"),
-        ("PPO [gamma=0.9, total_timesteps=2560]", "1"),
+        ("PPO, gamma=0.99, total_timesteps=256", "1"),
+        ("PPO", "1"),
         ("TD3", "1"),
     ]
 
@@ -354,7 +359,7 @@ def test_all_of_a_folder_with_logs_and_an_analysis(runs, capsys):
     (runs / "results").mkdir()
     (runs / "results" / "report.html").touch()
     (runs / "choice.csv").touch()
-    options = ["--noise", OBSERVATION, "--noise-rate", "0.5", "1.0", "--episodes", "3"]
+    options = ["--noises", OBSERVATION, "--noise-rates", "0.5", "1.0", "--episodes", "3"]
     result = commands.run(evaluate.__file__, [*sorted(runs.iterdir()), *options])
     assert (result.code, result.err) == (0, "")
     table = [re.split(r" {2,}", line) for line in result.out.splitlines()]
@@ -370,17 +375,12 @@ def test_all_of_a_folder_with_logs_and_an_analysis(runs, capsys):
         means.append(
             np.mean([float(r["episodic_return"]) for r in rows if r["noise_rate"] == "0.5"])
         )
-    assert table[4][6] == f"{np.mean(means):.1f} ± {np.std(means, ddof=1):.1f}"
+    spread = np.std(means, ddof=1)
+    assert table[4][6] == f"{rounded(np.mean(means), spread)} ± {rounded(spread, spread)}"
     before = files(runs)
     main(Args((runs,), (OBSERVATION,), (0.5, 1.0), episodes=3))  # the folder stands for its runs
     assert capsys.readouterr().out == result.out
     assert files(runs) == before
-
-
-def test_the_demo_keeps_its_text_where_all_of_its_folder_can_be_tested():
-    """evaluate.py runs/demo/* refuses a file, but skips logs."""
-    written = re.findall(r"> ?(runs/demo/\S+)", (ROOT / "Makefile").read_text())
-    assert written and all(path.startswith("runs/demo/logs/") for path in written)
 
 
 def test_a_folder_stands_for_its_finished_runs(runs, capsys):
@@ -388,7 +388,7 @@ def test_a_folder_stands_for_its_finished_runs(runs, capsys):
     runs = runs.rename(runs.parent / "two__words")  # which is no run's name here
     (runs / "report.html").touch()  # analyze.py --out may be the same folder
     main(Args((runs, one(runs, "TD3")), episodes=1))
-    assert f"{runs}: unfinished runs are left out (1)" in capsys.readouterr().out
+    assert "unfinished runs are left out: 1\n" in capsys.readouterr().out
     assert sum((run_dir / "robustness.csv").exists() for run_dir in runs.glob("*Inv*")) == 3
 
 
@@ -407,7 +407,7 @@ def test_an_environment_that_takes_no_arguments(tmp_path):
 def test_videos(runs, tmp_path):
     run_dir = one(runs, "PPO")
     before = files(runs)
-    options = ["--noise", ACTION, "--noise-rate", "1.0", "--video", tmp_path / "a" / "b"]
+    options = ["--noises", ACTION, "--noise-rates", "1.0", "--video", tmp_path / "a" / "b"]
     result = run(run_dir, *options, "--episodes", "9")
     assert (result.returncode, result.stderr) == (0, "")
     assert files(runs) == before
@@ -420,7 +420,7 @@ def test_videos(runs, tmp_path):
         assert len(video) == int(row["episodic_length"]) + 1  # the reset's, and one per step
         assert video.shape[1:] == (480, 480, 3)
         assert video[0].std() > 10 and np.abs(video[0].astype(int) - video[-1]).max() > 50
-    assert f"return {float(row['episodic_return']):.1f}, " in result.stdout
+    assert f"return {rounded(float(row['episodic_return']))}, " in result.stdout
 
 
 def test_videos_of_runs_of_one_name(runs, tmp_path, capsys):
@@ -527,36 +527,95 @@ def other_environment(run_dir, env_id="Reacher-v5"):
 
 
 BAD_RUNS = {
-    "is not finished": lambda run_dir: (run_dir / "result.json").unlink(),
-    "is not a policy for Reacher-v5": other_environment,
-    "is not a policy for InvertedPendulum-v5": lambda run_dir: (run_dir / "policy.pt").write_bytes(
-        b"x"
+    "policy.pt is not a policy for Reacher-v5": other_environment,
+    "policy.pt is not a policy for InvertedPendulum-v5": lambda run_dir: (
+        run_dir / "policy.pt"
+    ).write_bytes(b"x"),
+    "config.json: args is None": lambda run_dir: (run_dir / "config.json").write_text("{}"),
+    "config.json: algorithm is 'DQN'": lambda run_dir: edit_config(run_dir, algorithm="DQN"),
+    "delete that file": lambda run_dir: (run_dir / "robustness.csv").write_text("a,b\n1,2\n"),
+    "there is no environment 'Nothing-v0'": lambda run_dir: other_environment(
+        run_dir, "Nothing-v0"
     ),
-    "cannot read": lambda run_dir: (run_dir / "config.json").write_text("{"),
-    "KeyError: 'args'": lambda run_dir: (run_dir / "config.json").write_text("{}"),
-    "cannot import": lambda run_dir: edit_config(run_dir, algorithm="DQN"),
-    "delete it": lambda run_dir: (run_dir / "robustness.csv").write_text("a,b\n1,2\n"),
-    "no environment|exist": lambda run_dir: other_environment(run_dir, "Nothing-v0"),
+    "RuntimeError: not today .*broken.py, line 2": lambda run_dir: other_environment(
+        run_dir, "broken:Mine-v0"
+    ),
 }
 
 
 @pytest.mark.parametrize("message", BAD_RUNS)
-def test_bad_runs(runs, capsys, message):
+def test_a_bad_run_is_named_and_the_others_are_tested(runs, capsys, message, monkeypatch, tmp_path):
+    (tmp_path / "broken.py").write_text("def f():\n    raise RuntimeError('not today')\nf()\n")
+    monkeypatch.chdir(tmp_path)
     run_dir = one(runs, "PPO")
     BAD_RUNS[message](run_dir)
-    refused(Args((one(runs, "TD3"), run_dir)), message, runs, capsys)
+    assert main(Args((one(runs, "TD3"), run_dir), episodes=1)) == 1
+    out, err = capsys.readouterr()
+    assert err.count("\n") == 1 and re.match(f"error: {run_dir}: .*{message}", err), err
+    assert len(stored(one(runs, "TD3"))) == 1 and "TD3" in out and "PPO" not in out
+
+
+def test_one_reason_of_many_runs_is_one_line(runs, capsys):
+    for run_dir in runs.iterdir():
+        other_environment(run_dir, "Nothing-v0")
+    refused(Args((runs,)), "/[^/]* and 3 more: there is no environment", runs, capsys)
+
+
+# A downloaded folder of runs, with its own modules: where they lie in it, and the id in config.json
+FOREIGN = {
+    "beside the runs": ("runs/dl/evil.py", "runs.dl.evil:Mine-v0", "."),
+    "in the run": ("runs/dl/{run}/evil.py", "runs.dl.{run}.evil:Mine-v0", "."),
+    "above the runs": ("runs/evil.py", "runs.evil:Mine-v0", "."),
+    "a package": ("runs/dl/__init__.py", "runs.dl:Mine-v0", "."),
+    "called from there": ("runs/dl/evil.py", "evil:Mine-v0", "runs/dl"),
+    "called from the run": ("runs/dl/{run}/evil.py", "evil:Mine-v0", "runs/dl/{run}"),
+    "through a link": ("runs/dl/evil.py", "link.evil:Mine-v0", "."),
+    "not even a late import": ("runs/dl/my_physics.py", "InvertedPendulum-v5", "runs/dl"),
+}
+
+
+@pytest.mark.parametrize("place", FOREIGN)
+def test_no_module_is_imported_from_a_folder_of_runs(place, trained, tmp_path, monkeypatch, capsys):
+    """As `python evaluate.py runs/dl` would, were it in this process's module path."""
+    file, env_id, cwd = (text.replace("{run}", "run") for text in FOREIGN[place])
+    shutil.copytree(one(trained, "PPO"), tmp_path / "runs/dl/run")
+    (tmp_path / file).write_text("raise SystemExit('imported')")
+    (tmp_path / "link").symlink_to("runs/dl")
+    other_environment(tmp_path / "runs/dl/run", env_id)
+    monkeypatch.chdir(tmp_path / cwd)
+    monkeypatch.setattr(sys, "path", sys.path[:])
+    if place == "not even a late import":
+        main(Args((tmp_path / "runs/dl",), episodes=1))
+        with pytest.raises(ImportError):
+            importlib.import_module("my_physics")
+        return
+    assert main(Args((tmp_path / "runs/dl",), episodes=1)) == 2
+    assert "in a folder of runs; if you trust that module, move it" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("runs_dir", [".", "runs"])
+def test_a_module_of_ones_own_is_imported(runs_dir, trained, tmp_path, monkeypatch):
+    """Also where the runs lie in the folder of the project, which is on the module path."""
+    run_dir = tmp_path / runs_dir / "run"
+    shutil.copytree(one(trained, "PPO"), run_dir)
+    register(tmp_path, f"own_{len(runs_dir)}", "")
+    other_environment(run_dir, f"own_{len(runs_dir)}:Mine-v0")
+    monkeypatch.setattr(evaluate, "__file__", str(tmp_path / "evaluate.py"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", sys.path[:])
+    assert main(Args((run_dir,), episodes=1)) == 0
+    assert len(stored(run_dir)) == 1
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"noise": ("Nothing(1)",), "noise_rate": (1.0,)}, "unknown name"),
-        ({"noise": (ACTION,), "noise_rate": (1.5,)}, "1.5"),
-        ({"noise": (ACTION,), "noise_rate": ("x",)}, "'x'"),
-        ({"noise": (ACTION,), "noise_rate": ("1:0",)}, "constant rates"),
-        ({"noise": (ACTION,)}, "--noise-rate"),
-        ({"noise_rate": (1.0,)}, "--noise"),
-        ({"noise": (f"{OBSERVATION[:-4]}(1, 2))",), "noise_rate": (1.0,)}, "has 2 numbers"),
+        ({"noises": ("Nothing(1)",), "noise_rates": (1.0,)}, "unknown name"),
+        ({"noises": (ACTION,), "noise_rates": (1.5,)}, "1.5"),
+        ({"noises": (ACTION,), "noise_rates": ("x",)}, "'x'"),
+        ({"noises": (ACTION,), "noise_rates": ("1:0",)}, "constant rates"),
+        ({"env_id": "Nowhere-v0"}, "--env-id: there is no environment"),
+        ({"noises": (f"{OBSERVATION[:-4]}(1, 2))",), "noise_rates": (1.0,)}, "has 2 numbers"),
         ({"episodes": 0}, "--episodes must be at least 1, not 0"),
         ({"jobs": 0}, "--jobs"),
         ({"seed": -1}, "--seed"),
@@ -566,20 +625,49 @@ def test_bad_runs(runs, capsys, message):
         ({"runs": (Path("nowhere"),)}, "nowhere is neither a run nor a folder of runs"),
         ({"runs": (Path(__file__),)}, "is neither a run nor a folder of runs"),
         ({"runs": (ROOT / "docs",)}, "is neither a run nor a folder of runs"),
-        ({"runs": (Path("runs/logs"),)}, "no finished run"),
+        ({"runs": (ROOT / "docs", ROOT / "tests")}, "no finished run"),
     ],
 )
 def test_bad_arguments(runs, capsys, options, message):
     refused(Args(**({"runs": (runs,)} | options)), message, runs, capsys)
 
 
+@pytest.mark.parametrize("flag", ["--noise", "--noise-rate"])
+def test_the_flags_of_earlier_versions_name_the_new_ones(flag):
+    command = [sys.executable, str(ROOT / "evaluate.py"), "runs", f"{flag}=1"]
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr == f"error: {flag} is {flag}s here: every noise is tested at every rate\n"
+
+
+def test_another_environment(runs, capsys):
+    """Its tests stand beside those at home, are not played again, and never mix with them."""
+    run_dir = one(runs, "PPO")
+    home = json.loads((run_dir / "config.json").read_text())["args"]["env_id"]
+    main(Args((run_dir,), (OBSERVATION,), episodes=2))
+    before = (run_dir / "robustness.csv").read_text()
+    gym.register("Heavy-v0", gym.spec(home).entry_point, max_episode_steps=7)
+    for _ in range(2):
+        main(Args((run_dir,), (OBSERVATION,), env_id="Heavy-v0", episodes=2))
+    rows = stored(run_dir)
+    assert [row["environment"] for row in rows] == 4 * [""] + 4 * ["Heavy-v0"]
+    at_home = [",".join(list(row.values())[:-1]) for row in rows[:4]]
+    assert at_home == before.splitlines()[1:]
+    assert all(int(row["episodic_length"]) <= 7 for row in rows[4:])
+    table = capsys.readouterr().out.splitlines()[-1]
+    assert f"{home}, tested in Heavy-v0" in table
+    refused(Args((run_dir,), env_id="Pendulum-v1"), "a policy needs the same", runs, capsys)
+
+
 def refused(args, message, runs, capsys):
     """One line, exit status 2, nothing written."""
     before = files(runs)
-    with pytest.raises(SystemExit) as exit:
-        main(args)
+    try:
+        code = main(args)
+    except SystemExit as exit:
+        code = exit.code
     out, err = capsys.readouterr()
-    assert (exit.value.code, out) == (2, "")
+    assert (code, out) == (2, "")
     first, *others = err.splitlines()
     assert first.startswith("error: ") and re.search(message, first)
     assert all(line.startswith("  Random") for line in others)  # the list of the wrappers

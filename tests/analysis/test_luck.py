@@ -20,7 +20,7 @@ from noisy_wrappers import BASELINE, Configuration
 
 NAN = float("nan")
 PAPER = Path(analyze.__file__).parent / "results/paper"
-STUDY = {"algorithm": "PPO", "settings": "", "phase": ""}
+STUDY = {"algorithm": "PPO", "exp_name": "", "phase": ""}
 MANY = 10**9  # seeds or degrees of freedom: no uncertainty
 
 

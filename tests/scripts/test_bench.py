@@ -1,5 +1,6 @@
 """bench.py: what it counts, who runs when, what it prints. No timings."""
 
+import functools
 import io
 import itertools
 import json
@@ -9,6 +10,8 @@ from types import SimpleNamespace
 
 import bench
 import pytest
+
+from sweep import environment
 
 ROOT = Path(__file__).parents[2]
 
@@ -149,6 +152,31 @@ def test_a_checkpoint_is_measured(tmp_path, monkeypatch):
     options = bench.parse(["--checkpoint", "--stored", "3000"])
     [row] = bench.checkpoint("sac", "Any-v5", options)
     assert (row["step"], row["MB"]) == (4000, 1)
+
+
+@pytest.mark.parametrize(
+    ("learning", "ratio"), [(0.004, 0.5), (0.007, 0.8), (0.011, 1.2), (0.02, 2.1)]
+)
+def test_an_estimate_is_checked(learning, ratio, tmp_path, monkeypatch, capsys):
+    def measure(options, program):
+        program.speeds.append(100)
+
+    known = environment.Environment(0.001, 200, 1000, 17, True, {})
+    monkeypatch.setattr(environment, "ask", lambda env_id, clock: known)
+    monkeypatch.setitem(environment.LEARNING, "sac", (learning, 0.0))
+    monkeypatch.setattr(bench, "measure", measure)
+    folder = checkout(tmp_path / "a", SCRIPT.format(log=tmp_path / "log", name="a"))
+    monkeypatch.setattr(bench, "ours", functools.partial(bench.ours, folder=folder))
+    figures = tmp_path / "figures.json"
+    words = ["--estimate", "--algos", "sac", "--envs", "Any-v5", "--json", str(figures)]
+    if ratio in (0.5, 2.1):
+        with pytest.raises(SystemExit) as exit_:
+            bench.main(words)
+        assert exit_.value.code == 1 and "wrong by more than 1.5 times" in capsys.readouterr().err
+    else:
+        bench.main(words)
+    [row] = json.loads(figures.read_text())["estimate"]
+    assert row["real / estimated"] == pytest.approx(ratio) and row["steps/s"] == 100
 
 
 @pytest.mark.parametrize(

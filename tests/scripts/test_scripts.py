@@ -179,12 +179,49 @@ def test_evaluate(algorithm):
     script, seen = SCRIPTS[algorithm], []
     env = script.make_env("toy_envs:Tiny-v0")
     results = script.evaluate(policy, env, 4)
-    assert results.shape == (4, 2)
+    assert results.shape == (4, 3) and np.isnan(results[:, 2]).all()
     assert results[:, 1].sum() == len(seen)
     starts = [seen[int(i)] for i in (0, *results[:-1, 1].cumsum())]
     expected = [env.reset(seed=1_000_000 + episode)[0] for episode in range(4)]
     np.testing.assert_array_equal(starts, expected)
     np.testing.assert_array_equal(script.evaluate(policy, env, 4), results)
+
+
+@pytest.mark.parametrize("env_id", ["toy_envs:IsSuccess-v0", "toy_envs:Success-v0"])
+@one_script
+def test_success_is_an_outcome(algorithm, env_id, tmp_path, capsys):
+    run_dir = run(algorithm, tmp_path, env_id=env_id)
+    env, solved = SCRIPTS[algorithm].make_env(env_id), []
+    for episode in range(3):
+        env.reset(seed=1_000_000 + episode)
+        solved.append(env.unwrapped.solved)
+    assert 0 < sum(solved) < 3
+    header, *lines = (run_dir / "eval.csv").read_text().splitlines()
+    assert header == "step,episode,episodic_return,episodic_length,success"
+    assert lines == [f"{s},{i},8.0,8,{solved[i]:d}" for s in (20, 40, 60) for i in range(3)]
+    rate = sum(solved) / 3
+    assert json.loads((run_dir / "result.json").read_text())["final_success_rate"] == rate
+    out = capsys.readouterr().out
+    assert f" eval_return=8.000 success_rate={rate:.2f} eta=" in out
+    assert f"is finished: mean test return 8.000, success rate {rate:.2f}\n" in out
+    events = EventAccumulator(str(run_dir)).Reload()
+    curve = [event.value for event in events.Scalars("eval/success_rate")]
+    assert curve == pytest.approx([rate] * 3)
+    training = [event.value for event in events.Scalars("charts/success_rate")]
+    totals = [value * n for n, value in enumerate(training, start=1)]  # solved until then
+    assert set(np.diff([0, *totals]).round(6)) == {0, 1}
+    assert SCRIPTS[algorithm].train(arguments(algorithm, tmp_path, env_id=env_id))
+    assert f", success rate {rate:.2f}\n" in capsys.readouterr().out
+
+
+@one_script
+def test_an_environment_may_tell_success_alone(algorithm, tmp_path):
+    run_dir = run(algorithm, tmp_path, env_id="toy_envs:SuccessOnly-v0")
+    table = [line.split(",") for line in (run_dir / "eval.csv").read_text().splitlines()]
+    assert [row[4] for row in table] == ["success", *"000", *"011", *"000"]
+    events = EventAccumulator(str(run_dir)).Reload()
+    curve = [event.value for event in events.Scalars("eval/success_rate")]
+    assert curve == pytest.approx([2 / 3, 0])
 
 
 @one_script
@@ -212,7 +249,7 @@ def test_run_folder(algorithm, tmp_path, capsys):
     args.noise_rate = [0.25, 0.5]
     assert config["args"] == asdict(args)
     assert config["algorithm"] == algorithm
-    assert config["matmul_precision"] in ("highest", "high", "medium")
+    assert config["matmul_precision"] in ("highest", "medium")
     assert config["versions"] == {
         "python": ".".join(map(str, sys.version_info[:3])),
         "torch": torch.__version__,
@@ -433,10 +470,10 @@ def run_block(script):
 
 
 def test_repeated_helpers_are_word_for_word_identical():
-    everywhere = "make_env fail fail_on say read_args check_numbers make_envs evaluate can_compile "
-    everywhere += "use_matmul_precision Run"
+    everywhere = "make_env fail fail_on say read_args check_numbers make_envs train evaluate "
+    everywhere += "use_matmul_precision prepare_compiler start_again Run"
     off_policy = "mlp in_numpy TwinLinear Critic ReplayBuffer updater"
-    by_design = {"Args", "Actor", "load_policy", "critic_loss", "actor_loss", "train"}
+    by_design = {"Args", "Actor", "load_policy", "critic_loss", "actor_loss", "learn"}
     found = [definitions(script) for script in (sac, td3, ppo)]
     for name in everywhere.split():
         assert len({source[name] for source in found}) == 1, name
@@ -524,14 +561,12 @@ def test_compiled_and_plain_updates_agree(algorithm, tmp_path, capsys, monkeypat
     compiled = run(
         algorithm, tmp_path / "compiled", matmul_precision="highest", compile=True, **short
     )
-    if "not compiled" in (output := capsys.readouterr().out):
-        pytest.skip(re.search(r"not compiled: .*", output)[0])
     losses = {
         "SAC": {"critic_loss", "actor_loss", "temperature_loss"},
         "TD3": {"critic_loss", "actor_loss"},
         "PPO": {"clipped_gradient"},
     }
-    assert set(graphs) == losses[algorithm] | {"neg"}
+    assert set(graphs) == losses[algorithm]
     torch.testing.assert_close(policy(compiled), policy(plain), rtol=1e-4, atol=1e-5)
 
     if algorithm == "PPO":
@@ -541,19 +576,6 @@ def test_compiled_and_plain_updates_agree(algorithm, tmp_path, capsys, monkeypat
     assert json.loads((rough / "config.json").read_text())["matmul_precision"] == "bf16"
     exact, rough = (torch.cat([x.flatten() for x in policy(r).values()]) for r in (plain, rough))
     assert 1e-5 < (rough - exact).abs().max() < 0.05
-
-
-@pytest.mark.parametrize("algorithm", ["TD3", "PPO"])  # SAC has TD3's updater
-def test_no_compiler_means_plain_updates(algorithm, tmp_path, capsys, monkeypatch):
-    def no_compiler(*_, **__):
-        raise RuntimeError("no compiler\nand more")
-
-    plain = run(algorithm, tmp_path / "plain")
-    monkeypatch.setattr(torch, "compile", no_compiler)
-    fallback = run(algorithm, tmp_path / "fallback", compile=True)
-    output = capsys.readouterr().out
-    assert "not compiled: no compiler\n" in output and output.count("not compiled") == 1
-    torch.testing.assert_close(policy(fallback), policy(plain), rtol=0, atol=0)
 
 
 # ENVIRONMENTS THAT ARE UNUSUAL
@@ -571,9 +593,11 @@ def test_dict_observations_are_flattened(algorithm, tmp_path, capsys):
 
 
 @one_script
-def test_reward_noise_works_beside_a_one_hot_observation(algorithm, tmp_path):
-    noise = {"noise": ("RandomNormalNoisyReward(0.5)",), "noise_rate": (0.5,)}
-    run(algorithm, tmp_path, env_id="toy_envs:OneHotObservation-v0", **noise)
+def test_noise_on_the_numbers_beside_a_category(algorithm, tmp_path):
+    noise = {"noise": ("RandomNormalNoisyObservation(0.5)",), "noise_rate": (0.5,)}
+    run_dir = run(algorithm, tmp_path, env_id="toy_envs:OneHotObservation-v0", **noise)
+    result = json.loads((run_dir / "result.json").read_text())
+    assert 0.3 < result["noise_applied_fraction"]["RandomNormalNoisyObservation"] < 0.7
 
 
 @pytest.mark.parametrize("algorithm", ["TD3", "PPO"])  # SAC has TD3's buffer
@@ -609,7 +633,8 @@ def test_a_test_without_a_time_limit_can_be_stopped(algorithm):
     assert script.evaluate(act, script.make_env("toy_envs:Endless-v0"), 2, stop) is None
     assert len(asked) == 30
     assert (
-        script.evaluate(act, script.make_env("toy_envs:Count-v0"), 2, stop).tolist() == [[8, 8]] * 2
+        script.evaluate(act, script.make_env("toy_envs:Count-v0"), 2, stop)[:, :2].tolist()
+        == [[8, 8]] * 2
     )
     assert len(asked) == 30  # it has a time limit: it was not asked again
 
@@ -674,7 +699,7 @@ BAD = [  # arguments, what the message names, of which scripts
     (
         {
             "env_id": "toy_envs:OneHotObservation-v0",
-            "noise": ("RandomDropoutObservation(0.5)",),
+            "noise": ("RandomDropoutObservation(0.5, keys='phase')",),
             "noise_rate": (0.1,),
         },
         "RandomDropoutObservation cannot perturb categories",
@@ -701,10 +726,10 @@ BAD = [  # arguments, what the message names, of which scripts
     ({"target_kl": math.nan}, "--target-kl", ("PPO",)),
     ({"env_id": "toy_envs:MatrixAction-v0"}, "in one dimension", SCRIPTS),
     ({"seed": -1}, "--seed must be at least 0, not -1\n", SCRIPTS),
-    ({"seed": 2**64}, "--seed must be a smaller number", SCRIPTS),
-    ({"gamma": 1.1}, "--gamma must be from 0 to 1, not 1.1\n", SCRIPTS),
+    ({"seed": 2**64}, "--seed must be at most 9223372036854775807", SCRIPTS),
+    ({"gamma": 1.1}, "--gamma must be at most 1, not 1.1\n", SCRIPTS),
     ({"gamma": -0.1}, "--gamma", SCRIPTS),
-    ({"gamma": math.nan}, "--gamma must be a finite number, not nan\n", SCRIPTS),
+    ({"gamma": math.nan}, "--gamma must be at least 0, not nan\n", SCRIPTS),
     ({"total_timesteps": 0}, "--total-timesteps must be at least 1, not 0\n", SCRIPTS),
     ({"total_timesteps": -5}, "--total-timesteps", SCRIPTS),
     ({"eval_episodes": 0}, "--eval-episodes", SCRIPTS),
@@ -877,6 +902,8 @@ def test_help_has_examples_and_noises(algorithm):
     assert "module:Name-v0" in text
     for signature in signatures():
         assert f"  {signature}\n" in text
+    groups = ["RUN", "NOISE", "TESTS", "SPEED", "ALGORITHM"]  # each begins with its name
+    assert re.findall(r"\b([A-Z]+): ", text.partition(" options ")[2]) == groups
 
 
 @pytest.mark.slow
@@ -1125,14 +1152,13 @@ def test_tensorboard_knows_the_hyperparameters(tensorboard, three_runs):
     assert {group["name"] for group in groups} == names  # readable, and one for each run
     experiment = tensorboard("/data/plugin/hparams/experiment", {"experimentName": ""})
     columns = [info["name"] for info in experiment["hparamInfos"]]
-    names = {"env_id", "exp_name", "noise", "noise_rate", "seed"}
-    assert names < set(columns)
-    assert not {"runs_dir", "compile", "eval_frequency", "gamma"} & set(columns)
+    assert set(columns) == {"env_id", "exp_name", "noise", "noise_rate", "seed"}
+    metrics = [info["name"]["tag"] for info in experiment["metricInfos"]]
+    assert metrics == ["eval/episodic_return_mean", "eval/success_rate", "charts/episodic_return"]
     for group in groups:
         noise = "RandomEarlyTermination(2, 4) + RandomNormalNoisyReward(0.5)"
         assert group["hparams"]["noise"] == noise
         assert group["hparams"]["noise_rate"] == "0.25 + 0.5"
-        assert group["hparams"]["total_timesteps"] == 240  # not the default
         [session] = group["sessions"]
         assert session["status"] == "STATUS_SUCCESS"
         assert group["hparams"]["env_id"] == "toy_envs:Tiny-v0"

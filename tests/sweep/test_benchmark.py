@@ -25,7 +25,7 @@ from types import SimpleNamespace
 
 import pytest
 import stub_run
-from views import ROOT, attempts, folders, log_of, view
+from views import ROOT, attempts, finish, folders, locked, log_of, view
 
 from sweep import choose
 from sweep.options import check_arguments, parse_args
@@ -255,7 +255,7 @@ def test_a_failing_and_a_killed_run(engine, tmp_path):
 
     sweep = start(*grid, *executor, env=env)
     wait_for((killed / "checkpoint.pt").exists, what="the first checkpoint")
-    os.kill(*processes("--noise", SCALE, tmp_path), signal.SIGKILL)
+    os.kill(*processes("--env-id", SCALE, tmp_path), signal.SIGKILL)
     out, err = sweep.communicate(timeout=PATIENCE)
     assert sweep.returncode == 1, err
     assert "3 runs: 1 done, 0 running, 2 failed, 0 to do" in out
@@ -423,7 +423,7 @@ CHOOSE += ["RandomDropoutObservation(0.9)", "RandomMixupObservation(0.5)"]
 
 def chosen(folder):
     """Return what a choice leaves behind: its lines, and the names of its runs."""
-    names = {path.parent.name for path in folder.glob("*/config.json")}
+    names = {path.parent.relative_to(folder) for path in folder.glob("*/*/config.json")}
     return (folder / "choice.csv").read_bytes(), names
 
 
@@ -466,7 +466,7 @@ def test_choose_survives_being_killed(stub, tmp_path):
     dice = random.Random(1)
 
     def begun():
-        return len(list(runs.glob("*/config.json")))
+        return len(list(runs.glob("*/*/config.json")))
 
     for number in (signal.SIGINT, signal.SIGKILL):
         wanted = begun() + dice.randint(1, 4)
@@ -478,10 +478,10 @@ def test_choose_survives_being_killed(stub, tmp_path):
     last = run(*command, env=stub)
     assert last.code == 0, last.out + last.err
     assert (*chosen(runs), verdicts(last.out)) == undisturbed(tmp_path / "expected", *CHOOSE)
-    logs = {path.name: path.read_text() for path in runs.glob("logs/*__*.log")}
+    logs = {path.name: path.read_text() for path in runs.glob("*/logs/*__*.log")}
     again = run(*command, env=stub)
     assert again.code == 0 and again.out == last.out and not again.err
-    assert logs == {path.name: path.read_text() for path in runs.glob("logs/*__*.log")}
+    assert logs == {path.name: path.read_text() for path in runs.glob("*/logs/*__*.log")}
 
 
 @pytest.mark.slow
@@ -512,8 +512,11 @@ def test_a_dry_run_of_choose_prints_the_batch_that_is_due(tmp_path, stub):
     assert (
         first.out.count("\n") == 3 and "13 runs in all, 5 to search and 8 to confirm" in first.err
     )
-    # 13 runs of 4000 steps at 5,700 steps per second, and 10 seconds to start: 139 s
-    assert "0 are done, about 0.039 core-hours are left" in first.err
+    # 13 runs with 10 seconds to start and 4000 steps; here one takes 0.1 to 5 ms
+    hours = re.search(r"0 are done, about ([\d.]+) core-hours are left", first.err)
+    assert 0.036 <= float(hours[1]) <= 0.2
+    assert "Pendulum-v1: " in first.err and " ms a step" in first.err
+    assert not list(tmp_path.iterdir())
     for line in first.out.splitlines():
         subprocess.run(line, shell=True, check=True)
     second = run(*command, "--dry-run", env=stub)
@@ -522,6 +525,7 @@ def test_a_dry_run_of_choose_prints_the_batch_that_is_due(tmp_path, stub):
     assert "4 fresh seeds confirm" in first.err and "fresh seeds confirm" not in second.err
     # The three finished runs say that they have taken 36 seconds each; ten are left.
     assert "3 are done, about 0.1 core-hours are left" in second.err
+    assert " ms a step" not in second.err
 
 
 def test_a_choice_never_mixes_runs_with_other_options(tmp_path):
@@ -535,7 +539,7 @@ def test_a_choice_never_mixes_runs_with_other_options(tmp_path):
         assert "holds a finished run with --gamma 0.99, not 0.5; choose another" in other.err
     same = view("report", *command, "--", "--no-compile", "--gamma", "0.990")
     assert (same.code, same.out) == (0, first.out)
-    config = next(tmp_path.glob("p*__*/config.json"))
+    config = next(tmp_path.glob("search/p*__*/config.json"))
     config.write_text(config.read_text().replace('"eval_frequency": 100', '"eval_frequency": 50'))
     mixed = view("list", *command)
     assert mixed.code == 2 and mixed.err.count("\n") == 1
@@ -549,45 +553,176 @@ def test_a_choice_never_mixes_runs_with_other_options(tmp_path):
 # REPORTS AND ERRORS
 
 
-@pytest.mark.slow
-def test_status_without_a_grid_reads_the_folder(tmp_path, stub):
-    grid = ["baseline", *GRID[1:5], "--seeds", "1-2", "--total-timesteps", "1000"]
-    assert run(*grid, "--runs-dir", tmp_path, env=stub).code == 0
-    (tmp_path / "Hopper-v5__ppo__baseline__1").mkdir()
-    config = '{"args": {"total_timesteps": 500}}'
-    (tmp_path / "Hopper-v5__ppo__baseline__1" / "config.json").write_text(config)
-    log = "# now host: python x.py\nerror: bad\n# now host: exit=2\n"
-    (tmp_path / "logs" / "Hopper-v5__ppo__baseline__2.log").write_text(log)  # it has no folder
+def test_status_without_a_grid_reads_the_folder(tmp_path):
+    for seed in (1, 2):
+        finish(tmp_path / f"baseline_s{seed}__Hopper-v5__sac")
+    finish(tmp_path / "Hopper-v5__ppo__baseline__1")
+    (tmp_path / "Hopper-v5__ppo__baseline__1/result.json").unlink()
+    log_of(tmp_path / "Hopper-v5__ppo__baseline__2").parent.mkdir()  # it has no folder
+    log = "# now host: python x.py\nerror: \x1b[31mbad\n# now host: exit=2\n"
+    log_of(tmp_path / "Hopper-v5__ppo__baseline__2").write_text(log)
     for words in (["status"], ["status", "custom"]):
         result = run(*words, "--runs-dir", tmp_path)
         assert result.code == 0, result.err
         assert "4 runs: 2 done, 0 running, 1 failed, 1 to do" in result.out
-        assert re.search(r"exit 2 .*baseline__2.log +error: bad\n", result.out)
+        assert re.search(r"exit 2 .*baseline__2.log +error: \?\[31mbad\n", result.out)
+        assert "\x1b" not in result.out
     empty = run("status", "--runs-dir", tmp_path / "none")
     assert empty.code == 2 and f"error: no runs in {tmp_path}/none" in empty.err
 
 
+def test_status_for_a_reader_that_stops_early(tmp_path):
+    for seed in range(300):
+        log = log_of(tmp_path / f"baseline_s{seed}__Hopper-v5__sac")
+        log.parent.mkdir(exist_ok=True)
+        log.write_text("# now host: exit=1\n")
+    command = f"set -o pipefail; ./benchmark.sh status --runs-dir {tmp_path} | true"
+    done = subprocess.run(["bash", "-c", command], cwd=ROOT, env=ENV, capture_output=True)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("file", "damaged"), [("result.json", ""), ("result.json", "{}"), ("config.json", "[]")]
-)
-def test_a_damaged_result_fails_its_run_and_stops_no_other(file, damaged, tmp_path, stub):
+def test_a_damaged_result_fails_its_run_and_stops_no_other(tmp_path, stub):
+    """The kinds of damage are in test_damage.py."""
     grid = ["baseline", "--algos", "sac", "--envs", "Hopper-v5", "--seeds", "1-2"]
     grid += ["--total-timesteps", "1000", "--runs-dir", tmp_path]
     bad, good = folders(*grid)
-    bad.mkdir()
-    (bad / "result.json").write_text('{"total_timesteps": 1000}')
-    (bad / file).write_text(damaged)
-    advice = f"{bad}/{file} cannot be read ("
-    status = run("status", *grid)
-    assert status.code == 0 and re.search(
-        rf"damaged +{log_of(bad)} +{re.escape(advice)}", status.out
-    )
+    finish(bad)
+    (bad / "result.json").write_text("{")
     sweep = run(*grid, env=stub)
-    assert sweep.code == 1 and f"warning: {advice}" in sweep.err and "2 runs, 1 to do" in sweep.err
-    assert (bad / file).read_text() == damaged and (good / "result.json").exists()
-    assert "2 runs: 1 done, 0 running, 1 failed, 0 to do" in sweep.out
-    assert "delete the run's folder to run it again" in sweep.out
+    assert sweep.code == 1 and f"warning: {bad}/result.json: " in sweep.err
+    assert "2 runs, 1 to do" in sweep.err and "2 runs: 1 done, 0 running, 1 failed" in sweep.out
+    assert (bad / "result.json").read_text() == "{" and (good / "result.json").exists()
+    assert "move its folder away to run it again" in sweep.out
+
+
+# LOCKS AND DISKS
+
+
+def test_running_is_what_holds_the_lock(tmp_path):
+    grid = ["baseline", "--algos", "sac", "--envs", "Hopper-v5", "--seeds", "1-6"]
+    grid += ["--total-timesteps", "1000", "--runs-dir", tmp_path]
+    silent, testing, elsewhere, lost, moved, stopped = folders(*grid)
+    log_of(silent).parent.mkdir()
+    for folder, age, end in (
+        (silent, 14, ""),
+        (testing, 1, ""),
+        (elsewhere, 1, ""),
+        (lost, 3, ""),
+        (moved, 1, "# now host: exit=0\n"),
+        (stopped, 1, "# now host: exit=130\n"),
+    ):
+        log_of(folder).write_text(f"# now host: python x.py\ncompiling ...\n{end}")
+        os.utime(log_of(folder), (time.time() - 60 * age,) * 2)
+    with locked(silent), locked(testing):
+        for words in (grid, ["--runs-dir", tmp_path]):
+            status = view("status", *words)
+            assert status.code == 0
+            assert "2 running, 1 probably running, 0 failed, 3 to do" in status.out
+            [line] = re.findall("  running, .*", status.out)
+            assert re.search(rf"silent for 14 min +{log_of(silent)} +compiling", line)
+        report = view("report", *grid).out
+        assert "2 running, 0 failed, 4 to do" in report and report.count("still running") == 2
+    assert not (lost / ".lock").exists()
+
+
+@pytest.mark.slow
+def test_status_never_stops_a_run_that_starts(tmp_path):
+    """A process takes 50 locks, over and over, as scripts do that start."""
+    for i in range(50):
+        (tmp_path / f"a__{i}").mkdir()
+        (tmp_path / f"a__{i}/.lock").touch()
+    code = """if True:
+        import fcntl, itertools, sys
+        for i in itertools.cycle(range(50)):
+            with open(f"a__{i}/.lock", "w") as lock:
+                fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    """
+    with subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, stderr=-1) as runs:
+        for _ in range(1000):
+            assert view("status", "--runs-dir", tmp_path).code == 0
+        assert runs.poll() is None, runs.stderr.read()
+        runs.kill()
+
+
+def test_a_file_system_without_locks_is_one_line(tmp_path, stub):
+    (tmp_path / "flock").write_text("#!/bin/sh\necho no locks >&2\nexit 71\n")
+    (tmp_path / "flock").chmod(0o755)
+    env = stub | {"PATH": f"{tmp_path}:{PATH}"}
+    result = run("demo", "--runs-dir", tmp_path / "runs", env=env)
+    _, line = result.err.splitlines()
+    assert (result.code, result.out) == (2, "")
+    assert re.match(
+        r"error: --runs-dir: \S+ on \S+ has no locks, without which two .*: choose", line
+    )
+    assert not list(tmp_path.glob("runs/*/config.json"))
+    # A machine whose file system has none may be another one than that of the sweep.
+    command = ["bash", ROOT / "benchmark.sh", "run-one", "x", tmp_path / "runs/a__b", "true"]
+    one = subprocess.run(command, env=env, capture_output=True, text=True)
+    assert one.returncode == 1 and "has no locks" in one.stdout and "already" not in one.stderr
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 300 kB."""
+    command = ["mount", "-t", "tmpfs", "-o", "size=300k", "none", tmp_path]
+    if subprocess.run(command, capture_output=True).returncode:
+        pytest.skip("may not mount a file system")
+    yield tmp_path
+    subprocess.run(["umount", "--recursive", "--lazy", tmp_path], check=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("state", ["full", "full later", "read-only", "read-only later"])
+def test_a_disk_that_takes_nothing_is_named(state, small_disk, stub):
+    runs, env = small_disk / "runs", stub
+    runs.mkdir()
+    grid = [*GRID, "--total-timesteps", "400", "--runs-dir", runs]
+    fill = f"dd if=/dev/zero of={small_disk}/filler bs=1k 2>/dev/null"
+    if "later" in state:  # by the first thing that a run does
+        text = Path(stub["PYTHON"]).read_text()
+        script = f"exec {sys.executable} {ROOT}"
+        python = small_disk / "python"
+        if "read-only" in state:  # a disk that is written to cannot become so; hide the logs
+            fill = f"[ -e {small_disk}/filler ] || mount -t tmpfs -o ro none {runs}/logs"
+            fill += f"; touch {small_disk}/filler"
+        python.write_text(text.replace(script, f"{fill}; {script}"))
+        python.chmod(0o755)
+        env = stub | {"PYTHON": str(python)}
+    else:
+        read_only = f"mount -o remount,ro {small_disk}"
+        subprocess.run(fill if state == "full" else read_only, shell=True)
+    result = run(*grid, "--jobs", "1", env=env)
+    reason = "Read-only file system" if "read-only" in state else "No space left on device"
+    errors = [line for line in result.err.splitlines() if "to do" not in line]
+    if "later" in state:
+        assert result.code == 1 and errors == [f"error: cannot write to {runs}/logs: {reason}"]
+        assert f"3 runs: {int('read-only' in state)} done" in result.out
+    else:
+        assert result.code == 2 and not result.out
+        assert errors == [f"error: --runs-dir: cannot write to {runs}/logs: {reason}"]
+
+
+# NAMES OF FOLDERS
+
+
+@pytest.mark.slow
+def test_names_of_folders(tmp_path, stub):
+    """Through a link to benchmark.sh, into a folder whose name is not UTF-8; with a home folder."""
+    (tmp_path / "bench").symlink_to(ROOT / "benchmark.sh")
+    (tmp_path / "home").mkdir()
+    runs = os.fsencode(tmp_path) + b"/caf\xe9 \x1b[31m"
+    grid = [*GRID, "--total-timesteps", "400", "--runs-dir", os.fsdecode(runs)]
+    result = run(*grid, env=stub, cwd=tmp_path, script=tmp_path / "bench")
+    assert result.code == 0, result.out + result.err
+    assert all(line.endswith("to do") for line in result.err.splitlines()), result.err
+    assert "3 runs: 3 done" in result.out and "\x1b" not in result.out
+    assert len([name for name in os.listdir(runs) if b"__" in name]) == 3
+    again = run(*grid, env=stub, cwd=tmp_path, script=tmp_path / "bench")
+    assert again.out == result.out and "3 runs, 0 to do" in again.err
+    home = ENV | {"HOME": str(tmp_path / "home")}
+    shown = run("demo", "--runs-dir=~/my runs", "--dry-run", env=home)
+    assert f"--runs-dir '{tmp_path}/home/my runs'" in shown.out
 
 
 @pytest.mark.slow
@@ -711,7 +846,7 @@ def test_what_an_interpreter_lacks_is_named(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(("executor", "program"), [("parallel", "parallel"), ("slurm", "sbatch")])
 def test_missing_engine(executor, program, tmp_path):
-    tools, used = tmp_path / "bin", "env bash dirname awk grep wc cut flock"
+    tools, used = tmp_path / "bin", "env bash dirname readlink awk grep wc cut flock"
     tools.mkdir()
     for tool in used.split():
         (tools / tool).symlink_to(shutil.which(tool))

@@ -17,6 +17,7 @@ from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED
 from analysis.statistics import Comparison, holm
 from noisy_wrappers import BASELINE, Configuration, rounded
 from sweep import choose
+from sweep.environment import Environment, remember
 from sweep.halving import (
     advance,
     compare,
@@ -180,7 +181,7 @@ def test_the_simulation_confirms_by_the_test():
     assert np.mean(found != verdicts) <= 0.05
 
 
-@pytest.mark.parametrize("noises", [16, 90])
+@pytest.mark.parametrize("noises", [20, 90])
 def test_the_default_finds_and_confirms_what_docs_say(noises):
     sizes = schedule(noises, 3 * noises)
     found = [simulate_choose.simulate(noises, sizes, 25, gain, trials=4000) for gain in (1, 1.5)]
@@ -356,7 +357,7 @@ def test_two_algorithms_and_environments_at_once(tmp_path):
     # Three noises, one of them in two spellings: rounds of 3 and 2 runs, then 5 fresh seeds
     found = batches(args)
     assert [len(batch) for batch in found] == [4 * 3, 4 * 2, 4 * 10]
-    assert set().union(*found) == {path.name for path in tmp_path.glob("*__*")}
+    assert set().union(*found) == {path.name for path in tmp_path.glob("*/*__*")}
     assert all("_s1_" in name for name in found[0])
     assert all("_s2_" in name for name in found[1])
     sentences = conclude(args, tmp_path)
@@ -384,32 +385,69 @@ def test_two_algorithms_and_environments_at_once(tmp_path):
         assert float(line["score"]) == pytest.approx(fmean(wanted))
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "env", "seconds"),
-    [  # eight runs of 1,000 steps, each with ten seconds to start
-        ("sac", "Hopper-v5", 8 * (10 + 1000 / 150)),
-        ("sac", "Humanoid-v5", 8 * (10 + 1000 / 90)),
-        ("td3", "HumanoidStandup-v5", 8 * (10 + 1000 / 130)),
-        ("ppo", "Humanoid-v5", 8 * (10 + 1000 / 2900)),
-    ],
-)
-def test_the_core_hours_announced(algorithm, env, seconds, tmp_path):
-    args = arguments(
-        f"--algos | {algorithm} | --envs | {env} | --noises | {A}@1 | --confirm | 4", tmp_path
+THREE = "RandomMixupObservation(0.5) | RandomDropoutObservation(0.9)"
+THREE = f"--noise-rates | 1 | --confirm | 5 | --noises | {A} | {THREE}"
+
+
+def test_a_noise_is_chosen_by_the_rate_of_success(tmp_path):
+    env_id = "toy_envs:IsSuccess-v0"
+    text = f"--algos | ppo | --envs | {env_id} | --metric | success_rate | {THREE}"
+    args = arguments(text, tmp_path)
+    batches(args)
+    [verdict] = conclude(args, tmp_path)
+    lines = read(tmp_path / "choice.csv")
+    rates = {}
+    for line in lines[-2:]:
+        noise = Configuration.parse(line["noise"], line["noise_rate"])
+        last = [
+            stub_run.episodes_of("ppo", env_id, *noise.texts, seed)[-1]
+            for seed in range(1001, 1006)
+        ]
+        rates[noise] = 100 * np.mean(np.array(last) > 100)
+        assert float(line["score"]) == pytest.approx(rates[noise])
+    gain = rates.pop(noise) - rates.pop(BASELINE)
+    found = re.search(
+        r"5 fresh seeds, ([-+][\d.]+) \[.*\] percentage points of success, p", verdict
     )
-    [choice] = choose.choices(args)
-    assert choice.core_hours == pytest.approx(seconds / 3600)
+    assert float(found[1]) == pytest.approx(gain, abs=0.5) and abs(gain) > 5
+    assert "(80 %" in verdict or " %" not in verdict  # never percent of a rate
+    returns = arguments(f"--algos | ppo | --envs | {env_id} | {THREE}", tmp_path)
+    assert "percentage points" not in conclude(returns, tmp_path)[0]
 
 
-def test_the_readme_says_what_it_takes_by_default():
+def test_choose_by_success_needs_an_environment_that_tells_it(tmp_path, capsys):
+    text = f"--algos | ppo | --envs | Pendulum-v1 | --metric | success_rate | {THREE}"
+    with pytest.raises(SystemExit) as exit_:
+        batches(arguments(text, tmp_path))
+    assert exit_.value.code == 2
+    told = "error: --metric success_rate: Pendulum-v1 tells no `is_success` or `success`\n"
+    assert capsys.readouterr().err == told
+
+
+def test_choose_stops_where_nothing_was_learned(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(stub_run, "episodes_of", lambda *run: [[-50.0] * 10] * 10)
+    args = arguments(f"--algos | ppo | --envs | Pendulum-v1 | {THREE}", tmp_path)
+    with pytest.raises(SystemExit) as exit_:
+        batches(args)
+    assert exit_.value.code == 1
+    assert len(list(tmp_path.glob("*/*__*"))) == 6  # after the first round: two seeds of three
+    told = (
+        "PPO on Pendulum-v1: all 6 runs have a return of -50.00 in every test: nothing was learned "
+    )
+    assert f"error: {told}in 1,000 steps" in capsys.readouterr().err
+
+
+def test_the_readme_says_what_it_takes_by_default(tmp_path):
     text = " ".join((Path(__file__).parents[2] / "README.md").read_text().split())
     pattern = r"takes (\d+) runs of a .*: about (\d+) core-hours with PPO and (\d+) with SAC in a"
     runs, *hours = map(int, re.search(pattern, text).groups())
     for algorithm, announced in zip(("ppo", "sac"), hours, strict=True):
-        args = parse_args("list", "/", ["choose", "--algos", algorithm, "--envs", "Hopper-v5"])
+        args = parse_args("list", str(tmp_path), ["choose", "--algos", algorithm])
+        args.envs, known = ["Hopper-v5"], Environment(0.05e-3, 200, 1000, 11, True, {})
+        remember(args.runs_dir, "Hopper-v5", known)
         choices = choose.choices(args)
-        assert choose.total(choices).startswith(f"{runs} runs in all")
-        assert choices[0].core_hours == pytest.approx(announced, rel=0.03)
+        assert choose.total(choices, args).startswith(f"{runs} runs in all")
+        assert runs * choices[0].run_seconds / 3600 == pytest.approx(announced, rel=0.1)
 
 
 def test_the_default_noises_and_those_of_the_paper(tmp_path):
@@ -421,8 +459,8 @@ def test_the_default_noises_and_those_of_the_paper(tmp_path):
         [choice] = choose.choices(args)
         return choice.state.noises
 
-    assert len(tried()) == 16 and {noise.noise_rate for noise in tried()} == {"0.05", "1.00"}
-    assert len({noise.noise for noise in tried()}) == 8
+    assert len(tried()) == 20 and {noise.noise_rate for noise in tried()} == {"0.05", "1.00"}
+    assert len({noise.noise for noise in tried()}) == 10
     assert not any(noise.noise == "RandomNormalNoisyObservation(1.0)" for noise in tried())
     assert [str(noise) for noise in tried("--noise-rates 0.2")] == [
         f"{noise.noise} at 0.2" for noise in tried()[::2]
@@ -432,23 +470,6 @@ def test_the_default_noises_and_those_of_the_paper(tmp_path):
     assert len(tried("--noises paper --noise-rates 0.2")) == 15
 
 
-def test_a_choice_among_the_papers_noises_is_not_mixed_with_todays(tmp_path, capsys):
-    words = "--algos | ppo | --envs | Pendulum-v1 | --noise-rates | 1"
-    paper = arguments(f"{words} | --noises | paper", tmp_path)
-    [choice] = choose.choices(paper)
-    for run in choice.state.due:
-        stub_run.train([choice.runs[run].script, *choice.runs[run].arguments])
-    with pytest.raises(SystemExit) as error:
-        choose.choices(arguments(words, tmp_path))
-    assert error.value.code == 2
-    message = capsys.readouterr().err
-    assert message.count("\n") == 1 and "holds a choice among other noises" in message
-    assert "--noises paper" in message and "--runs-dir" in message
-    [choice] = choose.choices(paper)
-    assert len(choice.returns) == 15 and len(choice.state.rounds) == 1  # it goes on
-    choose.choices(arguments(words.replace("ppo", "sac"), tmp_path))  # another one
-
-
 def test_an_excluded_noise_is_no_other_choice(tmp_path):
     words = "--algos | ppo | --envs | Pendulum-v1"
     [choice] = choose.choices(arguments(words, tmp_path))
@@ -456,20 +477,37 @@ def test_an_excluded_noise_is_no_other_choice(tmp_path):
         stub_run.train([choice.runs[run].script, *choice.runs[run].arguments])
     excluded = f"{words} | --exclude | RandomEarlyTermination(50)@1"
     [choice] = choose.choices(arguments(excluded, tmp_path))
-    assert len(choice.returns) == 15
+    assert len(choice.returns) == 19
 
 
 def test_what_the_confirmation_can_show(tmp_path):
     words = f"--algos | ppo | --envs | Pendulum-v1 | --noises | {A}@1"
-    [line] = choose.plan(choose.choices(arguments(words, tmp_path)))[2:]
-    assert line == (
-        "25 fresh seeds confirm a true gain of 0.8 standard deviations over seeds with 80 % power"
-    )
-    two = arguments(words.replace("ppo", "ppo | sac"), tmp_path)
-    assert choose.plan(choose.choices(two))[3] == (
-        "25 fresh seeds confirm a true gain of 0.9 standard deviations over seeds with 80 % power, "
-        "corrected for 2 verdicts"
-    )
+
+    def lines(words):
+        args = arguments(words, tmp_path)
+        plan = choose.plan(choose.choices(args), args)
+        return [line for line in plan if "fresh seeds confirm" in line]
+
+    unit = "standard deviations over seeds with 80 % power"
+    assert lines(words) == [f"25 fresh seeds confirm a true gain of 0.8 {unit}"]
+    [line] = lines(words.replace("ppo", "ppo | sac"))
+    assert line.endswith(f" 0.9 {unit}, corrected for 2 verdicts")
+    # Once there is a spread, in the return's own units
+    two = f"{words} | RandomMixupObservation(0.5)@1 | --budget | 6 | --confirm | 5"
+    [choice] = choose.choices(arguments(two, tmp_path))
+    for run in map(choice.runs.get, choice.state.due):
+        stub_run.train([run.script, *run.arguments])
+    tests = [
+        [stub_run.tests_of("ppo", "Pendulum-v1", [noise], [1.0], seed)[-1] for seed in (1, 2, 3)]
+        for noise in (A, "RandomMixupObservation(0.5)")
+    ]
+    spread = math.sqrt(fmean(np.var(tests, axis=1, ddof=1)))
+    [line] = lines(two)
+    gain, units = re.search(
+        r"of about ([\d.]+) \(([\d.]+) standard deviations of the", line
+    ).groups()
+    assert line.startswith("PPO on Pendulum-v1: 5 fresh seeds confirm a true gain of about ")
+    assert float(gain) == pytest.approx(spread * float(units), rel=0.06)
 
 
 def test_a_second_choice_takes_the_same_fresh_seeds(tmp_path):
@@ -522,7 +560,8 @@ def test_two_commands_that_end_side_by_side_keep_each_others_lines(tmp_path, mon
     assert [found["algorithm"] for found in read(path)] == ["first", "x"]
 
 
-def test_status_says_who_survives(tmp_path):
+def test_status_says_who_survives(tmp_path, monkeypatch):
+    monkeypatch.setenv("SWEEP_JOBS", "2")
     scores = {}
     for noise in (A, "RandomMixupObservation(0.5)", "RandomDropoutObservation(0.9)"):
         tests = stub_run.tests_of("ppo", "Pendulum-v1", [noise], [1.0], 1)
@@ -534,23 +573,24 @@ def test_status_says_who_survives(tmp_path):
         f"--budget | 7 | --noises | {' | '.join(noises)}",
         tmp_path,
     )
-    line, total = choose.standing(choose.choices(args))
-    assert total.startswith("15 runs in all, 7 to search and 8 to confirm; 0 are done, about ")
+    line, total = choose.standing(choose.choices(args), args)
+    assert total == "15 runs in all, 7 to search and 8 to confirm; 0 are done"
     assert line == "PPO on Pendulum-v1, round 1 of 2: 3 of 3 noises, seed 1; runs to do: 3"
     for choice in choose.choices(args):
         for run in choice.state.due:
             stub_run.train([choice.runs[run].script, *choice.runs[run].arguments])
-    assert list(choose.standing(choose.choices(args))) == [
+    assert list(choose.standing(choose.choices(args), args)) == [
         "PPO on Pendulum-v1, round 2 of 2: 2 of 3 noises, seeds 1 to 3; runs to do: 4",
         "  mean return after round 1:",
         f"  {rounded(scores[best]):>10}  {best} at 1.0",
         f"  {rounded(scores[second]):>10}  {second} at 1.0",
         # Twelve runs are left; each of the three has taken 36 seconds
-        "15 runs in all, 7 to search and 8 to confirm; 3 are done, about 0.1 core-hours are left",
+        "15 runs in all, 7 to search and 8 to confirm; 3 are done, about 0.1 core-hours are left, "
+        "0.06 hours on the clock with 2 runs at a time",
     ]
     batches(args)
     finished = choose.choices(args)
-    [verdict] = choose.standing(finished)
+    [verdict] = choose.standing(finished, args)
     assert verdict.startswith("PPO on Pendulum-v1: ") and "4 fresh seeds" in verdict
     assert not (tmp_path / "choice.csv").exists()  # the status only looks
     assert [verdict] == list(choose.conclusion(finished))

@@ -2,8 +2,10 @@
 
 import contextlib
 import io
+import json
 import os
 import re
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -35,6 +37,29 @@ def folders(*words):
     found = view("list", *words)
     assert found.code == 0, found.err
     return [Path(line.split("\t")[0]) for line in found.out.splitlines()]
+
+
+def finish(folder, steps=1000, **args):
+    """Write what tells that a run of the sweep is finished."""
+    folder.mkdir(parents=True, exist_ok=True)
+    args = {"env_id": "Hopper-v5", "exp_name": "x", "seed": 1, "noise": [], "noise_rate": []} | args
+    args |= {"total_timesteps": steps, "eval_episodes": 10}
+    (folder / "config.json").write_text(json.dumps({"algorithm": "SAC", "args": args}))
+    result = {"total_timesteps": steps, "final_return_mean": 1.0}
+    (folder / "result.json").write_text(json.dumps(result))
+
+
+@contextlib.contextmanager
+def locked(folder):
+    """Hold a run's lock in another process, as its script does."""
+    folder.mkdir(parents=True, exist_ok=True)
+    code = "import fcntl, sys; lock = open(sys.argv[1], 'w'); fcntl.lockf(lock, fcntl.LOCK_EX); "
+    code += "print(flush=True); sys.stdin.read()"
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", code, folder / ".lock"], **pipes) as holder:
+        holder.stdout.readline()
+        yield
+        holder.stdin.close()
 
 
 def log_of(folder):

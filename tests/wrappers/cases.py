@@ -3,6 +3,7 @@
 import zlib
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 from hypothesis import settings
 
@@ -73,11 +74,46 @@ NOISES = [
     "RandomEarlyTermination(each_step=True)",
     "RandomNormalNoisyAction(0.3)",
     "RandomNormalNoisyAction(0.3, loc=-0.5)",
+    "RandomActionDelay(1, 3)",
+    "RandomDynamics(0.5, 1.5)",
 ]
-
-STEP_NOISES = [text for text in NOISES if not text.startswith("RandomEarlyTermination(3")]
+DYNAMICS = NOISES[-1]
+# Those that are decided when an episode begins, and the others.
+EPISODE_NOISES = [text for text in NOISES if "Termination(3" in text or text in NOISES[-2:]]
+STEP_NOISES = [text for text in NOISES if text not in EPISODE_NOISES]
 
 BOX = gym.spaces.Box(-10.0, 10.0, (3,), np.float64)
+WIDE = gym.spaces.Box(-10.0, 10.0, (30,), np.float64)  # dropout never keeps all of it
+
+# A cart with a pole, and what mj_setConst computes for: a tendon, a camera, a light, a constraint.
+MODEL = """
+<mujoco>
+  <worldbody>
+    <light pos="0 0 3" mode="trackcom"/>
+    <body name="cart">
+      <joint name="slide" type="slide" axis="1 0 0" damping="0.1" armature="0.2"/>
+      <geom type="box" size="0.2 0.1 0.1"/>
+      <camera name="track" mode="trackcom" pos="0 -3 0"/>
+      <body name="pole" pos="0 0 0.1">
+        <joint name="hinge" axis="0 1 0" stiffness="0.5"/>
+        <geom type="capsule" fromto="0 0 0 0 0 0.6" size="0.05"/>
+      </body>
+    </body>
+    <body name="ball" pos="0 0 2">
+      <freejoint/>
+      <geom size="0.1"/>
+    </body>
+  </worldbody>
+  <tendon>
+    <fixed name="both"><joint joint="slide" coef="1"/><joint joint="hinge" coef="0.3"/></fixed>
+  </tendon>
+  <equality><connect body1="pole" body2="ball" anchor="0 0 1"/></equality>
+  <actuator>
+    <motor joint="slide" gear="50"/>
+    <position joint="hinge" kp="3" dampratio="1"/>
+  </actuator>
+</mujoco>
+"""
 
 
 class GenericEnv(gym.Env):
@@ -87,6 +123,7 @@ class GenericEnv(gym.Env):
 
     def __init__(self, observation_space=BOX, reset=None, step=None):
         self.observation_space = observation_space
+        self.model = mujoco.MjModel.from_xml_string(MODEL)  # which nothing here simulates
         self._reset = reset or (lambda env: (env.draw(), {}))
         self._step = step or (
             lambda env, action: (env.draw(), float(env.np_random.normal()), False, False, {})
@@ -104,6 +141,34 @@ class GenericEnv(gym.Env):
         return self._step(self, action)
 
 
+class Cart(gym.Env):
+    """Simulates MODEL. Unlike an environment of Gymnasium's, a copy goes on within an episode."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (5,), np.float64)
+    action_space = gym.spaces.Box(-1.0, 1.0, (2,))
+
+    def __init__(self):
+        self.model = mujoco.MjModel.from_xml_string(MODEL)
+        self.data = mujoco.MjData(self.model)
+
+    def observe(self):
+        return np.concatenate([self.data.qpos[:2], self.data.qvel[:2], self.data.qpos[4:5]])
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qvel[:2] = self.np_random.normal(size=2)
+        return self.observe(), {}
+
+    def step(self, action):
+        self.data.ctrl[:] = action
+        mujoco.mj_step(self.model, self.data, 5)
+        return self.observe(), float(self.data.qpos[0]), False, False, {}
+
+
+gym.register("Cart-v0", "cases:Cart", max_episode_steps=40)
+
+
 def constant_env(value=2.0, shape=(3,)):
     space = gym.spaces.Box(-np.inf, np.inf, shape, np.float64)
     return GenericEnv(
@@ -119,14 +184,14 @@ def episodes_env(lengths):
     def reset(env):
         env.episode = getattr(env, "episode", -1) + 1
         env.t = 0
-        return np.zeros(3), {}
+        return env.draw(), {}
 
     def step(env, action):
         env.t += 1
         done = env.t == lengths[env.episode % len(lengths)]
-        return np.zeros(3), 1.0, done, False, {}
+        return env.draw(), 1.0, done, False, {}
 
-    return GenericEnv(reset=reset, step=step)
+    return GenericEnv(WIDE, reset=reset, step=step)
 
 
 def build(text, env, rate):
@@ -137,6 +202,8 @@ def build(text, env, rate):
 
 def registered(text):
     """A registered environment that a noise can work on, and an action."""
+    if text == DYNAMICS:
+        return "Cart-v0", np.array([0.5, 0.5], np.float32)
     if "Action" in text:
         return "Pendulum-v1", np.array([0.5], np.float32)
     return "CartPole-v1", 0
@@ -160,6 +227,13 @@ def rollout(env, seed=None, steps=100, action=0):
     return out
 
 
+def plain(value):
+    """An info with lists in place of arrays, which == compares as a whole."""
+    if isinstance(value, dict):
+        return {name: plain(part) for name, part in value.items()}
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
 def same(first, second):
     """Two rollouts are equal bit for bit, types included."""
     return len(first) == len(second) and all(
@@ -167,7 +241,8 @@ def same(first, second):
         and a[0].shape == b[0].shape
         and a[0].tobytes() == b[0].tobytes()
         and type(a[1]) is type(b[1])
-        and a[1:] == b[1:]
+        and a[1:4] == b[1:4]
+        and plain(a[4]) == plain(b[4])
         for a, b in zip(first, second, strict=True)
     )
 

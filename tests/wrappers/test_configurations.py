@@ -22,7 +22,11 @@ ENDING = "RandomEarlyTermination(50)"
 def test_it_is_read_and_written(noises, rates, noise, noise_rate):
     config = Configuration.read(noises, rates)
     assert (config.noise, config.noise_rate) == (noise, noise_rate)
-    assert Configuration.parse(*config.columns) == config == Configuration.stored(*config.texts)
+    assert (
+        Configuration.parse(*config.columns)
+        == config
+        == Configuration.read(*config.texts, stored=True)
+    )
     assert Configuration.parse(noise, noise_rate) == config
     assert config.texts == (noises, rates)
     assert config.is_baseline == (not noises)
@@ -62,9 +66,14 @@ def test_spellings_of_one_configuration_are_one():
     assert Configuration.read([SCALE, ENDING], [0.0, "0:0"]) == BASELINE
 
 
-def test_what_is_stored_is_not_checked():
-    stored = Configuration.stored(["Gone(1)"], [0.5])  # the noise of another version
-    assert stored.columns == ("Gone(1)", "0.5")
+def test_what_a_program_has_stored():
+    assert Configuration.parse("Gone(1)", 0.5).columns == ("Gone(1)", "0.5")
+    own = "no_such_module:Sticky(3)"  # whose module need not be here
+    config = Configuration.read([own, SCALE], ["1.0:0.0", 0.5], stored=True)
+    assert config.texts == ([own, SCALE], ["1.0:0.0", 0.5]) and config.kinds == {"own", "reward"}
+    for bad in ("Gone(1)", "no_such_module:Sticky(", 3):
+        with pytest.raises(ValueError, match="bad noise"):
+            Configuration.read([bad], [0.5], stored=True)
 
 
 @pytest.mark.parametrize("text", [f"{SCALE}+{SHIFT}", f" {SCALE} + {SHIFT} "])
@@ -77,4 +86,4 @@ def test_every_wrapper_says_its_kind():
     kinds = {name: wrapper.kind for name, wrapper in WRAPPERS.items()}
     assert set(kinds.values()) == {"observation", "reward", "action", "dynamics"}
     for name, kind in kinds.items():
-        assert name.lower().endswith(kind) or kind == "dynamics"
+        assert kind in name.lower() or kind == "dynamics"

@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from cases import (
+    EPISODE_NOISES,
     NOISES,
     OBSERVATION_CASES,
     REWARD_CASES,
@@ -15,6 +16,7 @@ from cases import (
     episodes_env,
     numbered_env,
     rollout,
+    same,
     streams,
 )
 
@@ -35,7 +37,8 @@ def test_observation_golden(wrapper, args, kwargs, formula, rate, dtype):
         may_act = wrapper is not RandomMixupObservation or t > 0
         if may_act and gate.random() < rate:
             expected = formula(noise, observation.astype(np.float64), previous)
-            info = {"noise": (wrapper.__name__,)}
+            if (expected != observation).any():  # dropout may keep everything
+                info = {"noise": (wrapper.__name__,)}
         assert got[0].dtype == dtype
         np.testing.assert_allclose(got[0], expected, rtol=4 * np.finfo(dtype).eps, atol=1e-300)
         assert got[1:] == (*clean[1:4], info)
@@ -62,21 +65,22 @@ def test_early_termination_golden(rate, truncate):
     natural = [4, None, 20, None, 7]  # a chosen episode may end before its drawn step
     env = RandomEarlyTermination(episodes_env(natural), rate, 3, 9, truncate=truncate)
     gate, noise = streams(RandomEarlyTermination, seed=5)
-    chosen = 0
+    ended = 0
     for episode in range(100):
         env.reset(seed=5 if episode == 0 else None)
         drawn = noise.integers(3, 10)
         last = drawn if gate.random() < rate else math.inf
-        chosen += last < math.inf
         end = natural[episode % 5] or math.inf
         for t in range(1, 30):
             _, _, terminated, truncated, info = env.step(0)
             assert terminated == (t == end or (t == last and not truncate))
             assert truncated == (t == last and truncate)
-            assert info == ({"noise": ("RandomEarlyTermination",)} if t == last else {})
+            acted = t == last and (truncate or t != end)
+            ended += acted
+            assert info == ({"noise": ("RandomEarlyTermination",)} if acted else {})
             if terminated or truncated:
                 break
-    assert (env.times_applied, env.opportunities) == (chosen, 100)
+    assert (env.times_applied, env.opportunities) == (ended, 100)
 
 
 @pytest.mark.parametrize("truncate", [False, True])
@@ -120,9 +124,40 @@ def test_early_termination_at_the_first_step(high):
 
 
 def test_termination_at_the_time_limit_is_a_termination():
-    env = RandomEarlyTermination(gym.wrappers.TimeLimit(constant_env(), 5), 1.0, 5)
+    with pytest.warns(UserWarning, match="only turns truncated into terminated"):
+        env = RandomEarlyTermination(gym.wrappers.TimeLimit(constant_env(), 5), 1.0, 5)
     env.reset(seed=0)
     assert [env.step(0)[2:4] for _ in range(5)][-1] == (True, True)
+    assert env.times_applied == 1
+
+
+@pytest.mark.parametrize(("low", "kwargs"), [(6, {}), (5, {"truncate": True})])
+def test_a_termination_beyond_the_time_limit_never_acts(low, kwargs):
+    with pytest.warns(UserWarning, match="never acts: episodes have at most 5 steps"):
+        env = RandomEarlyTermination(gym.wrappers.TimeLimit(constant_env(), 5), 1.0, low, **kwargs)
+    steps = rollout(env, seed=0, steps=20)
+    assert not any("noise" in step[4] for step in steps)
+    assert (env.times_applied, env.opportunities) == (0, 5)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "RandomDropoutObservation(1)",
+        "RandomNormalNoisyObservation(0)",
+        "RandomUniformScaleObservation(1, 1)",
+        "RandomUniformScaleReward(1, 1)",
+        "RandomNormalNoisyReward(0)",
+        "RandomNormalNoisyAction(0)",
+        "RandomActionDelay(0)",
+        "RandomDynamics(1, 1)",
+    ],
+)
+def test_noise_that_changes_nothing_is_not_applied(text):
+    env = build(text, gym.make("Cart-v0"), 1.0)
+    bare = rollout(gym.make("Cart-v0"), seed=0, action=np.ones(2))
+    assert same(rollout(env, seed=0, action=np.ones(2)), bare)
+    assert env.times_applied == 0 < env.opportunities
 
 
 @pytest.mark.parametrize("reuse", [False, True])
@@ -144,7 +179,7 @@ def test_mixup_by_hand(factor, recursive, episodes, reuse):
         assert info == {}
         seen += [env.step(0)[0][0] for _ in range(3)]
         assert seen == expected
-    assert (env.times_applied, env.opportunities) == (6, 6)
+    assert (env.times_applied, env.opportunities) == (0 if factor == 1 else 6, 6)
 
 
 def test_mixup_remembers_unperturbed_steps_too():
@@ -214,16 +249,17 @@ def test_applied_fraction_is_the_rate(text, rate):
     assert math.isnan(env.applied_fraction)
     steps = rollout(env, seed=3, steps=4000)
     seen = sum("noise" in info for *_, info in steps)
-    unfinished = 1 if "(3" in text else 0  # the last episode may be chosen and not at its end yet
-    assert seen <= env.times_applied <= seen + unfinished
     resets = sum(reward is None for _, reward, *_ in steps)
-    if "(3" in text:
+    if text in EPISODE_NOISES:
         opportunities = resets
+        starts = [i for i, step in enumerate(steps) if step[1] is None]
+        seen = sum(any("noise" in step[4] for step in steps[i : i + 11]) for i in starts)
     elif "Reward" in text or "Mixup" in text or "each_step" in text or "Action" in text:
         opportunities = len(steps) - resets
     else:
         opportunities = len(steps)
     assert env.opportunities == opportunities
     assert env.applied_fraction == env.times_applied / env.opportunities
+    assert env.times_applied == seen
     deviation = math.sqrt(rate * (1 - rate) / opportunities)
     assert env.applied_fraction == pytest.approx(rate, abs=4 * deviation)

@@ -3,12 +3,20 @@
 import re
 import sys
 
+import gymnasium as gym
 import pytest
 from cases import A, B, C, hypothesis_settings
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from noisy_wrappers import WRAPPERS, canonical_env_id, canonical_noises, run_folder, run_name
+from noisy_wrappers import (
+    WRAPPERS,
+    canonical_env_id,
+    canonical_noises,
+    refusals,
+    run_folder,
+    run_name,
+)
 from sweep.grid import NOISES as NOISES_OF_THE_PAPER
 
 
@@ -78,7 +86,9 @@ def configurations(draw):
             steps = sorted(draw(st.lists(st.sampled_from([1, 2, 12]), min_size=1, max_size=2)))
             arguments = [str(k) for k in steps] if draw(st.booleans()) else ["each_step=True"]
             arguments += draw(st.sampled_from([[], ["truncate=True"], ["truncate=False"]]))
-        elif "Uniform" in name:
+        elif name == "RandomActionDelay":
+            arguments = [str(draw(st.integers(0, 12)))]
+        elif "Uniform" in name or name == "RandomDynamics":
             arguments = [str(x) for x in sorted(draw(st.tuples(few, few)))]
         else:
             most = 1 if "Mixup" in name or "Dropout" in name else 1e16
@@ -87,6 +97,10 @@ def configurations(draw):
                 arguments = [str(tuple(draw(st.lists(few, min_size=2, max_size=3))))]
             if "Normal" in name and draw(st.booleans()):
                 arguments.append(f"loc={draw(few)}")
+        if name.endswith("Observation") and draw(st.booleans()):
+            keys = ["a", "b", "a-b", "a b", "a/b", "a', 'b", "ab", "0"]
+            keys = draw(st.lists(st.sampled_from(keys), min_size=1, max_size=2))
+            arguments.append(f"keys={tuple(keys)}" if draw(st.booleans()) else "keys=0")
         noises.append(f"{name}({', '.join(arguments)})")
     rates = [draw(st.sampled_from([0.0, 0.05, 0.5, 1.0, "0:0", "1:0", "0:.5"])) for _ in noises]
     return noises, rates
@@ -148,3 +162,10 @@ def test_what_a_module_raises_passes_through(source, error, tmp_path, monkeypatc
     with pytest.raises(error):
         canonical_env_id("buggy_module:Env-v0")
     assert sys.path == path
+
+
+def test_an_assertion_is_a_refusal_only_of_a_package_that_asserts_its_versions():
+    gym.register("Asserting-v0", "gymnasium_robotics.fetch:Env")
+    gym.register("Own-v0", "my_envs:Env")
+    assert AssertionError in refusals("Asserting-v0")
+    assert not {AssertionError, ImportError} & set(refusals("my_envs:Own-v0"))

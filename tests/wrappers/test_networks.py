@@ -6,13 +6,14 @@ import json
 import gymnasium as gym
 import numpy as np
 import pytest
-from cases import BOX, A, B, numbered_env
+from cases import BOX, A, B, layers, numbered_env
 from gymnasium.wrappers import FlattenObservation
 
 from noisy_wrappers import (
     EnvState,
     FiniteNumbers,
     NotFiniteError,
+    SpaceError,
     make_flat,
     make_noisy,
     noise_wrappers,
@@ -51,8 +52,35 @@ def test_make_flat_makes_observations_vectors(space):
     for observation in (env.reset()[0], env.step(None)[0]):
         np.testing.assert_array_equal(observation, gym.spaces.flatten(space, inner.observation))
         assert env.observation_space.contains(observation)
-    flattened = isinstance(env.env, FlattenObservation)
+    flattened = isinstance(env, FlattenObservation)
     assert flattened == (space is not BOX)  # a vector passes as it is
+
+
+def test_noise_goes_beneath_flattening():
+    space = gym.spaces.Dict({"a": BOX, "b": gym.spaces.Discrete(4), "c": gym.spaces.MultiBinary(2)})
+    env = make_flat(Given(space))
+    clean = env.reset()[0]
+    noisy = make_noisy(env, [A, "RandomNormalNoisyObservation(1.0, keys='a')"], [1.0])
+    names = ["FiniteNumbers", "RecordEpisodeStatistics", "RandomNormalNoisyReward"]
+    assert layers(noisy) == [*names, "RandomNormalNoisyObservation", "FlattenObservation"]
+    got = noisy.reset(seed=0)[0]
+    assert (got[:3] != clean[:3]).all() and (got[3:] == clean[3:]).all()
+    image = make_flat(Given(gym.spaces.Box(0, 255, (2, 3), np.uint8)))  # its pixels are as before
+    names = ["FiniteNumbers", "FlattenObservation", "RecordEpisodeStatistics"]
+    assert layers(make_noisy(image, [], [])) == names
+
+
+def test_finite_numbers_look_into_dictionaries():
+    inner = Given(gym.spaces.Dict(a=gym.spaces.Tuple((BOX, BOX)), b=gym.spaces.Discrete(4)))
+    env = make_flat(inner)
+    first = env.reset()[0]
+    inner.observation["a"][1][2] = np.nan
+    assert not np.isnan(first).any()  # a copy
+    with pytest.raises(NotFiniteError, match=r"step 1 .*the observation\['a'\]\[1\] \[.*nan\]"):
+        env.step(None)
+    inner.observation["a"] = (np.zeros(3), np.zeros(4))
+    with pytest.raises(SpaceError, match=r"an observation\['a'\]\[1\] of shape \(4,\)"):
+        env.step(None)
 
 
 @pytest.mark.parametrize(

@@ -132,9 +132,10 @@ def test_bad_notation(text):
 
 def test_signatures():
     assert [text.split("(")[0] for text in signatures()] == list(WRAPPERS)
-    assert "RandomMixupObservation(factor, *, recursive=False)" in signatures()
+    assert "RandomMixupObservation(factor, *, recursive=False, keys=None)" in signatures()
     assert "RandomUniformScaleReward(low, high)" in signatures()
     assert "RandomNormalNoisyAction(scale, *, loc=0.0)" in signatures()
+    assert "RandomActionDelay(low, high=low)" in signatures()
 
 
 def test_the_registry_is_complete():
@@ -149,6 +150,8 @@ def test_the_registry_is_complete():
         "RandomUniformScaleReward",
         "RandomEarlyTermination",
         "RandomNormalNoisyAction",
+        "RandomActionDelay",
+        "RandomDynamics",
     ]
     assert all(issubclass(wrapper, NoiseWrapper) for wrapper in WRAPPERS.values())
     assert {text.split("(")[0] for text in NOISES} == set(WRAPPERS)

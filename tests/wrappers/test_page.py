@@ -7,11 +7,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
-from noisy_wrappers import make_noisy, noise_statistics, set_progress
+from noisy_wrappers import RandomEarlyTermination, make_noisy, noise_statistics, set_progress
 
 PAGE = Path(__file__).parents[2] / "docs" / "wrappers.md"
 
@@ -81,3 +82,15 @@ def test_a_vec_env_without_noise():
     env = DummyVecEnv([lambda: Monitor(gym.make("Pendulum-v1"))])
     set_progress(env, 0.5)
     assert noise_statistics(env) == {}
+
+
+def test_make_vec_env_and_early_termination_lose_no_episode():
+    kwargs = {"noise_rate": 1, "low": 5}
+    kwargs = {"wrapper_class": RandomEarlyTermination, "wrapper_kwargs": kwargs}
+    with pytest.raises(ValueError, match="the record would miss those that RandomEarlyTermination"):
+        make_vec_env("Pendulum-v1", 1, **kwargs)  # it would be above SB3's Monitor
+    venv = make_vec_env(lambda: RandomEarlyTermination(gym.make("Pendulum-v1"), 1.0, 5), 1)
+    venv.reset()
+    for _ in range(20):
+        venv.step(np.zeros((1, 1), np.float32))
+    assert venv.env_method("get_episode_lengths") == [[5, 5, 5, 5]]

@@ -6,7 +6,7 @@ import re
 import gymnasium as gym
 import numpy as np
 import pytest
-from cases import NOISES, build, constant_env
+from cases import NOISES, WIDE, GenericEnv, build, constant_env
 from gymnasium.utils.env_checker import check_env
 
 from noisy_wrappers import (
@@ -32,8 +32,8 @@ BAD_FLAGS = [0, 1, None, "yes", np.True_]
 
 def bad_parameters():
     for name in WRAPPERS:
-        args = {"RandomEarlyTermination": (3,)}.get(name, (0.5,))
-        if "Uniform" in name:
+        args = {"RandomEarlyTermination": (3,), "RandomActionDelay": (3,)}.get(name, (0.5,))
+        if "Uniform" in name or name == "RandomDynamics":
             args = (0.5, 1.0)
             for bad in BAD_NUMBERS:
                 yield name, 0.1, (bad, 1.0), {}, "low", bad
@@ -49,6 +49,17 @@ def bad_parameters():
                 yield name, 0.1, (bad,), {}, "scale", bad
             for bad in BAD_NUMBERS:
                 yield name, 0.1, (0.5,), {"loc": bad}, "loc", bad
+    yield "RandomDynamics", 0.1, (-0.1, 1.0), {}, "low", -0.1
+    for bad in ["body_masss", "body_invweight0", "body_parentid", "opt", 3]:
+        yield "RandomDynamics", 0.1, (0.5, 1.0), {"fields": ("body_mass", bad)}, "fields", bad
+    for bad in [(), None, 5]:
+        yield "RandomDynamics", 0.1, (0.5, 1.0), {"fields": bad}, "fields", bad
+    for bad in [-1, *BAD_STEPS[2:]]:
+        yield "RandomActionDelay", 0.1, (bad,), {}, "low", bad
+        yield "RandomActionDelay", 0.1, (0, bad), {}, "high", bad
+    yield "RandomActionDelay", 0.1, (5, 4), {}, "low", 5
+    for bad in [3.5, (), ("a", 1), (None,), True]:
+        yield "RandomDropoutObservation", 0.1, (0.5,), {"keys": bad}, "keys", bad
     for bad in BAD_STEPS:
         yield "RandomEarlyTermination", 0.1, (bad,), {}, "low", bad
         yield "RandomEarlyTermination", 0.1, (3, bad), {}, "high", bad
@@ -78,7 +89,7 @@ def test_bad_parameters():
 
 @pytest.mark.parametrize("text", NOISES)
 def test_noise_rate_is_writable_and_checked(text):
-    env = build(text, constant_env(), 0)
+    env = build(text, GenericEnv(WIDE), 0)
     for rate in (1, 0.0, np.float32(0.5), 1.0):
         env.noise_rate = rate
         assert env.noise_rate == rate and type(env.noise_rate) is float

@@ -174,9 +174,9 @@ def test_noise_has_the_dtype_of_the_space_whatever_the_environment_returns(given
 
 
 def test_an_environments_own_info_of_noise_gives_way():
-    env = GenericEnv(gym.spaces.Box(-1, 1, (3,)), reset=lambda env: (np.zeros(3), {"noise": 0.3}))
+    env = GenericEnv(gym.spaces.Box(-1, 1, (3,)), reset=lambda env: (np.ones(3), {"noise": 0.3}))
     assert env.reset()[1] == {"noise": 0.3}
-    env = RandomNormalNoisyObservation(RandomDropoutObservation(env, 1.0, 0.5), 1.0, 0.1)
+    env = RandomNormalNoisyObservation(RandomDropoutObservation(env, 1.0, 0.0), 1.0, 0.1)
     names = ("RandomDropoutObservation", "RandomNormalNoisyObservation")
     assert env.reset()[1]["noise"] == names
 
@@ -271,55 +271,42 @@ def test_wide_integers_do_not_overflow(dtype):
     "env",
     [
         lambda text: gym.make(registered(text)[0]),
-        lambda text: gym.make("Pendulum-v1"),
         lambda text: gym.make("InvertedPendulum-v5"),
         lambda text: GenericEnv(gym.spaces.Box(-6, 5, (2, 3), np.int8)),
         lambda text: GenericEnv(gym.spaces.Box(-5, 5, (), np.float32)),
     ],
-    ids=["CartPole", "Pendulum", "InvertedPendulum", "int8", "scalar"],
+    ids=["registered", "InvertedPendulum", "int8", "scalar"],
 )
 def test_check_env(text, env):
     for rate in (1.0, 0.3, "1.0:0.0"):
         check_env(build(text, env(text), rate), skip_render_check=True)
 
 
-UNSUITABLE_SPACES = [
-    gym.spaces.Dict(x=BOX),
-    gym.spaces.Tuple((BOX, BOX)),
-    gym.spaces.MultiBinary(3),
-]
-
-
-@pytest.mark.parametrize("space", UNSUITABLE_SPACES, ids=lambda space: type(space).__name__)
-@pytest.mark.parametrize("text", NOISES)
-def test_spaces_other_than_box(text, space):
-    env = GenericEnv(space)
-    if not text.split("(")[0].endswith("Observation"):
-        build(text, env, 0.1)
-        return
-    with pytest.raises(ValueError, match="FlattenObservation") as error:
-        build(text, env, 0.1)
-    assert type(space).__name__ in str(error.value) and "\n" not in str(error.value)
-    build(text, FlattenObservation(env), 0.1)
-
-
-CATEGORIES = [
+WITHOUT_NUMBERS = [
     gym.spaces.Discrete(3),
-    gym.spaces.MultiDiscrete([2, 3]),
-    gym.spaces.Dict(x=BOX, kind=gym.spaces.Discrete(3)),
-    gym.spaces.Tuple((BOX, gym.spaces.Dict(kind=gym.spaces.MultiDiscrete([2, 3])))),
+    gym.spaces.MultiBinary(3),
+    gym.spaces.Tuple((gym.spaces.Dict(kind=gym.spaces.MultiDiscrete([2, 3])),)),
+    gym.spaces.Box(0, 1, (3,), np.bool_),
+    gym.spaces.Sequence(BOX),
 ]
 
 
-@pytest.mark.parametrize("space", CATEGORIES, ids=lambda space: type(space).__name__)
+@pytest.mark.parametrize("space", WITHOUT_NUMBERS, ids=lambda space: type(space).__name__)
 @pytest.mark.parametrize("text", NOISES)
-def test_categories_are_not_perturbed_as_if_they_were_quantities(text, space):
+def test_observations_without_numbers(text, space):
     env = GenericEnv(space, reset=lambda env: (space.sample(), {}))
-    flat = RandomNormalNoisyReward(gym.wrappers.TimeLimit(FlattenObservation(env), 9), 0.1, 1)
     if not text.split("(")[0].endswith("Observation"):
-        build(text, flat, 1.0).reset(seed=0)
+        build(text, env, 1.0).reset(seed=0)
         return
-    for unsuitable in (env, flat):
-        with pytest.raises(ValueError, match="cannot perturb categories.*reward noise") as error:
-            build(text, unsuitable, 0.1)
-        assert "\n" not in str(error.value)
+    of_numbers = isinstance(space, gym.spaces.Box | gym.spaces.Sequence)
+    reason = "floats or integers" if of_numbers else "cannot perturb categories.*reward noise"
+    with pytest.raises(ValueError, match=reason) as error:
+        build(text, env, 0.1)
+    assert "\n" not in str(error.value)
+
+
+def test_flattened_categories_are_not_perturbed_as_if_they_were_quantities():
+    env = GenericEnv(gym.spaces.Dict(x=BOX, kind=gym.spaces.Discrete(3)))
+    flat = RandomNormalNoisyReward(gym.wrappers.TimeLimit(FlattenObservation(env), 9), 0.1, 1)
+    with pytest.raises(ValueError, match="apply it before gymnasium.wrappers.FlattenObservation"):
+        RandomDropoutObservation(flat, 0.1, 0.5)

@@ -6,6 +6,7 @@ import pytest
 from cases import (
     NOISES,
     STEP_NOISES,
+    WIDE,
     GenericEnv,
     build,
     constant_env,
@@ -102,7 +103,7 @@ def test_global_generator_is_untouched(text):
 @pytest.mark.parametrize("text", STEP_NOISES)
 def test_a_lower_rate_perturbs_a_subset_of_the_steps(text):
     def perturbed(rate):
-        env = build(text, constant_env(), rate)
+        env = build(text, GenericEnv(WIDE), rate)
         steps = [env.reset(seed=4)[1]] + [env.step(0)[4] for _ in range(500)]
         return {t for t, info in enumerate(steps) if "noise" in info}
 
@@ -143,7 +144,7 @@ class Constant:
 def test_the_gate_at_the_ends_of_the_unit_interval(text):
     """Rate 0 never acts and rate 1 always, also on the smallest and the largest uniform."""
     for rate, uniform in [(0, 0.0), (1, np.nextafter(1.0, 0.0))]:
-        env = build(text, constant_env(), rate)
+        env = build(text, GenericEnv(WIDE), rate)
         env.reset(seed=0)
         env._gate = Constant(uniform)
         assert ("noise" in env.step(0)[4]) == (rate == 1)

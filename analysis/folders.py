@@ -1,0 +1,232 @@
+"""A run's folder, lock and log, read without trust: which folders are runs, and what is damaged.
+
+Nothing here waits for pandas, so a sweep of 9,100 runs is listed in a moment.
+"""
+
+import fcntl
+import json
+import math
+import os
+import re
+import shlex
+import struct
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+from noisy_wrappers import MAY_DIFFER_IN_A_TABLE, Configuration
+
+ALGORITHMS = ("SAC", "TD3", "PPO")
+SEARCH, CONFIRMATION = PHASES = ("search", "confirmation")  # the folders of a choice
+# Arguments that have columns of their own, or may differ; the steps of tests are intersected.
+NOT_SETTINGS = {"env_id", "exp_name", "seed", "noise", "noise_rate"} | MAY_DIFFER_IN_A_TABLE
+ENV_ID = re.compile(r"(?:\w+(?:\.\w+)*:)?[\w./-]+")  # a module, and what Gymnasium takes for an id
+STOPPED = (129, 130, 138, 143)  # exit statuses of a run that was told to stop, by signal
+END = re.compile(r"# .* exit=(\d+)")  # the last line of run_one in sweep/executors.sh
+PROGRESS = re.compile(r"step=(\d+)/\d+ sps=(\d+)")  # the line of _show_progress in the scripts
+
+
+class DamageError(ValueError):
+    """A file of a run cannot be used; the text begins with its name."""
+
+
+def is_run(folder):
+    """Tell run folders from others: from those of logs, and from what other programs left."""
+    if os.path.isfile(folder / "eval.csv") or os.path.isfile(folder / ".lock"):
+        return True
+    try:
+        return '"args"' in (folder / "config.json").read_text("utf-8", "replace")
+    except OSError:
+        return False
+
+
+def has_begun(folder):
+    """Tell whether a run has written more than its lock."""
+    return any((folder / name).exists() for name in ("config.json", "eval.csv"))
+
+
+def runs_of(runs_dir):
+    """Return the run folders of a folder of runs, those of a choice's two phases included."""
+    folders = [runs_dir, *(runs_dir / phase for phase in PHASES)]
+    children = [child for folder in folders if folder.is_dir() for child in folder.iterdir()]
+    return sorted(filter(is_run, children))
+
+
+def flat_choice(runs_dir):
+    """Say how to sort the runs of a choice that an earlier version left side by side."""
+    patterns = ["*_s1[0-9][0-9][0-9]_*", "*__1[0-9][0-9][0-9]"]  # its fresh seeds; older names
+    fresh = [pattern for pattern in patterns if any(runs_dir.glob(pattern))]
+    steps = [f"cd {shlex.quote(str(runs_dir))}", f"mkdir {SEARCH} {CONFIRMATION}"]
+    steps += [f"mv {' '.join(fresh)} {CONFIRMATION}/"] if fresh else []
+    steps += [f"mv *__*__* {SEARCH}/"]
+    return (
+        f"{runs_dir} holds the runs of a choice side by side, as earlier versions left them. They "
+        f"have two folders now: {' && '.join(steps)}"
+    )
+
+
+# ------------------------------------------------------------------------------------- the contents
+
+
+def read_json(path):
+    """Read an object from a file. Raises DamageError."""
+
+    def refuse(constant):
+        raise ValueError(f"{constant} is no number of JSON")
+
+    try:
+        value = json.loads(path.read_text("utf-8"), parse_constant=refuse)
+    except (OSError, ValueError, RecursionError) as error:
+        reason = error.strerror if isinstance(error, OSError) else " ".join(str(error).split())
+        raise DamageError(f"{path.name}: {reason}") from None
+    if not isinstance(value, dict):
+        raise DamageError(f"{path.name} is no JSON object")
+    return value
+
+
+def read_config(folder):
+    """Read config.json: what identifies a run. Raises DamageError.
+
+    The result has the arguments under "args"; "algorithm", "environment", "configuration" (a
+    Configuration), "exp_name", "seed", "episodes" (of a test), "total" (steps), "settings" (the
+    arguments that a study shares) and "versions".
+    """
+    config = read_json(folder / "config.json")
+    args, versions = config.get("args"), config.get("versions", {})
+
+    def check(name, value, is_good):
+        if not is_good:
+            raise DamageError(f"config.json: {name} is {shortened(value)}")
+        return value
+
+    check("args", args, isinstance(args, dict))
+    check("versions", versions, isinstance(versions, dict))
+    for name, value in args.items():
+        check(name, value, not any(map(is_nested, value if isinstance(value, list) else [value])))
+
+    def number(name, least):
+        value = args.get(name)
+        return check(name, value, type(value) is int and value >= least)
+
+    def text(name, is_good):
+        value = args.get(name)
+        return check(name, value, isinstance(value, str) and is_good(value))
+
+    algorithm = config.get("algorithm")
+    check("algorithm", algorithm, algorithm in ALGORITHMS)
+    if args.get("max_episode_steps") is not None:
+        number("max_episode_steps", 1)
+    noises, rates = args.get("noise"), args.get("noise_rate")
+    try:
+        configuration = Configuration.read(noises, rates, stored=True)
+    except (ValueError, TypeError, KeyError) as error:
+        reason = str(error).partition("\n")[0]
+        named = f"noise {shortened(noises)} at {shortened(rates)}"
+        raise DamageError(f"config.json: {named}: {reason}") from None
+    commit = str(config.get("git_commit"))  # 40 digits, perhaps with "-dirty"
+    return {
+        "algorithm": algorithm,
+        "environment": text("env_id", ENV_ID.fullmatch),
+        "exp_name": text("exp_name", str.isprintable),
+        "configuration": configuration,
+        "seed": number("seed", 0),
+        "episodes": number("eval_episodes", 1),
+        "total": number("total_timesteps", 1),
+        "args": args,
+        "settings": {name: args[name] for name in args if name not in NOT_SETTINGS},
+        "versions": {
+            **versions,
+            "matmul precision": config.get("matmul_precision"),
+            "git commit": commit[:10] + commit[40:],
+        },
+    }
+
+
+def read_result(folder, config):
+    """Read result.json of a finished run, or return None where there is none.
+
+    config: from read_config. Raises DamageError.
+    """
+    if not (folder / "result.json").exists():
+        return None
+    result = read_json(folder / "result.json")
+    mean = result.get("final_return_mean")
+    if type(mean) not in (int, float) or not math.isfinite(mean):
+        raise DamageError(f"result.json: final_return_mean is {shortened(mean)}")
+    steps = result.get("total_timesteps", config["total"])
+    if steps != config["total"]:
+        said = f"total_timesteps is {shortened(steps)}, in config.json {config['total']}"
+        raise DamageError(f"result.json: {said}")
+    return result
+
+
+def is_nested(value):
+    """Tell whether a value is a list or an object, which no item of an argument is."""
+    return isinstance(value, list | dict)
+
+
+def shortened(value):
+    """Return a value of a damaged file as a part of a line."""
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def difference(settings, reference):
+    """Return the names of the settings that both have, with different values, in order."""
+    return [name for name in sorted(settings.keys() & reference.keys())
+            if settings[name] != reference[name]]  # fmt: skip
+
+
+# -------------------------------------------------------------------------------- the lock, the log
+
+
+def is_locked(folder):
+    """Tell whether a process holds a run's lock, as a script does from its start to its end.
+
+    F_GETLK only asks. To take the lock, even for a moment, would end a run that starts just then.
+    """
+    layout, place = ("hhqqi", 0) if os.uname().sysname == "Linux" else ("qqihh", 3)
+    question = [0] * 5
+    question[place] = fcntl.F_RDLCK
+    try:
+        descriptor = os.open(folder / ".lock", os.O_RDONLY | os.O_NONBLOCK)
+        try:
+            answer = fcntl.fcntl(descriptor, fcntl.F_GETLK, struct.pack(layout, *question))
+        finally:
+            os.close(descriptor)
+    except OSError:  # there is none, or the file system has no locks
+        return False
+    return struct.unpack(layout, answer)[place] != fcntl.F_UNLCK
+
+
+class Log(NamedTuple):
+    """What the end of a run's log says."""
+
+    path: Path
+    age: float  # seconds since the last line, infinite where there is no log
+    step: int
+    steps_per_second: int
+    exit_status: int | None  # None while the run is not over, or where there is no log
+    last_line: str  # of what the run itself wrote
+
+
+def read_log(folder):
+    """Read the end of the log that a sweep keeps of a run."""
+    path = folder.parent / "logs" / f"{folder.name}.log"
+    if not path.is_file():
+        return Log(path, math.inf, 0, 0, None, "")
+    with open(path, "rb") as file:
+        status = os.fstat(file.fileno())
+        file.seek(max(0, status.st_size - 8192))
+        lines = file.read().decode(errors="replace").splitlines()
+    step, steps_per_second, exit_status, last_line = 0, 0, None, ""
+    for line in lines:
+        end, progress = END.fullmatch(line), PROGRESS.match(line)
+        exit_status = int(end[1]) if end else None
+        if progress:
+            step, steps_per_second = int(progress[1]), int(progress[2])
+        # "(" begins the notes that the scripts leave below a traceback
+        if not line.startswith(("# ", "(")) and re.search(r"\w", line):
+            last_line = line.strip()
+    age = time.time() - status.st_mtime
+    return Log(path, age, step, steps_per_second, exit_status, last_line)

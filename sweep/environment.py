@@ -1,0 +1,275 @@
+"""What an environment allows, and what its steps cost: asked before a sweep is planned.
+
+`ask` makes an environment, tries noises on it and times it. `run_seconds` says from that what a run
+takes until finished runs tell. `remember` keeps the answer, because `status` makes no environment.
+"""
+
+import contextlib
+import functools
+import json
+import math
+import re
+import sys
+import time
+import traceback
+import warnings
+from pathlib import Path
+from statistics import fmean
+from typing import NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+import noisy_wrappers as noisy
+from analysis.errors import fail
+from analysis.folders import read_json
+from sweep.grid import PROJECT, script_of, script_options
+
+# Seconds of learning for each step, without the environment's own, and what each number of an
+# observation adds to them: docs/sweeps.md says on which machine
+LEARNING = {"sac": (6.8e-3, 22e-6), "td3": (5.1e-3, 13e-6), "ppo": (0.103e-3, 0.2e-6)}
+START_UP = 10  # seconds, with compilation
+STEPS, SECONDS = 200, 1  # an environment is timed for at least so many steps, and so long
+PATIENCE = 30  # seconds until it is timed by fewer steps
+
+
+class Environment(NamedTuple):
+    """What is known of an environment."""
+
+    step_seconds: float  # of a step with random actions and its share of a reset
+    timed_steps: int
+    episode_steps: int  # of a test: the time limit; without one, what the timed episodes had
+    observed: int  # numbers in an observation
+    bounded: bool  # are its actions? SAC and TD3 need that
+    unfit: dict[str, str]  # noises that cannot act here, as Configuration.noise -> why
+
+
+class Refused(Exception):
+    """The environment cannot be trained in; the message says why, in one line."""
+
+
+# ------------------------------------------------------------------------------------- the question
+
+
+def ask(env_id, configurations=(), max_episode_steps=None, clock=time.perf_counter):
+    """Make an environment as the scripts do, time it, and try configurations of noise on it.
+
+    clock: what times the environment. Raises Refused if it cannot be made or played.
+    """
+    deadline = time.perf_counter() + PATIENCE
+    try:
+        with contextlib.redirect_stdout(sys.stderr), contextlib.ExitStack() as stack:
+            env = gym.make(env_id, disable_env_checker=True, max_episode_steps=max_episode_steps)
+            stack.callback(env.close)
+            declared = env.spec.max_episode_steps
+            env = noisy.make_flat(env, constant("sac_continuous_noisy.py", "STEP_LIMIT"))
+            limit = env.spec.max_episode_steps
+            seconds, steps, length = time_steps(env, limit, deadline, clock)
+            env.reset()  # a failure after this one is the noise's
+            reasons = {noise: why_unfit(env, noise, limit, deadline) for noise in configurations}
+            return Environment(
+                step_seconds=seconds,
+                timed_steps=steps,
+                episode_steps=declared or length,
+                observed=math.prod(env.observation_space.shape),
+                bounded=bool(np.isfinite([env.action_space.low, env.action_space.high]).all()),
+                unfit={noise.noise: reason for noise, reason in reasons.items() if reason},
+            )
+    except Exception as error:
+        raise Refused(in_a_line(error, env_id)) from error
+
+
+def time_steps(env, time_limit, deadline, clock):
+    """Return an environment's seconds a step, the steps timed, and the length of an episode.
+
+    Each step bears its share of a reset: an episode is as long as those that ended while it was
+    timed, or as the time limit if none did.
+    """
+    env.action_space.seed(1)
+    env.reset(seed=1)
+    env.step(env.action_space.sample())  # not timed: the first calls may load or compile something
+    begin = now = time.perf_counter()
+    steps = resets = episodes = in_episodes = 0
+    stepping = resetting = 0.0
+    ended = True
+    while not steps or now < deadline and (steps < STEPS or now < begin + SECONDS):
+        if ended:
+            start = clock()
+            env.reset()
+            resets, resetting = resets + 1, resetting + clock() - start
+        action = env.action_space.sample()
+        start = clock()
+        _, _, terminated, truncated, _ = env.step(action)
+        steps, stepping = steps + 1, stepping + clock() - start
+        ended = terminated or truncated
+        if ended:
+            episodes, in_episodes = episodes + 1, steps
+        now = time.perf_counter()
+    length = in_episodes / episodes if episodes else time_limit
+    return stepping / steps + resetting / resets / length, steps, math.ceil(length)
+
+
+def why_unfit(env, configuration, time_limit, deadline):
+    """Return why noises cannot act in an environment, or ""; after the deadline none is played."""
+    try:
+        with warnings.catch_warnings(action="ignore"):  # of what is said below
+            noisy_env = configuration.wrap(env)
+    except ValueError as error:
+        return " ".join(str(error).split())
+    for wrapper in noisy.noise_wrappers(noisy_env).values():
+        if isinstance(wrapper, noisy.RandomEarlyTermination) and (wrapper.low or 0) > time_limit:
+            return f"an episode has at most {time_limit} steps"
+    try:
+        if time.perf_counter() < deadline:
+            noisy_env.reset()
+            for _ in range(3):
+                _, _, terminated, truncated, _ = noisy_env.step(env.action_space.sample())
+                if terminated or truncated:
+                    break
+    except Exception as error:  # the environment's own, where noise has led it
+        return in_a_line(error)
+    return ""
+
+
+def in_a_line(error, env_id=""):
+    """Say what an error says; if it is not Gymnasium's or ours, also where it was raised."""
+    reason = " ".join(str(error).split())
+    if isinstance(error, (*noisy.refusals(env_id), noisy.NotFiniteError)):
+        return reason
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if "site-packages" not in frame.filename]
+    ours = Path(own[-1].filename).name in ("environment.py", "noisy_wrappers.py")
+    last = frames[-1] if ours else own[-1]
+    return f"{type(error).__name__}: {reason} ({last.filename}, line {last.lineno})"
+
+
+def ask_all(args, configurations):
+    """Ask environments, and say how fast they are; returns {env_id: Environment}.
+
+    configurations: {env_id: [Configuration]}. Exits with a line for each environment that cannot
+    be trained in, and for each algorithm that cannot act there.
+    """
+    options = script_options(script_of(args.algos[0]), tuple(args.extra))
+    answers, reasons = {}, []
+    for env_id, noises in configurations.items():
+        try:
+            answer = ask(env_id, noises, options["max-episode-steps"])
+        except Refused as error:  # others may be wrong, too
+            reasons.append(f"no algorithm can be trained in {env_id}: {error}")
+            continue
+        print(speed_of(env_id, answer), file=sys.stderr, flush=True)
+        answers[env_id] = answer
+        for algorithm in args.algos:
+            if algorithm != "ppo" and not answer.bounded:
+                name = algorithm.upper()
+                reasons.append(f"{name} needs bounded actions; some actions of {env_id} are not")
+    if reasons:
+        fail("\nerror: ".join(reasons))
+    return answers
+
+
+# ------------------------------------------------------------------------------------ what it costs
+
+
+def run_seconds(run, environment):
+    """Return about how many seconds a run takes: learning, the environment's steps, tests."""
+    learned = max(0, run.total_timesteps - run.options.get("learning-starts", 0))
+    test_steps = number_of_tests(run) * run.options["eval-episodes"] * environment.episode_steps
+    playing = (run.total_timesteps + test_steps) * environment.step_seconds
+    return START_UP + learned * learning_seconds(run.kind[0], environment) + playing
+
+
+def learning_seconds(algorithm, environment):
+    """Return about how many seconds an algorithm learns for each step of an environment."""
+    base, for_each = LEARNING[algorithm]
+    return base + for_each * environment.observed
+
+
+def number_of_tests(run):
+    """Return how often a run tests its policy."""
+    frequency = run.options["eval-frequency"]
+    if frequency is None:
+        most = constant(run.script, "EVAL_FREQUENCY")
+        frequency = max(1, min(most, run.total_timesteps // 10))
+    return math.ceil(run.total_timesteps / frequency) if frequency else 1
+
+
+@functools.cache
+def constant(script, name):
+    """Return a whole number that a script defines, from its text: importing it takes seconds."""
+    text = (PROJECT / script).read_text()
+    return int(re.search(rf"^{name} = ([\d_]+)", text, re.MULTILINE)[1])
+
+
+def cost(args, done, todo):
+    """Say what the runs to do will take: as long as finished ones of their kind, if there are any.
+
+    The others are estimated, and their environments asked for that.
+    """
+    seconds = {}
+    for run in done:
+        if wall_time(run):
+            seconds.setdefault(run.kind, []).append(wall_time(run))
+    seconds = {kind: fmean(values) for kind, values in seconds.items()}
+    new = {run.kind: run for run in todo if run.kind not in seconds}
+    answers = ask_all(args, {env_id: [] for _, env_id in new})
+    for (algorithm, env_id), run in new.items():
+        seconds[algorithm, env_id] = run_seconds(run, answers[env_id])
+    return time_left([[seconds[run.kind] for run in todo]], args.jobs, args.elsewhere and new)
+
+
+def wall_time(run):
+    """Return how many seconds a finished run has taken, or None where it does not say."""
+    seconds = read_json(run.folder / "result.json").get("wall_time_seconds")
+    return seconds if isinstance(seconds, int | float) and seconds > 0 else None
+
+
+def hours_of(seconds):
+    """Spell a time in hours: 1,330 or 4.9 or 0.076."""
+    hours = seconds / 3600
+    return f"{hours:,.0f}" if hours >= 100 else f"{hours:.1f}" if hours >= 0.1 else f"{hours:.2g}"
+
+
+def time_left(batches, jobs, elsewhere=False):
+    """Say what batches of runs take, one batch after the other.
+
+    batches: the seconds of each run, batch by batch. jobs: runs at a time, None if unknown.
+    """
+    text = f"about {hours_of(sum(map(sum, batches)))} core-hours are left"
+    if jobs:
+        clock = sum(max(sum(batch) / jobs, max(batch)) for batch in batches if batch)
+        runs = "1 run" if jobs == 1 else f"{jobs} runs"
+        text += f", {hours_of(clock)} hours on the clock with {runs} at a time"
+    if elsewhere:
+        text += "; timed on this machine, others may be faster or slower"
+    return text
+
+
+def speed_of(env_id, environment):
+    """Say how fast an environment is."""
+    text = f"{env_id}: {float(f'{1000 * environment.step_seconds:.2g}'):g} ms a step"
+    if environment.timed_steps < STEPS:
+        text += f" (only {environment.timed_steps} steps were timed: it is slow)"
+    return text
+
+
+# --------------------------------------------------------------------------------------- the memory
+
+
+def remember(runs_dir, env_id, environment):
+    """Keep what was found, for a status."""
+    path = file_of(runs_dir, env_id)
+    with contextlib.suppress(OSError):  # benchmark.sh will say so
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(environment))
+
+
+def remembered(runs_dir, env_id):
+    """Return what was found when an environment was asked last, or None."""
+    with contextlib.suppress(OSError, ValueError, TypeError):  # there is no file, or half of one
+        return Environment(*json.loads(file_of(runs_dir, env_id).read_text()))
+
+
+def file_of(runs_dir, env_id):
+    """Return the file of an environment, beside the logs of its runs."""
+    return Path(runs_dir, "logs", re.sub(r"[^\w.-]", "--", env_id) + ".json")

@@ -1,0 +1,61 @@
+"""What people see: terminals and files of any kind, whatever a folder of runs says."""
+
+import io
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+from test_analyze import SCALE, run, write_run
+
+import analyze
+from analysis.errors import Terminal
+
+NAME = "naïve |<b>$x$ \u00b1"  # of an experiment
+
+
+def test_no_control_character_reaches_the_terminal():
+    buffer = io.BytesIO()
+    terminal = Terminal(io.TextIOWrapper(buffer, "latin-1", newline=""))
+    print("\x1b[31mré\x9bd\x07\x7f\0 \ud800\u2713\tb\r\n", end="", file=terminal, flush=True)
+    assert buffer.getvalue().decode("latin-1") == "?[31mré?d??? ??\tb\r\n"
+
+
+def test_a_reader_that_leaves_stops_nothing():
+    reader, writer = os.pipe()
+    with open(writer, "w") as stream:
+        terminal = Terminal(stream)
+        print("first", file=terminal, flush=True)
+        os.close(reader)
+        for _ in range(10_000):
+            print("more than a pipe holds", file=terminal)
+        terminal.flush()
+
+
+def test_names_are_escaped_in_markdown(tmp_path):
+    write_run(tmp_path / "runs", [1.0, 2.0], exp_name=NAME)
+    run(tmp_path)
+    table = (tmp_path / "results/summary_SAC.md").read_text("utf-8")
+    [row] = [line for line in table.splitlines() if "Hopper-v5" in line]
+    assert r"naïve \|&lt;b>$x$ ±" in row
+    header = next(line for line in table.splitlines() if line.startswith("| algorithm"))
+    assert len(re.findall(r"(?<!\\)\|", row)) == header.count("|")
+
+
+@pytest.mark.slow
+def test_files_are_utf_8_whatever_the_locale(tmp_path):
+    """And the terminal gets a replacement for what it cannot show."""
+    for seed in (1, 2, 3):
+        for noise in ({}, {"noise": SCALE, "rate": 0.1}):
+            write_run(tmp_path / "runs", [1.0, 2.0 + seed], seed=seed, exp_name=NAME, **noise)
+    locale = {"LC_ALL": "POSIX", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    command = [sys.executable, analyze.__file__, "--runs-dir", tmp_path / "runs", "--latex"]
+    done = subprocess.run(command, capture_output=True, env=os.environ | locale)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert b"na?ve" in done.stdout and b" ? " in done.stdout
+    texts = {path.suffix: path.read_text("utf-8") for path in tmp_path.rglob("*.[cmth][sdet]*")}
+    assert texts.keys() == {".csv", ".md", ".tex", ".html"}
+    assert "naïve" in (tmp_path / "runs/results/summary_SAC.csv").read_text("utf-8")
+    pdf = next(tmp_path.rglob("*.pdf"))
+    assert b"/FontFile2" in pdf.read_bytes() and b"/Type3" not in pdf.read_bytes()

@@ -1,0 +1,107 @@
+"""Success beside the return, and what is said where nothing was learned."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+import tyro
+from test_analyze import SCALE, row, run, write_run
+
+import analysis.runs
+import analyze
+import evaluate
+import ppo_continuous_noisy as ppo
+
+ENV = "FetchReach-v4"
+
+
+def write_success(root, rates, env=ENV, **config):
+    """Write runs with these final rates of success, one for each seed; their returns are equal."""
+    for seed, rate in enumerate(rates, start=1):
+        folder = write_run(root, [-50.0, -50.0], env=env, seed=seed, **config)
+        path = folder / "eval.csv"
+        lines = path.read_text().splitlines()
+        for i, line in enumerate(lines[1:], start=1):  # two tests of two episodes
+            lines[i] = f"{line},{int(i > 2 and 2 * rate >= i - 2)}"
+        path.write_text("\n".join([f"{lines[0]},success", *lines[1:]]) + "\n")
+
+
+@pytest.fixture
+def runs_dir(tmp_path):
+    """Five runs that solve half of their episodes, and five with noise that solve more."""
+    write_success(tmp_path / "runs", [0.5, 0.5, 0.5, 0.5, 0.5])
+    write_success(tmp_path / "runs", [0.5, 1, 1, 1, 1], noise=SCALE, rate=1.0)
+    return tmp_path / "runs"
+
+
+def test_rates_are_read_in_percent(runs_dir):
+    runs = analysis.runs.read_runs(runs_dir)
+    assert set(runs["status"]) == {"finished"}
+    [study], _ = analysis.runs.make_studies(runs, "success rate")
+    noisy = max(study.returns)
+    assert study.final(noisy)[:, 0].tolist() == [50, 100, 100, 100, 100]
+    assert study.returns[noisy][0, :, 0].tolist() == [0, 0, 0, 0, 0]
+
+
+def test_the_verdict_is_in_percentage_points(runs_dir, capsys):
+    out = runs_dir / "out"
+    analyze.main(analyze.Args(runs_dir, out, metric="success_rate"))
+    said = capsys.readouterr().out
+    found = f"{ENV} with {SCALE} at rate 1.00 is better than no noise: +40 [12, 68] percentage "
+    assert f"{found}points of success, p = 0.048" in said
+    assert not re.search(r"\(\+\d+ %\)", said)
+    for name in ("best.csv", "statistics.csv", "summary_SAC.csv"):
+        lines = (out / name).read_text().splitlines()
+        names = lines[0].split(",")
+        for line in lines[1:]:
+            cells = dict(zip(names, re.split(r",(?![^(]*\))", line), strict=True))
+            assert not any(cells[name] for name in names if name.endswith("_percent"))
+    report = (out / "report.html").read_text()
+    assert "Final test success rate of every configuration" in report
+    assert "sum of rewards" not in report
+
+
+def test_success_is_beside_the_return(runs_dir, capsys):
+    tables = run(runs_dir.parent)
+    found = row(tables["success"], noise=SCALE)
+    assert found[["mean", "baseline_mean", "difference", "n"]].tolist() == [90, 50, 40, 5]
+    assert found["p"] == pytest.approx(12 / 252)  # all four of 100 % on one side
+
+
+def test_returns_that_are_all_equal_say_nothing(tmp_path, capsys):
+    for noise in ({}, {"noise": SCALE, "rate": 1.0}):
+        for seed in range(1, 6):
+            write_run(tmp_path / "runs", [-50.0] * 2, env=ENV, seed=seed, spread=0.0, **noise)
+    tables = run(tmp_path)
+    said = capsys.readouterr().out
+    told = "all runs return -50.00: nothing was learned in 20,000 steps, so they say nothing about "
+    assert told in said and "success" not in tables
+    judged = row(tables["statistics"], noise=SCALE)
+    assert judged["verdict"] == "nothing learned" and np.isnan(judged["p"])
+    assert "no clear difference" not in said and "+0.0 %" not in said
+    with pytest.raises(SystemExit):
+        analyze.main(analyze.Args(tmp_path / "runs", metric="success_rate"))
+    assert "no environment here tells it" in capsys.readouterr().err
+
+
+def test_evaluate_stores_success(tmp_path, capsys):
+    words = ["--env-id", "toy_envs:IsSuccess-v0", "--runs-dir", str(tmp_path), "--no-compile"]
+    words += ["--total-timesteps", "24", "--num-steps", "12", "--num-minibatches", "3"]
+    assert ppo.train(tyro.cli(ppo.Args, args=words))
+    [run_dir] = tmp_path.iterdir()
+    args = evaluate.Args((run_dir,), episodes=6)
+    evaluate.main(args)
+    header, *lines = (run_dir / "robustness.csv").read_text().splitlines()
+    assert header == "noise,noise_rate,episode,episodic_return,episodic_length,success"
+    solved = [int(line.rpartition(",")[2]) for line in lines]
+    env, expected = ppo.make_env("toy_envs:IsSuccess-v0"), []
+    for episode in range(6):
+        env.reset(seed=2_000_000 + episode)
+        expected.append(int(env.unwrapped.solved))
+    assert solved == expected and 0 < sum(solved) < 6
+    assert f", {100 * sum(solved) / 6:.0f} % solved" in capsys.readouterr().out
+    before = (run_dir / "robustness.csv").read_bytes()
+    evaluate.main(args)
+    assert (run_dir / "robustness.csv").read_bytes() == before
+    assert json.loads((run_dir / "result.json").read_text())["final_success_rate"] >= 0

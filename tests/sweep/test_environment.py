@@ -1,0 +1,259 @@
+"""What a plan asks the environment: who can be trained in it, with which noise, and how fast."""
+
+import contextlib
+import json
+import re
+
+import pytest
+import toy_envs
+from views import view
+
+from noisy_wrappers import BASELINE, Configuration
+from sweep import environment
+from sweep.environment import Environment, ask, remember, remembered, run_seconds, time_left
+from sweep.grid import make_run
+from sweep.options import parse_args
+
+SCALE = "RandomUniformScaleObservation(0.8, 1.2)"
+LATE = "RandomEarlyTermination(50)"
+KNOWN = Environment(0.001, 200, 100, 3, True, {})
+
+
+def choose(env, *words, view_name="dry-run", algos=("ppo",)):
+    return view(view_name, "choose", "--algos", *algos, "--envs", f"toy_envs:{env}-v0", *words)
+
+
+def planned(algorithm, env_id, *words):
+    """Return the baseline of a grid with these options."""
+    args = parse_args("list", "/", ["custom", *words])
+    return make_run(args, algorithm, env_id, BASELINE, 1)
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch, tmp_path):
+    """Time environments for a moment, and keep answers away from the project."""
+    monkeypatch.setattr(environment, "SECONDS", 0.01)
+    monkeypatch.setenv("SWEEP_JOBS", "2")
+    monkeypatch.chdir(tmp_path)
+
+
+# THE QUESTION
+
+
+def test_an_environment_that_sleeps():
+    found = ask("toy_envs:Slow-v0")
+    assert 0.005 < found.step_seconds < 1 and found.timed_steps == 200  # the machine may be busy
+    assert (found.episode_steps, found.observed, found.bounded) == (100, 1, True)
+    assert ask("toy_envs:Slow-v0", max_episode_steps=7).episode_steps == 7
+
+
+def test_an_environment_that_is_too_slow_is_timed_by_fewer_steps(monkeypatch, tmp_path):
+    monkeypatch.setattr(environment, "PATIENCE", 0.1)
+    shown = choose("Slow", "--runs-dir", tmp_path)
+    line = re.search(r"toy_envs:Slow-v0: [\d.]+ ms a step \(only (\d+) steps were timed", shown.err)
+    assert shown.code == 0 and 1 <= int(line[1]) <= 20
+    monkeypatch.setattr(environment, "PATIENCE", -1)  # one that takes half a minute to be made
+    assert ask("toy_envs:Slow-v0", [Configuration.read([SCALE], [1.0])]).timed_steps == 1
+
+
+@pytest.mark.parametrize("env", ["Count", "OneReset"])
+def test_an_environment_is_closed(env, monkeypatch):
+    closed = []
+    monkeypatch.setattr(toy_envs.Count, "close", lambda self: closed.append(env))
+    with contextlib.suppress(environment.Refused):
+        ask(f"toy_envs:{env}-v0")
+    assert closed
+
+
+def test_resets_count_in_proportion(monkeypatch):
+    class Clock:
+        """An environment and its action space, and the time that they take."""
+
+        now = 0.0
+
+        def reset(self, seed=None):
+            self.now += 6.0
+
+        def step(self, action):
+            self.steps += 1
+            self.now += 0.5
+            return None, 0, self.steps % 12 == 0, False, {}
+
+    clock = Clock()
+    clock.steps, clock.action_space = -1, clock  # the first step is not timed
+    clock.seed = clock.sample = lambda *_: None
+    monkeypatch.setattr(environment, "SECONDS", 0)
+    seconds, steps, length = environment.time_steps(clock, 1000, 1e9, lambda: clock.now)
+    assert (steps, length) == (200, 12)
+    assert seconds == pytest.approx(0.5 + 6 / 12)
+
+
+def test_without_a_time_limit_a_test_is_as_long_as_an_episode():
+    assert ask("toy_envs:NoLimit-v0").episode_steps == 20
+    assert ask("toy_envs:Endless-v0").episode_steps == 10_000
+
+
+@pytest.mark.parametrize(
+    ("env", "algos", "message"),
+    [
+        ("DiscreteAction", ["ppo"], "DiscreteAction-v0: needs Box actions of floats in one dim"),
+        ("SequenceObservation", ["ppo"], "SequenceObservation-v0: needs Box observations of"),
+        ("Unbounded", ["ppo", "sac"], "SAC needs bounded actions; some actions of toy_envs:Unb"),
+        ("BuggyConstructor", ["ppo"], "BuggyConstructor-v0: KeyError: 'missing' ("),
+        ("BuggyStep", ["ppo"], "/tests/toy_envs.py, line "),
+        ("OneReset", ["ppo"], "OneReset-v0: RuntimeError: the window is open already ("),
+        ("NanReward", ["ppo"], "NanReward-v0: "),
+    ],
+)
+def test_what_cannot_be_trained_is_refused_in_a_line(env, algos, message, tmp_path):
+    for view_name in ("dry-run", "list"):
+        shown = choose(env, "--runs-dir", tmp_path, view_name=view_name, algos=algos)
+        *_, line = shown.err.splitlines()
+        assert (shown.code, shown.out) == (2, "") and line.startswith("error: ")
+        assert message in line and shown.err.count("error: ") == 1
+        assert not list(tmp_path.iterdir())
+
+
+def test_everything_that_is_wrong_is_said_at_once():
+    envs = ["toy_envs:Unbounded-v0", "toy_envs:DiscreteAction-v0"]
+    for command in (["choose"], ["custom", "--seeds", "1"]):
+        shown = view("dry-run", *command, "--algos", "sac", "td3", "--envs", *envs)
+        assert shown.code == 2
+        assert [line[:18] for line in shown.err.splitlines()[1:]] == [
+            "error: SAC needs b",
+            "error: TD3 needs b",
+            "error: no algorith",
+        ]
+
+
+def test_noises_that_cannot_act_are_left_out_or_refused(tmp_path):
+    shown = choose("CategoryObservation", "--runs-dir", tmp_path)
+    assert shown.code == 0 and shown.out.count("\n") == 10  # rewards, actions, delays at two rates
+    [line] = [line for line in shown.err.splitlines() if "left out" in line]
+    assert line.startswith(
+        "toy_envs:CategoryObservation-v0: left out, because they cannot act there"
+    )
+    assert line.count("cannot perturb categories") == 1 and f"{SCALE}, " in line
+    assert f"; {LATE} (an episode has at most 8 steps)" in line
+    assert re.search(r"; RandomDynamics\(0\.7, 1\.3\) \([^()]*MuJoCo", line)
+    assert " of 10 noises" in shown.err
+    named = ["--noises", LATE, "RandomNormalNoisyReward(1.0)", "--noise-rates", "1"]
+    shown = choose("Tiny", *named, "--runs-dir", tmp_path)
+    assert (shown.code, shown.out) == (2, "")
+    assert shown.err.splitlines()[-1] == (
+        f"error: --noises: these cannot act in toy_envs:Tiny-v0: {LATE} (an episode has at most 8 "
+        "steps)"
+    )
+    assert choose("Tiny", *named, "--runs-dir", tmp_path, "--", "--max-episode-steps=50").code == 0
+    assert choose("Tiny", "--noises", "paper", "--runs-dir", tmp_path).out.count("\n") == 84
+
+
+def test_what_an_environment_prints_is_no_command(tmp_path):
+    shown = choose("Talks", "--runs-dir", tmp_path)
+    assert "reset!" in shown.err and "reset!" not in shown.out
+
+
+# WHAT IT COSTS
+
+
+def test_the_seconds_of_a_run():
+    # 5,000 steps without learning; 20 tests of 10 episodes with 100 steps of 1 ms
+    run = planned("sac", "toy_envs:Tiny-v0", "--total-timesteps", "200000")
+    learning = 195_000 * (6.8e-3 + 3 * 22e-6)
+    assert run_seconds(run, KNOWN) == pytest.approx(10 + learning + 200 + 20)
+    words = ["--total-timesteps", "100000", "--", "--eval-frequency", "0", "--eval-episodes", "3"]
+    run = planned("ppo", "toy_envs:Tiny-v0", *words)
+    learning = 100_000 * (0.103e-3 + 3 * 0.2e-6)
+    assert run_seconds(run, KNOWN) == pytest.approx(10 + learning + 100 + 0.3)
+
+
+def test_time_left():
+    batches = [[3600.0] * 5, [7200.0], []]
+    assert time_left(batches, 2) == (
+        "about 7.0 core-hours are left, 4.5 hours on the clock with 2 runs at a time"
+    )
+    assert time_left([[400.0]], None, elsewhere=True) == (
+        "about 0.1 core-hours are left; timed on this machine, others may be faster or slower"
+    )
+    assert time_left([[3600.0 * 1330]], 1).startswith("about 1,330 core-hours are left, 1,330 h")
+
+
+@pytest.mark.parametrize(
+    ("executor", "jobs", "hosts", "expected"),
+    [
+        ("local", "3", "", (3, False)),
+        ("parallel", "", "hostA,4/hostB", (None, True)),
+        ("parallel", "3", "hostA,4/hostB", (6, True)),
+        ("slurm", "", "", (None, True)),
+        ("slurm", "64", "", (64, True)),
+    ],
+)
+def test_runs_at_a_time(executor, jobs, hosts, expected, monkeypatch):
+    monkeypatch.setenv("SWEEP_EXECUTOR", executor)
+    monkeypatch.setenv("SWEEP_JOBS", jobs)
+    monkeypatch.setenv("SWEEP_HOSTS", hosts)
+    args = parse_args("list", "/", ["paper"])
+    assert (args.jobs, args.elsewhere) == expected
+
+
+def test_a_plan_says_what_it_will_decide(tmp_path):
+    shown = choose("Slow", "--runs-dir", tmp_path)
+    speed, left_out, question, first, total, reach, place = shown.err.splitlines()
+    assert "RandomDynamics" in left_out
+    milliseconds = float(re.fullmatch(r"toy_envs:Slow-v0: ([\d.]+) ms a step", speed)[1])
+    assert question.startswith("PPO on toy_envs:Slow-v0: is the best of 18 noises better than no ")
+    assert first.startswith("PPO on toy_envs:Slow-v0, round 1 of 5: 18 of 18 noises, seed 1")
+    hours = re.search(r"99 runs in all, .*, about ([\d,]+) core-hours are left, ([\d.,]+) h", total)
+    hours, clock = (float(text.replace(",", "")) for text in hours.groups())
+    # with 20 tests of ten episodes of 100 steps, and learning
+    assert hours == pytest.approx(99 * (1.02e6 * milliseconds / 1000 + 114) / 3600, rel=0.06)
+    assert clock == pytest.approx(hours / 2, rel=0.02)
+    assert reach.startswith("25 fresh seeds confirm a true gain of 0.8 standard deviations")
+    assert place == f"runs, logs and the verdict are stored in {tmp_path}"
+
+
+def test_any_dry_run_says_what_it_costs_and_finished_runs_tell_better(tmp_path):
+    grid = ["baseline", "--algos", "ppo", "--envs", "toy_envs:Slow-v0", "--seeds", "1-3"]
+    grid += ["--total-timesteps", "4000", "--runs-dir", tmp_path]
+    shown = view("dry-run", *grid)
+    assert shown.code == 0 and shown.out.count("\n") == 3
+    speed, line = shown.err.splitlines()
+    seconds = float(re.fullmatch(r"toy_envs:Slow-v0: ([\d.]+) ms a step", speed)[1]) / 1000
+    hours = re.match(r"3 runs, 3 to do; about ([\d.]+) core-hours are left, ", line)[1]
+    expected = 3 * (10 + 4000 * 0.103e-3 + (4000 + 10 * 10 * 100) * seconds) / 3600
+    assert float(hours) == pytest.approx(expected, rel=0.1, abs=0.05)
+    assert view("list", *grid).err == "3 runs, 3 to do\n"
+    folder = tmp_path / shown.out.split("\t")[0]
+    folder.mkdir()
+    result = {"final_return_mean": 1.0, "total_timesteps": 4000, "wall_time_seconds": 1800}
+    (folder / "result.json").write_text(json.dumps(result))
+    args = {"env_id": "toy_envs:Slow-v0", "exp_name": "x", "seed": 1, "noise": [], "noise_rate": []}
+    args |= {"eval_episodes": 10, "total_timesteps": 4000}
+    (folder / "config.json").write_text(json.dumps({"algorithm": "PPO", "args": args}))
+    assert view("dry-run", *grid).err == (
+        "3 runs, 2 to do; about 1.0 core-hours are left, 0.5 hours on the clock with 2 runs at a "
+        "time\n"
+    )
+
+
+# THE MEMORY
+
+
+def test_a_status_makes_no_environment(tmp_path, monkeypatch):
+    words = ["--runs-dir", tmp_path, "--noise-rates", "1"]
+    assert "of 10 noises" in choose("Tiny", *words, view_name="status").out
+    assert "of 8 noises" in choose("Tiny", *words).err and not list(tmp_path.iterdir())
+    assert choose("Tiny", *words, view_name="list").code == 0
+    monkeypatch.setattr(environment, "ask", None)
+    shown = choose("Tiny", *words, view_name="status").out
+    assert "8 of 8 noises" in shown and "core-hours are left" in shown
+
+
+def test_what_cannot_be_read_is_asked_again(tmp_path):
+    assert remembered(tmp_path, "m:A-v0") is None
+    remember(tmp_path, "m:A-v0", KNOWN)
+    assert remembered(tmp_path, "m:A-v0") == KNOWN
+    [path] = tmp_path.glob("logs/*")
+    for text in ("{", "[]", '{"step_seconds": 1}'):
+        path.write_text(text)
+        assert remembered(tmp_path, "m:A-v0") is None

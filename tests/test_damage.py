@@ -1,0 +1,183 @@
+"""Damaged and hostile folders of runs: each kind, fed to everything that reads folders of runs."""
+
+import json
+import re
+import shutil
+from contextlib import nullcontext
+from pathlib import Path
+from types import SimpleNamespace
+
+import gymnasium as gym
+import pytest
+import stub_run
+
+import analyze
+import evaluate
+from sweep import choose
+from sweep.__main__ import main as sweep
+from sweep.options import check_arguments, parse_args
+
+ROOT = Path(__file__).parents[1]
+CHOOSE = ["choose", "--algos", "ppo", "--envs", "Pendulum-v1", "Pusher-v5", "--noise-rates", "1"]
+CHOOSE += ["--noises", "RandomNormalNoisyReward(1)", "RandomDropoutObservation(0.9)", "--confirm"]
+CHOOSE += ["5", "--budget", "2", "--total-timesteps", "4000"]
+
+
+def config(**values):
+    """Return a change of config.json: of its arguments, or of what stands beside them."""
+
+    def damage(folder):
+        content = json.loads((folder / "config.json").read_text())
+        for name, value in values.items():
+            (content if name in content else content["args"])[name] = value
+        (folder / "config.json").write_text(json.dumps(content))
+
+    return damage
+
+
+def text(name, change):
+    """Return a change of a file's text."""
+
+    def damage(folder):
+        (folder / name).write_text(change((folder / name).read_text()))
+
+    return damage
+
+
+DAMAGE = {  # of config.json and result.json, and what is said of it
+    "args that are no object": (config(args=["--seed", 1]), r"args is ['--seed', 1]"),
+    "args with an object": (config(gamma={}), "gamma is {}"),
+    "a seed of 1.7": (config(seed=1.7), "seed is 1.7"),
+    "a seed that is true": (config(seed=True), "seed is True"),
+    "an infinite seed": (config(seed=float("inf")), "Infinity is no number of JSON"),
+    "deep nesting": (text("config.json", lambda _: "[" * 100_000), "recursion"),
+    "half of a file": (text("config.json", lambda text: text[:70]), "config.json: "),
+    "a time limit as text": (config(max_episode_steps="100"), "max_episode_steps is '100'"),
+    "a newline in an id": (config(env_id="Pendulum-v1\nerror: x"), r"env_id is 'Pendulum-v1\n"),
+    "a formula as an id": (config(env_id=r"$\frac$-v1"), "env_id is "),
+    "NUL in an id": (config(env_id="Pendulum\0-v1"), "env_id is "),
+    "a surrogate in an id": (config(env_id="\ud800-v1"), "env_id is "),
+    "an escape sequence": (config(exp_name="\x1b[31m"), r"exp_name is '\x1b[31m'"),
+    "an empty noise": (config(noise=[""], noise_rate=[1.0]), "noise ['']"),
+    "an unknown noise": (config(noise=["RandomX(1)"], noise_rate=[1.0]), "RandomX"),
+    "a rate of 5": (config(noise_rate=[5.0], noise=["RandomNormalNoisyReward(1.0)"]), "5.0"),
+    "a noise without a rate": (config(noise=["RandomNormalNoisyReward(1.0)"], noise_rate=[]), ""),
+    "a path as algorithm": (config(algorithm="x/../../ESCAPED"), "algorithm is 'x/../../ESCAPED'"),
+    "other steps": (text("result.json", lambda text: text.replace("4000", "5000")), "is 5000, in"),
+    "an infinite result": (
+        text("result.json", lambda text: re.sub(r'_mean": [^,}]*', '_mean": 1e999', text)),
+        "final_return_mean is inf",
+    ),
+}
+DAMAGED_TESTS = {  # of eval.csv
+    "half a line": (text("eval.csv", lambda text: text[:-5]), "half-written"),
+    "a huge number": (text("eval.csv", lambda text: text.replace(",1,", ",1e999,", 1)), "eval.csv"),
+    "no text": (lambda folder: (folder / "eval.csv").write_bytes(b"\xff\n"), "eval.csv: "),
+}
+
+
+@pytest.fixture(scope="module")
+def searched(tmp_path_factory):
+    """A choice in two environments after its first batch: two noises in each."""
+    folder = tmp_path_factory.mktemp("choice")
+    args = parse_args("list", "/", [*CHOOSE, "--runs-dir", str(folder)])
+    check_arguments(args)
+    for found in choose.choices(args):
+        for run in found.runs.values():
+            stub_run.train([run.script, *run.arguments])
+    return folder
+
+
+@pytest.fixture
+def case(searched, tmp_path, monkeypatch):
+    """The choice, a sweep with the same runs, and the run in each of them to be damaged."""
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(analyze, "figures", lambda *_: [])
+    monkeypatch.setattr(evaluate, "load", lambda run: nullcontext((gym.make("Pendulum-v1"), None)))
+    monkeypatch.setattr(evaluate, "play", lambda *_: [(1.0, 1)])
+    choice = Path(shutil.copytree(searched, tmp_path / "choice"))
+    runs = Path(shutil.copytree(searched / "search", tmp_path / "runs"))
+    name = "p1.0_s1_NormalNoisyReward_1.0__Pendulum-v1__ppo_continuous_noisy"
+    return SimpleNamespace(choice=choice, runs=runs, bad=[choice / "search" / name, runs / name])
+
+
+def view(name, *words):
+    """Return the exit status of a view of the sweep."""
+    return sweep(name, "/", list(map(str, words)))
+
+
+def check_analysis(case, said, capsys):
+    assert analyze.main(analyze.Args(case.runs, case.runs.parent / "out")) == 1
+    assert "Finished runs: 3." in capsys.readouterr().out
+    missing = (case.runs.parent / "out/missing.csv").read_text()
+    assert case.bad[1].name in missing and said in missing.replace('""', '"')
+
+
+def check_choice(case, said, capsys):
+    """The choice in the other environment goes on to its confirmation."""
+    words = [*CHOOSE, "--runs-dir", case.choice]
+    assert view("list", *words) == 0
+    out, err = capsys.readouterr()
+    states = [line.split("\t")[1] for line in out.splitlines()]
+    assert states.count("damaged") == 1 and states.count("todo") == 10
+    assert f"warning: {case.bad[0]}/" in err and said in err and "Pusher-v5, confirmation" in err
+    assert view("status", *words) == 1
+    out = capsys.readouterr().out
+    assert "14 runs: 3 done, 0 running, 1 failed, 10 to do" in out
+    assert "Pusher-v5, confirmation" in out and re.search(f"damaged .*{re.escape(said)}", out)
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_a_damaged_run_is_named_and_hides_no_other(name, case, capsys):
+    damage, said = DAMAGE[name]
+    for folder in case.bad:
+        damage(folder)
+    check_analysis(case, said, capsys)
+    check_choice(case, said, capsys)
+
+    assert view("status", "--runs-dir", case.runs) == 1
+    out = capsys.readouterr().out
+    assert "4 runs: 3 done, 0 running, 1 failed, 0 to do" in out
+    assert re.search(f"damaged .*{re.escape(str(case.bad[1]))}/.*{re.escape(said)}", out)
+
+    assert evaluate.main(evaluate.Args((case.runs,), episodes=1)) == 1
+    out, err = capsys.readouterr()
+    assert err.startswith(f"error: {case.bad[1]}: ") and said in err and err.count("\n") == 1
+    assert len(list(case.runs.glob("*/robustness.csv"))) == 3
+    assert {path.name for path in case.runs.parent.iterdir()} == {"choice", "runs", "out"}
+
+
+@pytest.mark.parametrize("name", DAMAGED_TESTS)
+def test_damaged_tests_of_a_run_hide_no_other(name, case, capsys):
+    damage, said = DAMAGED_TESTS[name]
+    for folder in case.bad:
+        damage(folder)
+    check_analysis(case, said, capsys)
+    check_choice(case, said, capsys)
+
+
+def test_what_is_no_run_is_left_alone(case, capsys):
+    """Nor is it called damaged, and nobody is advised to delete it."""
+    for name in ("__MACOSX", "__pycache__", "pretrained", "org__model", "logs", "results"):
+        (case.runs / name).mkdir()
+        (case.runs / name / "config.json").write_text('{"architectures": ["Bert"]}')
+    (case.runs / "ray__tune").mkdir()
+    (case.runs / "ray__tune/result.json").write_text("{}\n{}\n")
+    (case.runs / "link__to__nothing").symlink_to("nowhere")
+    (case.runs / "starting__now").mkdir()
+    (case.runs / "starting__now/.lock").touch()  # of a script that is importing PyTorch
+    assert analyze.main(analyze.Args(case.runs, case.runs.parent / "out")) == 0
+    assert view("status", "--runs-dir", case.runs) == 0
+    assert evaluate.main(evaluate.Args(tuple(case.runs.iterdir()), episodes=1)) == 0
+    out, err = capsys.readouterr()
+    assert "Finished runs: 4." in out and "5 runs: 4 done" in out
+    assert "(1 unfinished, 2 missing)" in out and "unfinished runs are left out: 1" in out
+    assert "delete" not in out + err and not err
+
+
+def test_a_noise_of_a_test_that_does_not_exist_is_a_note(case, capsys):
+    header = "noise,noise_rate,episode,episodic_return,episodic_length\n"
+    for noise in ("RandomX(1)", "__import__('os')"):
+        (case.bad[1] / "robustness.csv").write_text(f'{header}"{noise}",0.5,0,1.0,1\n')
+        assert analyze.main(analyze.Args(case.runs, case.runs.parent / "out")) == 0
+        assert f"{case.bad[1].name}: robustness.csv is left out: " in capsys.readouterr().out

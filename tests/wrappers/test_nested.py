@@ -1,0 +1,211 @@
+"""Observations of several parts: dictionaries and tuples."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from cases import OBSERVATION_CASES, GenericEnv, build, rollout, streams
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, Tuple
+from gymnasium.spaces.utils import flatten
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import FlattenObservation
+
+from noisy_wrappers import (
+    RandomDropoutObservation,
+    RandomMixupObservation,
+    RandomNormalNoisyObservation,
+    RandomUniformNoisyObservation,
+    make_noisy,
+    run_name,
+)
+
+GOALS = Dict(  # as Gymnasium-Robotics' Fetch has it; in this order
+    {
+        "achieved_goal": Box(-np.inf, np.inf, (3,), np.float64),
+        "desired_goal": Box(-np.inf, np.inf, (3,), np.float64),
+        "observation": Box(-np.inf, np.inf, (4,), np.float64),
+    }
+)
+MIXED = Dict(
+    image=Box(0, 255, (2, 2), np.uint8),
+    inner=Tuple((Discrete(3), Box(-1, 1, (2,), np.float32), MultiBinary(2))),
+    flag=Box(0, 1, (2,), np.bool_),
+    speed=Box(-1, 1, (1,), np.float64),
+)
+
+
+def sampled(space, seed=0):
+    """An environment that observes samples of a space, the same every time it is made."""
+    space.seed(seed)
+    samples = [space.sample() for _ in range(50)]
+
+    def observe(env):
+        env.count = getattr(env, "count", -1) + 1
+        return samples[env.count % 50]
+
+    env = GenericEnv(
+        space,
+        reset=lambda env: (observe(env), {}),
+        step=lambda env, action: (observe(env), 1.0, False, False, {}),
+    )
+    return env, samples
+
+
+def make_goals():
+    return sampled(GOALS)[0]
+
+
+@pytest.mark.parametrize("rate", [0.3, 1.0])
+@pytest.mark.parametrize(("wrapper", "args", "kwargs", "formula"), OBSERVATION_CASES)
+def test_numbers_are_perturbed_as_one_vector(wrapper, args, kwargs, formula, rate):
+    space = Dict({"b": Box(-5, 5, (1,), np.float64), "a": Tuple((Discrete(2), Box(-5, 5, (1, 2))))})
+    env, samples = sampled(space)
+    env = wrapper(env, rate, *args, **kwargs)
+    gate, noise = streams(wrapper, seed=7)
+    previous = None
+    for t, (got, *_, info) in enumerate(rollout(env, seed=7, steps=49)):
+        clean = samples[t]
+        vector = np.concatenate([clean["a"][1].ravel(), clean["b"]]).astype(np.float64)
+        expected = vector
+        if (wrapper is not RandomMixupObservation or t > 0) and gate.random() < rate:
+            expected = formula(noise, vector, previous)
+        assert list(got) == ["a", "b"] and got["a"][0] == clean["a"][0]
+        assert (got["a"][1].shape, got["a"][1].dtype) == ((1, 2), np.float32)
+        together = np.concatenate([got["a"][1].ravel(), got["b"]])
+        np.testing.assert_allclose(together, expected, rtol=1e-6)
+        assert ("noise" in info) == bool((expected != vector).any())
+        previous = vector
+
+
+@pytest.mark.parametrize(
+    "text", ["RandomNormalNoisyObservation(0.3)", "RandomDropoutObservation(0.5)"]
+)
+def test_float_boxes_are_perturbed_as_when_they_were_flattened(text):
+    inside = FlattenObservation(build(text, sampled(GOALS)[0], 0.7))
+    outside = build(text, FlattenObservation(sampled(GOALS)[0]), 0.7)
+    for ours, theirs in zip(rollout(inside, 3, 40), rollout(outside, 3, 40), strict=True):
+        np.testing.assert_array_equal(ours[0], theirs[0])
+        assert ours[4] == theirs[4]
+
+
+def test_keys_restrict_the_noise():
+    env, samples = sampled(GOALS)
+    env = RandomNormalNoisyObservation(env, 1.0, 0.3, keys=("observation", "desired_goal"))
+    _, noise = streams(RandomNormalNoisyObservation, 0)
+    got = env.reset(seed=0)[0]
+    eps = noise.normal(0, 0.3, 7)  # in the order of the space
+    np.testing.assert_array_equal(got["desired_goal"], samples[0]["desired_goal"] + eps[:3])
+    np.testing.assert_array_equal(got["observation"], samples[0]["observation"] + eps[3:])
+    assert got["achieved_goal"] is samples[0]["achieved_goal"]
+
+
+def test_keys_of_a_tuple_are_indices():
+    space = Tuple((Box(-1, 1, (2,)), Box(-1, 1, (3,))))
+    env, samples = sampled(space)
+    env = RandomDropoutObservation(env, 1.0, 0.0, keys=(1,))
+    got = env.reset(seed=0)[0]
+    assert isinstance(got, tuple) and got[0] is samples[0][0] and not got[1].any()
+    for bad in (2, -1):
+        with pytest.raises(ValueError, match=r"have the keys \[0, 1\]"):
+            RandomDropoutObservation(sampled(space)[0], 1.0, 0.0, keys=(bad,))
+
+
+def test_categories_and_other_entries_stay():
+    env, samples = sampled(MIXED)
+    env = RandomNormalNoisyObservation(env, 1.0, 30.0)
+    for t, (got, *_) in enumerate(rollout(env, seed=0, steps=20)):
+        clean = samples[t]
+        assert got["flag"] is clean["flag"]
+        assert got["inner"][0] == clean["inner"][0] and got["inner"][2] is clean["inner"][2]
+        assert got["image"].dtype == np.uint8 and (got["image"] != clean["image"]).any()
+        assert (got["inner"][1] != clean["inner"][1]).all()
+        assert (got["speed"] != clean["speed"]).all()
+        assert got in env.observation_space
+
+
+def test_the_space_is_widened_in_its_entries():
+    env = RandomUniformNoisyObservation(sampled(MIXED)[0], 1.0, -2, 1, keys=("inner", "image"))
+    space = env.observation_space
+    assert list(space) == list(MIXED) and space["speed"] == MIXED["speed"]
+    assert space["image"] == MIXED["image"]
+    assert space["inner"][1] == Box(-3, 2, (2,), np.float32)
+    assert space["inner"][0] == Discrete(3)
+
+
+def test_the_environments_observation_is_not_written_to():
+    env, samples = sampled(MIXED)
+    kept = [flatten(MIXED, sample) for sample in samples]
+    names = [list(sample) for sample in samples]
+    env = RandomDropoutObservation(RandomNormalNoisyObservation(env, 1.0, 9.0), 1.0, 0.5)
+    rollout(env, seed=0, steps=49)
+    assert [list(sample) for sample in samples] == names
+    np.testing.assert_array_equal([flatten(MIXED, sample) for sample in samples], kept)
+
+
+@pytest.mark.filterwarnings("ignore:.*WARN")
+@pytest.mark.parametrize("space", [GOALS, MIXED, Tuple((MIXED, Box(-1, 1, (2,))))])
+def test_check_env(space):
+    class Sampled(GenericEnv):
+        def draw(self):
+            self.observation_space.seed(int(self.np_random.integers(2**31)))
+            return self.observation_space.sample()
+
+    env = Sampled(space)
+    check_env(RandomMixupObservation(RandomNormalNoisyObservation(env, 0.5, 1), 0.5, 0.5))
+
+
+@pytest.mark.parametrize(
+    ("env", "keys", "reason"),
+    [
+        (
+            lambda: sampled(GOALS)[0],
+            ("goal",),
+            "the keys .'achieved_goal', 'desired",
+        ),
+        (lambda: sampled(GOALS)[0], (0,), "have the keys"),
+        (lambda: GenericEnv(), ("observation",), r"have the keys \[\]"),
+        (
+            lambda: sampled(Dict(x=Box(-1, 1), y=Discrete(2)))[0],
+            ("y",),
+            "cannot perturb categories",
+        ),
+    ],
+)
+def test_keys_that_name_no_numbers(env, keys, reason):
+    with pytest.raises(ValueError, match=reason) as error:
+        RandomDropoutObservation(env(), 0.1, 0.5, keys=keys)
+    assert "\n" not in str(error.value)
+
+
+def test_a_scale_for_each_dimension_of_the_vector():
+    scale = (0.0,) * 3 + (1.0,) * 4
+    keys = ("achieved_goal", "observation")
+    got = RandomNormalNoisyObservation(sampled(GOALS)[0], 1.0, scale, keys=keys).reset(seed=0)[0]
+    clean = sampled(GOALS)[1][0]
+    assert (got["achieved_goal"] == clean["achieved_goal"]).all()
+    assert (got["observation"] != clean["observation"]).all()
+    with pytest.raises(ValueError, match=r"scale has 7 numbers and .* has shape \(10,"):
+        RandomNormalNoisyObservation(sampled(GOALS)[0], 1.0, scale)
+
+
+def test_keys_in_the_notation_and_in_the_folders_name():
+    text = "RandomDropoutObservation(0.5, keys=('b', 'a', 'b'))"
+    name = "p0.5_s1_DropoutObservation_0.5_keys=a-b__E__x"
+    assert run_name("E", "x", [text], [0.5], 1) == name
+    one = "RandomDropoutObservation(0.5, keys='a')"
+    assert run_name("E", "x", [one], [0.5], 1) == name.replace("a-b", "a")
+    strange = {
+        run_name("E", "x", [f"RandomDropoutObservation(0.5, keys={keys!r})"], [0.5], 1)
+        for keys in [("a", "b"), ("a-b",), ("a/b",), ("a b",), ("0",), (0,), ("a', 'b",), ("(a",)]
+    }
+    assert len(strange) == 8
+    env = make_noisy(sampled(GOALS)[0], ["RandomDropoutObservation(0, keys='observation')"], [1.0])
+    assert not env.reset(seed=0)[0]["observation"].any()
+    assert env.reset()[0]["desired_goal"].all()
+
+
+def test_specs_keep_the_keys():
+    gym.register("Goals-v0", "test_nested:make_goals")
+    env = gym.make("Goals-v0", disable_env_checker=True)
+    env = RandomDropoutObservation(env, 0.5, 0.5, keys=("observation",))
+    for spec in (env.spec, gym.envs.registration.EnvSpec.from_json(env.spec.to_json())):
+        assert spec.make().keys == ("observation",)

@@ -1,0 +1,150 @@
+"""Noises of one's own: the docstring's, from a folder of its own, through all commands."""
+
+import csv
+import json
+import re
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from cases import GenericEnv, streams
+from gymnasium.utils.env_checker import check_env
+from test_action_noise import actions_env
+
+from noisy_wrappers import Configuration, NoiseWrapper, make_noisy, parse_noise, run_name
+
+ROOT = Path(__file__).parents[2]
+TEXT = "my_noises:StickyAction(3)"
+[EXAMPLE] = re.findall(
+    r"(?:    >>> class StickyAction|    \.\.\.).*?(?=\n\n)", NoiseWrapper.__doc__, re.S
+)
+MODULE = "from noisy_wrappers import NoiseWrapper\n\n\n" + textwrap.dedent(
+    re.sub(r"^    (>>>|\.\.\.) ?", "", EXAMPLE, flags=re.M)
+)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with my_noises.py, in which Python is started."""
+    (tmp_path / "my_noises.py").write_text(MODULE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "my_noises", raising=False)
+    parse_noise.__globals__["_read_noise"].cache_clear()
+    yield tmp_path
+    sys.modules.pop("my_noises", None)
+    parse_noise.__globals__["_read_noise"].cache_clear()
+
+
+def test_a_sticky_action_by_hand(folder):
+    bare = actions_env(gym.spaces.Discrete(100))
+    env = make_noisy(bare, [TEXT], [0.3], record_statistics=False)
+    gate, noise = streams(sys.modules["my_noises"].StickyAction, seed=5)
+    env.reset(seed=5)
+    expected, left, last, marks = [], 0, None, []
+    for action in range(60):
+        if gate.random() < 0.3:
+            left = noise.integers(1, 3, endpoint=True)
+        sticks = left > 0 and last is not None
+        left, last = left - 1, last if sticks else action
+        expected.append(last)
+        marks.append(("StickyAction",) if sticks else None)
+    assert [env.step(action)[4].get("noise") for action in range(60)] == marks
+    assert bare.received == expected
+    assert 0 < env.times_applied < env.opportunities == 60
+
+
+@pytest.mark.filterwarnings("ignore:.*WARN")
+def test_it_is_a_wrapper_like_the_others(folder):
+    assert str(parse_noise("my_noises:StickyAction(longest=3)")) == TEXT
+    config = Configuration.read([TEXT, "RandomEarlyTermination(9)"], ["1:0"])
+    assert config.texts[0] == ["RandomEarlyTermination(9)", TEXT]  # an action noise
+    assert config.kinds == {"dynamics", "own"}
+    assert Configuration.parse(*config.columns) == config
+    assert run_name("E", "x", [TEXT], [0.5], 1) == "p0.5_s1_my_noises--StickyAction_3__E__x"
+    env = config.wrap(gym.make("Pendulum-v1"))
+    check_env(env, skip_render_check=True)
+    assert env.spec.make().spec == env.spec
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "message"),
+    [
+        ("no_such:A(1)", "", "No module named 'no_such'"),
+        ("my_noises:Nothing(1)", "", "my_noises has no class Nothing"),
+        (
+            "my_noises:GenericEnv(1)",
+            "class GenericEnv: pass",
+            "must be a subclass of noisy_wrappers",
+        ),
+        ("my_noises:StickyAction()", "", "missing a required argument: 'longest'"),
+        ("my_noises:StickyAction(1, 2)", "", "too many positional arguments"),
+        ("my-noises:StickyAction(1)", "", "'my-noises' is not a module name"),
+        (
+            "my_noises:Strict(1)",
+            "class Strict(NoiseWrapper):\n"
+            "    def __init__(self, env, noise_rate, x):\n"
+            "        raise ValueError('x is bad')",
+            "x is bad",
+        ),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(folder, text, code, message):
+    (folder / "my_noises.py").write_text(f"{MODULE}\n\n{code}\n")
+    with pytest.raises(ValueError) as error:
+        parse_noise(text)
+    assert str(error.value).startswith(f"bad noise {text!r}: ") and message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_bug_keeps_its_traceback(folder):
+    (folder / "my_noises.py").write_text("import no_such_dependency\n")
+    with pytest.raises(ModuleNotFoundError, match="no_such_dependency"):
+        parse_noise(TEXT)
+    (folder / "my_noises.py").write_text(MODULE.replace("longest  #", "longest + 'x'  #"))
+    with pytest.raises(TypeError, match="unsupported operand"):
+        parse_noise(TEXT)
+
+
+@pytest.mark.slow
+def test_a_sweep_and_a_test_from_the_folder_of_the_noise(folder):
+    def run(*words):
+        done = subprocess.run([*map(str, words)], cwd=folder, capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    sweep = "custom --algos ppo --envs InvertedPendulum-v5 --seeds 1 --total-timesteps 512 --jobs 1"
+    sweep = [*sweep.split(), "--runs-dir", "runs", "--noises", TEXT, "--noise-rates", "0.5"]
+    small = ["--", "--no-compile", "--num-steps", "256", "--eval-episodes", "2"]
+    env = ["env", f"PYTHON={sys.executable}"]
+    run(*env, ROOT / "benchmark.sh", *sweep, *small)
+    [noisy] = folder.glob("runs/p0.5_s1_my_noises--StickyAction_3__*/result.json")
+    assert 0 < json.loads(noisy.read_text())["noise_applied_fraction"]["StickyAction"] < 0.6
+    assert len([*folder.glob("runs/*/result.json")]) == 2
+    test = ["--noises", TEXT, "--noise-rates", "1", "--episodes", "2"]
+    run(sys.executable, ROOT / "evaluate.py", "runs", *test)
+    (folder / "my_noises.py").unlink()
+    run(sys.executable, ROOT / "analyze.py")  # reads runs without their noise
+    tables = (folder / "runs/results/robustness.csv", folder / "runs/results/summary_PPO.csv")
+    assert all(TEXT in table.read_text() for table in tables)
+    rows = list(csv.DictReader((noisy.parent / "robustness.csv").open()))
+    assert {row["noise"] for row in rows} == {"", TEXT}
+    assert np.isfinite([float(row["episodic_return"]) for row in rows]).all()
+
+
+def test_the_observation_and_reward_bases_are_for_everybody(folder):
+    (folder / "my_noises.py").write_text(
+        "from noisy_wrappers import ObservationNoise\n\n\n"
+        "class Quantized(ObservationNoise):\n"
+        "    def __init__(self, env, noise_rate, step, *, keys=None):\n"
+        "        super().__init__(env, noise_rate, step=step, keys=keys)\n"
+        "        self.step_size = step\n\n"
+        "    def _perturb(self, observation):\n"
+        "        return observation - observation % self.step_size\n"
+    )
+    env = make_noisy(GenericEnv(), ["my_noises:Quantized(0.5)"], [1.0])
+    got = env.reset(seed=0)[0]
+    assert (got % 0.5 == 0).all() and env.applied_fraction == 1
