@@ -911,6 +911,9 @@ def test_an_environment_whose_baseline_is_zero_is_in_every_table(sparse):
     assert bad["without_percent"] == "Car-v0, Maze-v0"
     assert bad["average_improvement_percent"] == pytest.approx(100 * (89.7 / 103 - 1))
     assert sparse.tables["consistent"].empty  # worse in one of three
+    rows = analysis.tables.consistency_rows(sparse.tables["summary_SAC"])
+    shares = {row["noise"]: row["percent_of_environments"] for row in rows}
+    assert shares == {SCALE: pytest.approx(200 / 3), ENDING: 0}
     luck = sparse.tables["luck"].iloc[0]
     assert (luck["environments"], luck["consistently_worse"]) == (3, 1)
     statistics = sparse.tables["statistics"]
