@@ -12,7 +12,7 @@ demo: $(BIN)/.run
 	PYTHON=$(BIN)/python ./benchmark.sh demo
 	$(BIN)/python analyze.py --runs-dir runs/demo >runs/demo/logs/analysis.txt
 	@echo
-	@sed -n 2p runs/demo/logs/analysis.txt  # the verdict
+	@sed '/^$$/q' runs/demo/logs/analysis.txt  # the verdict
 	@echo "The picture: runs/demo/results/curves_PPO_RandomNormalNoisyObservation_1.0.svg"
 	@echo "All tables and figures: runs/demo/results/report.html"
 	@echo "The curves in TensorBoard: .venv/bin/tensorboard --logdir runs/demo"
