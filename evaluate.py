@@ -174,7 +174,7 @@ def load(run, render_mode=None):
     Raises UnusableError.
     """
     script = importlib.import_module(script_name(run.algorithm))
-    for environment in {run.environment, run.tested_in}:
+    for environment in dict.fromkeys([run.environment, run.tested_in]):
         refuse_foreign_module(run, environment)
         try:
             canonical_env_id(environment)  # imports its module

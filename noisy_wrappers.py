@@ -1511,7 +1511,7 @@ def run_name(
     configuration = Configuration.read(noises, rates)
     rate, *names = configuration._rates_and_names() or ["baseline"]
     first = "_".join([rate, f"s{seed}", *names])
-    end = f"__{_safe(env_id)}__{_safe(exp_name)}"
+    end = f"__{safe_name(env_id)}__{safe_name(exp_name)}"
     if len(first + end) > 240:  # a file's name has at most 255 bytes
         first = f"{first[:100]}_{hashlib.sha256(first.encode()).hexdigest()[:16]}"
     return first + end
@@ -1529,7 +1529,7 @@ def run_folder(
     configuration = Configuration.read(noises, rates)
     pairs = zip(configuration.noises, configuration.rates, strict=True)
     slug = "+".join(f"{_words(noise)}_p{_rate_word(rate)}" for noise, rate in pairs) or "baseline"
-    old_name = f"{_safe(env_id)}__{_safe(exp_name)}__{slug}__{seed}"
+    old_name = f"{safe_name(env_id)}__{safe_name(exp_name)}__{slug}__{seed}"
     if len(old_name) <= 240 and Path(runs_dir, old_name).is_dir():
         return Path(runs_dir, old_name)
     return Path(runs_dir, run_name(env_id, exp_name, noises, rates, seed))
@@ -1538,7 +1538,7 @@ def run_folder(
 def _words(noise: str) -> str:
     """Return a noise as a part of a file's name; different noises have different ones."""
     plain = noise.replace("=(", "=").replace("', '", "-").replace("'", "")  # keys=a-b
-    words = _safe("_".join(re.findall(r"[^(), ]+", plain)))
+    words = safe_name("_".join(re.findall(r"[^(), ]+", plain)))
     if re.sub(r"'[A-Za-z_][A-Za-z0-9_.]*'", "", noise).count("'"):  # a key that is no plain name
         words += "_" + hashlib.sha256(noise.encode()).hexdigest()[:8]
     return words
@@ -1548,7 +1548,7 @@ def _rate_word(rate: tuple[float, float]) -> str:
     return str(_spelled(rate)).replace(":", "to")
 
 
-def _safe(text: str) -> str:
+def safe_name(text: str) -> str:
     """Replace what a folder's name cannot hold: "/" by one dash, anything else by two."""
     return re.sub(r"[^A-Za-z0-9._=+-]", lambda match: "-" if match[0] == "/" else "--", text)
 

@@ -15,7 +15,6 @@ NARROW_WIDTH = 4.2  # inches of those for a telephone
 HEIGHT = 3.6  # inches, at least
 # Colour-blind readers tell these apart (Okabe and Ito, 2008); report.html.jinja has them, too.
 BETTER, WORSE, UNCLEAR = "#0072B2", "#D55E00", "#8C8C8C"
-PALETTE = [BETTER, WORSE, "#009E73"]  # of lines that are no verdicts, from the same source
 COLORS = {"better": BETTER, "worse": WORSE}  # of verdicts; all others are grey
 DIVERGING = LinearSegmentedColormap.from_list("effects", [WORSE, "white", BETTER])
 viridis = matplotlib.colormaps["viridis"]  # ordered by lightness, so it reads in grey

@@ -208,8 +208,8 @@ def cost(args, done, todo):
     """
     seconds = {}
     for run in done:
-        if wall_time(run):
-            seconds.setdefault(run.kind, []).append(wall_time(run))
+        if taken := wall_time(run):
+            seconds.setdefault(run.kind, []).append(taken)
     seconds = {kind: fmean(values) for kind, values in seconds.items()}
     new = {run.kind: run for run in todo if run.kind not in seconds}
     answers = ask_all(args, {env_id: [] for _, env_id in new})
@@ -272,4 +272,4 @@ def remembered(runs_dir, env_id):
 
 def file_of(runs_dir, env_id):
     """Return the file of an environment, beside the logs of its runs."""
-    return Path(runs_dir, "logs", re.sub(r"[^\w.-]", "--", env_id) + ".json")
+    return Path(runs_dir, "logs", noisy.safe_name(env_id) + ".json")

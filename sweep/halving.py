@@ -73,11 +73,6 @@ def schedule(noises, budget):
     return [(n, max(1, round(budget / whole / math.sqrt(n)))) for n in numbers]
 
 
-def number_of_runs(noises, budget, confirm):
-    """Return how many runs a choice takes, whatever they return."""
-    return sum(n * seeds for n, seeds in schedule(noises, budget)) + 2 * confirm
-
-
 def advance(noises, budget, confirm, returns):
     """Return how far the choice has come, and which runs are due.
 
