@@ -15,7 +15,6 @@ https://arxiv.org/abs/2305.02882; IQM and probability of improvement are those o
 """
 
 import shutil
-import subprocess
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,17 +27,11 @@ from analysis.figures import figures, reword, write_figure
 from analysis.folders import is_run
 from analysis.formatting import in_metric, text_table, wrapped, write_table
 from analysis.paper import read_paper
-from analysis.report import write_report
+from analysis.report import Results, write_report
 from analysis.robustness import read_robustness, robustness_sentences, robustness_tables
-from analysis.runs import SUCCESS, left_out, make_studies, read_choice, read_runs
-from analysis.tables import (
-    family_notes,
-    make_tables,
-    success_table,
-    table_of,
-    unlearned_notes,
-)
-from analysis.verdicts import POINTS, clear_first, headlines, sentences, tally
+from analysis.runs import SUCCESS, left_out, make_studies, read_choice, read_runs, version_notes
+from analysis.tables import all_equal_notes, family_notes, make_tables, success_table, table_of
+from analysis.verdicts import POINTS, clear_first, headlines, in_sentences, tally
 
 # Columns that a terminal may have room for, the most important ones first
 BEST_IN_SHORT = ["algorithm, environment", "noise", "noise_rate", "difference", "p_adjusted", "n"]
@@ -63,23 +56,6 @@ class Args:
     """what the verdicts judge by: final test returns, or rates of success in percent"""
 
 
-def output_folder(args):
-    """Return where to write; a default that would overwrite a kept analysis is refused."""
-    if args.out:
-        return args.out
-    out = args.runs_dir / "results"
-    if (out / "runs").exists():
-        fail(f"{out} holds the runs of another analysis; choose a folder with --out")
-    git = ["git", "-C", args.runs_dir, "ls-files", "results"]
-    try:
-        tracked = subprocess.run(git, capture_output=True).stdout
-    except OSError:  # no git on this machine
-        tracked = b""
-    if tracked:
-        fail(f"{out} is tracked by git; choose another folder with --out, or the same to renew it")
-    return out
-
-
 def no_finished_run(runs_dir):
     """End with an error that says where there are finished runs, if that is below `runs_dir`."""
     paths = [*runs_dir.glob("*/*/result.json"), *runs_dir.glob("*/*/*/result.json")]
@@ -90,20 +66,19 @@ def no_finished_run(runs_dir):
     fail(f"no finished run in {runs_dir}; there are some in {found}: name it with --runs-dir")
 
 
-def verdicts_in_short(verdicts, tables):
+def verdicts_in_short(results):
     """Yield the tally of each study, then the sentences of clear verdicts."""
-    lines = headlines(tables["statistics"].frame, tables["best"].frame)
+    lines = headlines(results.tables["statistics"].frame, results.tables["best"].frame)
     if not lines:
         yield "There is no noise to compare with a baseline yet."
     for line in lines:
         counts = ", ".join(f"{count} {word}" for word, count in line["counts"])
         yield f"{line['name']}: {line['tried']}: {counts}. {line['luck']}".strip()
-    first, rest = clear_first(verdicts)
+    first, rest = clear_first(results.sentences)
     yield from first["sentence"]
     if len(first) and len(rest):
         yield f"Not shown here, but in the report: {tally(rest['verdict'])}."
-    if "robustness_score" in tables:
-        yield from robustness_sentences(tables["robustness_score"].frame)
+    yield from results.robustness
 
 
 def overview_of(runs, studies):
@@ -118,19 +93,17 @@ def overview_of(runs, studies):
     return " ".join(parts)
 
 
-def write_results(out, latex, verdicts, tables, studies, overview, problems, notes):
+def write_results(out, results, latex):
     """Write all tables, all figures and the report; return the names of tables and figures."""
     out.mkdir(parents=True, exist_ok=True)
-    for table in tables.values():
+    for table in results.tables.values():
         write_table(out, table, latex)
-    drawn = list(figures(studies, tables))
-    names = {*tables}
+    drawn = list(figures(results.studies, results.tables))
+    names = {*results.tables}
     for drawing in drawn:
-        if drawing.kind != "robustness":  # which is about returns
-            reword(drawing, studies[0].metric)
-        write_figure(out, drawing, latex)
+        write_figure(out, reword(drawing, results.studies[0].metric), latex)
         names |= {drawing.name, drawing.narrow_name}
-    write_report(out, verdicts, tables, drawn, overview, problems, notes)
+    write_report(out, results, drawn)
     return names
 
 
@@ -149,29 +122,69 @@ def print_left_out(missing, width):
     print(text_table(replace(missing, frame=missing.frame[MISSING_IN_SHORT][:20]), width))
 
 
-def print_results(out, verdicts, tables, overview, problems, notes):
+def print_results(out, results):
     """Print the verdicts, what to know about them, and where the report is."""
-    width = terminal_width()
+    width, tables = terminal_width(), results.tables
 
     def say(text):
         print(wrapped(text, width))
 
-    for line in verdicts_in_short(verdicts, tables):
+    for line in verdicts_in_short(results):
         say(line)
     print()
     if len(tables["best"].frame):
         say("The best noise in each environment, which may still be worse than no noise:")
         best = replace(tables["best"], view=tables["best"].view[BEST_IN_SHORT])
         print(f"\n{text_table(best, width)}\n")
-    say(overview)
-    for note in notes:
+    say(results.overview)
+    for note in results.notes + results.versions:
         say(f"note: {note}")
-    if problems:
+    if results.problems:
         print()
-        say(f"WARNING: {problems}")
+        say(f"WARNING: {results.problems}")
         print_left_out(tables["missing"], width)
         print(f"All of them: {out / 'missing.csv'}")
     print(f"\nOpen {out / 'report.html'}")
+
+
+def analyse(args, runs, paper, choice):
+    """Compute everything that is told of a frame of runs (read_runs); see main."""
+    metric = args.metric.replace("_", " ")
+    unit = POINTS if metric == SUCCESS else ""
+    missing, number = left_out(runs)
+    studies, notes = make_studies(runs, metric)
+    if not studies and make_studies(runs)[0]:
+        fail("--metric success_rate: no environment here tells it, in `is_success` or `success`")
+    if not studies:
+        if len(missing):
+            print_left_out(table_of("missing", missing), terminal_width())
+        no_finished_run(args.runs_dir)
+    robustness, unreadable = read_robustness(args.runs_dir, runs, metric)
+    tables = {
+        name: replace(table, caption=in_metric(table.caption, metric))
+        for name, table in make_tables(studies, paper).items()
+    }
+    statistics = tables["statistics"].frame
+    if metric != SUCCESS:
+        tables |= success_table(make_studies(runs, SUCCESS)[0])
+    tables |= robustness_tables(robustness, metric)
+    tables["missing"] = table_of("missing", missing)
+    if choice is not None:
+        tables["choice"] = table_of("choice", choice)
+    counts = ", ".join(f"{n} {status}" for status, n in number.items())
+    robust = ()
+    if "robustness_score" in tables:
+        robust = robustness_sentences(tables["robustness_score"].frame, unit)
+    return Results(
+        studies=studies,
+        tables=tables,
+        sentences=in_sentences(statistics, unit),
+        robustness=list(robust),
+        overview=overview_of(runs, studies),
+        problems=f"Runs left out: {sum(number.values())} ({counts})." if number else "",
+        notes=all_equal_notes(studies) + family_notes(statistics) + notes + unreadable,
+        versions=version_notes(runs),
+    )
 
 
 def main(args):
@@ -188,44 +201,19 @@ def main(args):
         choice = read_choice(args.runs_dir)
     except ValueError as error:
         fail(error)
-    out = output_folder(args)
+    out = args.out or args.runs_dir / "results"
     runs = read_runs(args.runs_dir)
-    missing, number = left_out(runs)
-    counts = ", ".join(f"{n} {status}" for status, n in number.items())
-    problems = f"Runs left out: {sum(number.values())} ({counts})." if number else ""
-    metric = args.metric.replace("_", " ")
-    studies, notes = make_studies(runs, metric)
-    if not studies and make_studies(runs)[0]:
-        fail("--metric success_rate: no environment here tells it, in `is_success` or `success`")
-    if not studies:
-        if len(missing):
-            print_left_out(table_of("missing", missing), terminal_width())
-        no_finished_run(args.runs_dir)
-    robustness, unreadable = read_robustness(args.runs_dir, runs)
-    notes += unreadable
-    tables = {
-        name: replace(table, caption=in_metric(table.caption, metric))
-        for name, table in make_tables(studies, paper).items()
-    }
-    if metric != SUCCESS:
-        tables |= success_table(make_studies(runs, SUCCESS)[0])
-    tables |= robustness_tables(robustness)
-    tables["missing"] = table_of("missing", missing)
-    if choice is not None:
-        tables["choice"] = table_of("choice", choice)
-    unit = POINTS if metric == SUCCESS else ""
-    verdicts = sentences(tables["statistics"].frame, unit)
-    notes = unlearned_notes(studies) + family_notes(tables["statistics"].frame) + notes
-    overview = overview_of(runs, studies)
+    results = analyse(args, runs, paper, choice)
     try:
-        names = write_results(out, args.latex, verdicts, tables, studies, overview, problems, notes)
+        names = write_results(out, results, args.latex)
     except OSError as error:
         fail(f"--out: {error}")
     old = left_by_others(out, names)
     if old:
-        notes.append(f"{out} also holds files that this analysis did not write: {', '.join(old)}")
-    print_results(out, verdicts, tables, overview, problems, notes)
-    return int(number["corrupt"] > 0)
+        told = f"{out} also holds files that this analysis did not write: {', '.join(old)}"
+        results.notes.append(told)
+    print_results(out, results)
+    return int((runs["status"] == "corrupt").any())
 
 
 if __name__ == "__main__":

@@ -20,9 +20,9 @@ from analysis.style import (
 from analysis.verdicts import seeds_of
 from noisy_wrappers import rate_order
 
-FOREST_ROWS = 25  # configurations of a forest plot; more of them are a heatmap
-ACROSS = 5  # panels of effects side by side
+MOST_IN_FOREST = 25  # configurations of a forest plot; more of them are a heatmap
 ENDS = ["difference", "difference_low", "difference_high"]
+LABEL = "difference from no noise in mean return"
 
 
 def of_environments(statistics):
@@ -44,7 +44,7 @@ def effects_caption(study, statistics):
     """Say what effects_figure shows."""
     rows = of_environments(statistics)
     clear = rows["verdict"].isin(COLORS).any()
-    if len(configurations(rows)) > FOREST_ROWS:
+    if len(configurations(rows)) > MOST_IN_FOREST:
         _, unit, limit = heatmap_scale(rows)
         text = f"{study.name}: difference from no noise in mean final return ({unit}). "
         text += "A dot marks a clear verdict. " if clear else "No verdict is clear. "
@@ -62,50 +62,47 @@ def configurations(rows):
 
 
 def effects_figure(statistics, narrow=False):
-    """Draw the effect of every noise, a panel for each environment in which any was tried.
+    """Draw the effect of every noise, a panel for each environment with what was tried there.
 
-    statistics: the tested rows of one study. Up to FOREST_ROWS noises and rates are a forest plot;
-    more are heatmaps of noises by rates. The panels stand side by side, or below each other if the
-    figure shall be narrow.
+    statistics: the tested rows of one study. Up to MOST_IN_FOREST noises and rates are a forest
+    plot; more are heatmaps of noises by rates. The panels stand below each other if the figure
+    shall be narrow, otherwise in two columns.
     """
     rows = of_environments(statistics)
-    configs = configurations(rows)
-    environments = sorted(set(rows["environment"]))
-    forest = len(configs) <= FOREST_ROWS
-    lines = [f"{broken(noise)}, {broken(rate)}" for noise, rate in configs]
-    if not forest:
-        lines = [broken(noise) for noise in dict.fromkeys(noise for noise, _ in configs)]
-    if narrow or (forest and len(environments) != 2):  # little room for names beside the panels
-        lines = [re.sub(r"(?<=\w)\((?=.{10})", "\n(", line) for line in lines]
-    across = 1 if narrow else min(ACROSS, len(environments))
-    down = -(-len(environments) // across)
+    draw = heat_panel if len(configurations(rows)) > MOST_IN_FOREST else forest_panel
+    panels = dict(list(rows.groupby("environment")))
+    across = 1 if narrow else min(2, len(panels))
     width = NARROW_WIDTH if narrow else WIDTHS[across - 1]
-    high = (0.18 if narrow else 0.22) * len("\n".join(lines).split("\n"))
-    fig = Figure(figsize=(width, 0.6 + down * (0.7 + high)), layout="constrained")
-    axes = fig.subplots(down, across, sharey=True, squeeze=False).ravel()
-    for ax in axes[len(environments) :]:
+    lines = [len("\n".join(labels_of(panel, draw)).split("\n")) for panel in panels.values()]
+    lines = [max(lines[i : i + across]) for i in range(0, len(lines), across)]
+    heights = [0.75 + (0.18 if narrow else 0.22) * number for number in lines]
+    fig = Figure(figsize=(width, 0.4 + sum(heights)), layout="constrained")
+    axes = fig.subplots(len(heights), across, squeeze=False, height_ratios=heights).ravel()
+    for ax in axes[len(panels) :]:
         ax.remove()
-    axes = axes[: len(environments)]
-    for ax, environment in zip(axes, environments, strict=True):
+    for ax, (environment, panel) in zip(axes, panels.items(), strict=False):
+        image = draw(ax, panel, heatmap_scale(rows), (width - 2 * across) / across)
+        labels = labels_of(panel, draw)
+        ax.set_yticks(range(len(labels)), labels, fontsize=6.5 if narrow else 8)
         ax.set_title(environment, fontsize=9)
-        ax.tick_params(axis="y", labelsize=6.5 if narrow else 9)
-        panel = rows[rows["environment"] == environment]
-        if forest:
-            forest_panel(ax, panel, configs, (width - 2) / across)
-        else:
-            image = heat_panel(ax, panel, configs, *heatmap_scale(rows))
-    axes[0].set_yticks(range(len(lines)), lines)
-    axes[0].set_ylim(len(lines) - 0.5, -0.5)  # the first noise on top
-    label = "difference from no noise in mean return"
-    below = fig.supxlabel if across > 1 else axes[-1].set_xlabel
-    below(label if forest else "noise rate", fontsize=9)
-    if not forest:
-        column, unit, limit = heatmap_scale(rows)
-        beyond = "both" if rows[column].abs().max() > limit else "neither"
-        place = {"location": "bottom", "fraction": 0.05} if narrow else {"fraction": 0.02}
-        text = {"extend": beyond, "label": f"{label} ({unit})"}
-        fig.colorbar(image, ax=list(axes), pad=0.01, **text, **place)
+    if draw is forest_panel:
+        fig.supxlabel(LABEL, fontsize=9)
+        return fig
+    fig.supxlabel("noise rate", fontsize=9)
+    column, unit, limit = heatmap_scale(rows)
+    beyond = "both" if rows[column].abs().max() > limit else "neither"
+    place = {"location": "bottom", "fraction": 0.05} if narrow else {"fraction": 0.02}
+    text = {"extend": beyond, "label": f"{LABEL} ({unit})"}
+    fig.colorbar(image, ax=list(axes[: len(panels)]), pad=0.01, **text, **place)
     return fig
+
+
+def labels_of(rows, draw):
+    """Return what stands beside the lines of a panel, broken where it is long."""
+    labels = [f"{broken(noise)}, {broken(rate)}" for noise, rate in configurations(rows)]
+    if draw is heat_panel:
+        labels = [broken(noise) for noise in sorted(set(rows["noise"]))]
+    return [re.sub(r"(?<=\w)\((?=.{10})", "\n(", label) for label in labels]
 
 
 def scale_forest(ax, rows, inches):
@@ -122,8 +119,9 @@ def scale_forest(ax, rows, inches):
     ax.set_xticks([tick for tick in ticks if low <= tick <= high])
 
 
-def forest_panel(ax, rows, configs, inches):
+def forest_panel(ax, rows, _, inches):
     """Draw one environment's differences with intervals, and n at the side."""
+    configs = configurations(rows)
     ax.axvline(0, color="black", linewidth=0.8)
     ax.grid(axis="y", color="0.92")
     ax.set_axisbelow(True)
@@ -140,28 +138,42 @@ def forest_panel(ax, rows, configs, inches):
     side = {"transform": ax.transAxes, "ha": "right", "va": "bottom"}
     ax.text(1, 1, "n", color="0.35", fontsize=7, **side)
     ax.tick_params(axis="y", length=0)
+    ax.set_ylim(len(configs) - 0.5, -0.5)  # the first noise on top
     scale_forest(ax, rows, inches)
 
 
-def heat_panel(ax, rows, configs, column, unit, limit):
+def heat_panel(ax, rows, scale, _):
     """Draw one environment's differences, noises by rates, dots where the verdict is clear."""
-    noises = list(dict.fromkeys(noise for noise, _ in configs))
-    rates = sorted({rate for _, rate in configs}, key=rate_order)
-    grid = np.full((len(noises), len(rates)), np.nan)
-    places = [(noises.index(r.noise), rates.index(r.noise_rate)) for r in rows.itertuples()]
-    for place, value in zip(places, rows[column], strict=True):
-        grid[place] = value
+    column, unit, limit = scale
+    noises = sorted(set(rows["noise"]))
+    rates = sorted(set(rows["noise_rate"]), key=rate_order)
+
+    def table(values):
+        found = rows.assign(value=values).pivot(index="noise", columns="noise_rate", values="value")
+        return found.reindex(index=noises, columns=rates)
+
+    def number(value):
+        text = f"{value:+z.{0 if unit == '%' else 1}f}" if abs(value) < 1000 else f"{value:+.0e}"
+        return text if len(rates) <= 8 else ""  # there is no room
+
+    dots = table(rows["verdict"].isin(COLORS)).eq(True)
+    image = heatmap(ax, table(rows[column].astype(float)), limit, number, dots, 6)
+    ax.tick_params(axis="x", labelsize=7, rotation=90 if len(rates) > 4 else 0)
+    return image
+
+
+def heatmap(ax, grid, limit, number, dots, size):
+    """Draw a frame of numbers: in each cell its colour, number(value), and a dot if it has one.
+
+    The colours end at \u00b1 limit. dots: as grid, of bool; size: of the numbers, in points.
+    """
     image = ax.imshow(grid, cmap=DIVERGING, vmin=-limit, vmax=limit, aspect="auto")
-    if len(rates) <= 8:  # else there is no room for numbers
-        for (i, j), value in zip(places, grid[tuple(zip(*places, strict=True))], strict=True):
-            text = (
-                f"{value:+z.{0 if unit == '%' else 1}f}" if abs(value) < 1000 else f"{value:+.0e}"
-            )
-            ink = ink_on(value, limit)
-            ax.text(j, i, text, ha="center", va="center", color=ink, fontsize=6)
-    clear = [p for p, word in zip(places, rows["verdict"], strict=True) if word in COLORS]
-    for i, j in clear:
-        ax.plot(j + 0.35, i - 0.3, "o", color="black", markersize=2.5)
-    ax.set_xticks(range(len(rates)), rates, fontsize=7, rotation=90 if len(rates) > 4 else 0)
-    ax.set_facecolor("0.93")  # not tried
+    for (i, j), value in np.ndenumerate(grid.to_numpy()):
+        if np.isfinite(value):
+            look = {"ha": "center", "va": "center", "color": ink_on(value, limit)}
+            ax.text(j, i, number(value), fontsize=size, **look)
+        if dots.iat[i, j]:
+            ax.plot(j + 0.38, i - 0.3, "o", color="black", markersize=2.5)
+    ax.set_xticks(range(len(grid.columns)), grid.columns)
+    ax.set_facecolor("0.93")  # where there is no number
     return image

@@ -10,12 +10,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 
-from analysis.effects import effects_caption, effects_figure
+from analysis.effects import configurations, effects_caption, effects_figure, heatmap
 from analysis.formatting import in_metric, slug
-from analysis.runs import STUDY, rows_of, study_name
+from analysis.runs import STUDY, SUCCESS, rows_of, study_name
 from analysis.style import (
     COLORS,
-    DIVERGING,
     HEIGHT,
     NARROW_WIDTH,
     STYLE,
@@ -24,7 +23,6 @@ from analysis.style import (
     WIDTHS,
     broken,
     color_limit,
-    ink_on,
     line_style,
 )
 from analysis.verdicts import percent, seeds_of
@@ -79,7 +77,7 @@ def figures(studies, tables):
             if len(variants) > 1:
                 yield ablation_figure(study, summary, wrapper, variants)
     if "robustness" in tables:
-        yield from robustness_figures(tables["robustness"].frame)
+        yield from robustness_figures(tables["robustness"].frame, studies[0].metric)
 
 
 def reword(drawing, metric):
@@ -100,7 +98,7 @@ def in_both_widths(drawing, environments, draw, *what):
 
 
 def span(numbers):
-    """Spell the numbers of seeds or environments behind a line or a panel: "5", or "3 to 5"."""
+    """Write the numbers of seeds or environments behind a line or a panel: "5", or "3 to 5"."""
     low, high = min(numbers, default=0), max(numbers, default=0)
     return f"{low}" if low == high else f"{low} to {high}"
 
@@ -164,8 +162,7 @@ def best_curves_figure(study, best, statistics, narrow=False):
         for color, config in pair.items():
             mean, std = mean_and_std(study.returns[config][:, :, e])
             ax.plot(study.steps / unit, mean, color=color, linewidth=1.6)
-            low, high = mean - std, mean + std
-            ax.fill_between(study.steps / unit, low, high, color=color, alpha=0.12, linewidth=0)
+            shade(ax, study.steps / unit, mean, std, color, 0.12)
         noise = row.noise if len(row.noise) < 50 else f"{row.noise[:47]}..."
         lines = f"{noise}, {row.noise_rate}\n{verdict} (n = {seeds_of(row.n, row.n_baseline)})"
         ax.set_title(f"{row.environment}\n{lines}", fontsize=7.5)
@@ -187,6 +184,11 @@ def mean_and_std(curves):
     curves = curves[:, np.isfinite(curves[-1])]
     mean = curves.mean(axis=1) if curves.size else np.full(len(curves), np.nan)
     return mean, curves.std(axis=1, ddof=1) if curves.shape[1] > 1 else 0
+
+
+def shade(ax, x, mean, std, color, alpha=0.07):
+    """Shade one standard deviation around a line."""
+    ax.fill_between(x, mean - std, mean + std, color=color, alpha=alpha, linewidth=0)
 
 
 def curves_figure(study, noise):
@@ -211,7 +213,7 @@ def curves_figure(study, noise):
         width = 1.8 if config == BASELINE else 1.1
         marks = {"marker": marker, "markevery": (min(i, every - 1), every), "markersize": 4.5}
         ax.plot(x, mean, line, color=color, linewidth=width, label=config.noise_rate, **marks)
-        ax.fill_between(x, mean - std, mean + std, color=color, alpha=0.07, linewidth=0)
+        shade(ax, x, mean, std, color)
         ax.set_xlabel(f"training steps ({word})")
     add_legend()
     title = f"{study.name}, {noise or 'no noise'}"
@@ -256,99 +258,83 @@ def bars(ax, place, rows, width, **look):
     ax.bar(place, rows["mean"], width, edgecolor="black", linewidth=0.6, **whiskers, **look)
 
 
-def heatmap(grid, label, form, framed=None, below=0.9):
-    """Draw numbers (rows x columns), each in its cell as form(number): return figure, axes, limit.
-
-    The colours fit the data and end at \u00b1 `limit`, which for percent is at most 100; `label`
-    names their unit. `framed` marks cells (as `grid`, of bool); `below` is the space in inches for
-    the names of the columns.
-    """
-    limit = color_limit(grid, 100 if label == "percent" else np.inf)
-    rows, columns = ([broken(name) for name in names] for names in (grid.index, grid.columns))
-    lines = max(name.count("\n") for name in rows) + 1
-    longest = max(len(line) for name in rows for line in name.split("\n"))
-    left = 0.4 + 0.075 * longest
-    wide = min(1.2 * len(columns), WIDTH - left - 1.5)
-    high = max(0.5, 0.17 * lines) * len(rows)
-    height = 0.5 + high + below
-    fig = Figure(figsize=(WIDTH, height))
-    ax = fig.add_axes([left / WIDTH, below / height, wide / WIDTH, high / height])
-    image = ax.imshow(grid, cmap=DIVERGING, vmin=-limit, vmax=limit, aspect="auto")
-    for (i, j), value in np.ndenumerate(grid.to_numpy()):
-        if np.isfinite(value):
-            ink = ink_on(value, limit)
-            ax.text(j, i, form(value), ha="center", va="center", color=ink, fontsize=8)
-        if framed is not None and framed.iat[i, j]:
-            box = Rectangle((j - 0.46, i - 0.46), 0.92, 0.92, fill=False, edgecolor="black", lw=1.5)
-            ax.add_patch(box)
-    ax.set_xticks(range(len(columns)), columns)
-    ax.set_yticks(range(len(rows)), rows)
-    bar = fig.add_axes([(left + wide + 0.2) / WIDTH, below / height, 0.15 / WIDTH, high / height])
-    clipped = np.nanmax(np.abs(grid.to_numpy())) > limit
-    fig.colorbar(image, cax=bar, extend="both" if clipped else "neither", label=label)
-    return fig, ax, limit
-
-
-def robustness_figures(table):
+def robustness_figures(table, metric="return"):
     """Yield a Drawing for every figure of robustness: heatmaps, then curves."""
     for (*study, environment), rows in table.groupby([*STUDY, "environment"]):
         clean = rows[(rows["noise"] == "") & (rows["test_noise"] == "")]["mean"]
         if len(clean) and len(rows) > 1:
-            yield robustness_heatmap(study_name(*study), environment, rows, clean.iloc[0])
+            yield robustness_heatmap(study_name(*study), environment, rows, clean.iloc[0], metric)
     for (*study, noise), rows in table.groupby([*STUDY, "test_noise"]):
         of_one_noise = pd.to_numeric(rows["test_rate"], errors="coerce").notna().all()
         if noise and of_one_noise and rows["test_rate"].nunique() >= 3:
             clean = rows_of(table, study) & (table["test_noise"] == "")
-            yield robustness_curves(study_name(*study), noise, pd.concat([table[clean], rows]))
+            both = pd.concat([table[clean], rows])
+            text = f"{study_name(*study)}, tested with {noise}: mean return over seeds against the "
+            text += "rate, shaded \u00b1 one standard deviation; a line for each noise in training."
+            drawing = Drawing("robustness", f"curves {study_name(*study)} {noise}", None, text)
+            yield in_both_widths(drawing, rows["environment"], robustness_curves, both, noise)
 
 
-def robustness_heatmap(algorithm, environment, rows, clean):
+def robustness_heatmap(algorithm, environment, rows, clean, metric):
     """Draw training configuration x test condition: the score of every cell.
 
     That is 100 (R - C) / |C|, or R - C where the clean return C has no percentages.
     """
+    in_percent = rows["score_percent"].notna().all()
+    unit = "percent of that"
+    if not in_percent:
+        unit = "percentage points" if metric == SUCCESS else "units of the return"
+    grid = by_condition(rows, rows["score_percent"] if in_percent else rows["mean"] - clean)
+    limit = color_limit(grid, 100 if in_percent else np.inf)
+    name = f"{algorithm} on {environment}"
+    caption = (
+        f"{name} (seeds: {span(rows['n'])}): mean return of policies by training and test, as its "
+        f"difference from the clean return of policies trained without noise, in {unit}. "
+        f"A dot marks a test on the noise of training. The colours end at \u00b1 {limit:.3g}."
+    )
+    same = by_condition(rows, rows["tested_on"] == "the same noise").eq(True)
+    form = (lambda value: percent(value).removesuffix(" %")) if in_percent else rounded
+    drawing = Drawing("robustness", f"heatmap {name}", None, caption)
+    drawing.figure = heatmap_figure(grid, limit, form, same, name)
+    drawing.narrow = heatmap_figure(grid.T, limit, form, same.T, name, narrow=True)
+    return drawing
+
+
+def by_condition(rows, values):
+    """Arrange values of rows of robustness as a frame: training x test, in the rows' order."""
     trained = rows["noise"].where(rows["noise"] != "", "no noise") + ", " + rows["noise_rate"]
     tested = rows["test_noise"].where(rows["test_noise"] != "", "clean") + ", " + rows["test_rate"]
-    in_percent = rows["score_percent"].notna().all()
-    cells = rows.assign(
-        trained=trained.str.replace("no noise, 0.00", "no noise"),
-        tested=tested.str.replace("clean, 0.00", "clean"),
-        score=rows["score_percent"] if in_percent else rows["mean"] - clean,
-        same=rows["tested_on"] == "the same noise",
-    )
-    # Rows and columns stand in the order of the table, which is that of noises and rates.
-    order = {"index": cells["trained"].unique(), "columns": cells["tested"].unique()}
-    axes = {"index": "trained", "columns": "tested"}
-    grid = cells.pivot(**axes, values="score").reindex(**order)
-    same = cells.pivot(**axes, values="same").reindex(**order).eq(True)
-    label, form = "difference in return", rounded
-    if in_percent:
-        label, form = "percent", lambda value: percent(value).removesuffix(" %")
-    longest = max(map(len, grid.columns))
-    fig, ax, limit = heatmap(grid, label, form, same, below=0.7 + 0.05 * longest)
-    ax.tick_params(axis="x", rotation=35)
+    trained = trained.str.replace("no noise, 0.00", "no noise")
+    tested = tested.str.replace("clean, 0.00", "clean")
+    table = pd.DataFrame({"trained with": trained, "tested with": tested, "value": values})
+    table = table.pivot(index="trained with", columns="tested with", values="value")
+    return table.reindex(index=trained.unique(), columns=tested.unique())
+
+
+def heatmap_figure(grid, limit, form, dots, name, narrow=False):
+    """Draw a figure of one heatmap; see effects.heatmap."""
+    size = 6 if narrow else 8
+    lines, columns = ([broken(label) for label in labels] for labels in (grid.index, grid.columns))
+    high = 0.25 * sum(line.count("\n") + 1 for line in lines) + 0.05 * max(map(len, columns))
+    width = NARROW_WIDTH if narrow else min(WIDTH, 4 + 0.9 * len(columns))
+    fig = Figure(figsize=(width, 1.2 + high), layout="constrained")
+    ax = fig.subplots()
+    heatmap(ax, grid, limit, form, dots, size)
+    ax.set_xticks(range(len(columns)), columns, fontsize=size, rotation=35, ha="right")
+    ax.set_yticks(range(len(lines)), lines, fontsize=size)
     for text in ax.get_xticklabels():
-        text.set(ha="right", rotation_mode="anchor")
-    ax.set_title(f"{algorithm} on {environment}: trained with (rows), tested with (columns)")
-    caption = (
-        f"{algorithm} on {environment} (seeds: {span(rows['n'])}): mean return under the noise "
-    )
-    caption += "of the column, of policies trained with the noise of the row, as its difference "
-    caption += "from the clean return of policies trained without noise"
-    caption += (
-        ", in percent of that. " if in_percent else ", which is not clearly unequal to zero. "
-    )
-    caption += f"Framed: tested on the noise of training. The colours end at \u00b1 {limit:.3g}."
-    return Drawing("robustness", f"heatmap {algorithm} {environment}", fig, caption)
+        text.set_rotation_mode("anchor")
+    ax.set(xlabel=grid.columns.name, ylabel=grid.index.name)
+    ax.set_title(name, fontsize=9)
+    return fig
 
 
-def robustness_curves(algorithm, noise, rows):
+def robustness_curves(rows, noise, narrow=False):
     """Draw the return against the rate of a test noise: one line per training configuration."""
-    configs = list(dict.fromkeys(zip(rows["noise"], rows["noise_rate"], strict=True)))
-    configs.sort(key=lambda config: (config[0], rate_order(config[1])))
-    labels = [f"{noise}, {rate}" if noise else "no noise" for noise, rate in configs]
+    configs = configurations(rows)
+    labels = [f"{name}, {rate}" if name else "no noise" for name, rate in configs]
     environments = sorted(set(rows[rows["test_noise"] == noise]["environment"]))
-    fig, axes, add_legend = panels(environments, labels)
+    fig, axes, add_legend = panels(environments, labels, narrow)
     for (ax, environment), (i, config) in product(
         zip(axes, environments, strict=True), enumerate(configs)
     ):
@@ -356,17 +342,12 @@ def robustness_curves(algorithm, noise, rows):
         line = rows[mine & (rows["environment"] == environment)]
         line = line.assign(rate=line["test_rate"].astype(float)).sort_values("rate")
         color, dashes, marker = line_style(i, len(configs))
-        std = line["std"].astype(float).fillna(0)
         look = {"color": color, "marker": marker or ".", "label": labels[i]}
         ax.plot(line["rate"], line["mean"], dashes, **look)
-        ax.fill_between(
-            line["rate"], line["mean"] - std, line["mean"] + std, color=color, alpha=0.07, lw=0
-        )
+        shade(ax, line["rate"], line["mean"], line["std"].astype(float).fillna(0), color)
         ax.set_xlabel("rate of the noise in the test (0: clean)")
     add_legend()
-    caption = f"{algorithm}, tested with {noise}: mean return over seeds against the rate, shaded "
-    caption += "\u00b1 one standard deviation; one line for each noise in training."
-    return Drawing("robustness", f"curves {algorithm} {noise}", fig, caption)
+    return fig
 
 
 def write_figure(out, drawing, latex=False):

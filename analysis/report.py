@@ -6,14 +6,14 @@ Figures that the page shows folded are files beside it; all else is in the page.
 import base64
 import os
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import jinja2
+import pandas as pd
 from markupsafe import Markup, escape
 
 from analysis.formatting import shown
-from analysis.robustness import robustness_sentences
-from analysis.runs import AVERAGED
 from analysis.verdicts import clear_first, headlines, tally
 
 SECTIONS = {
@@ -26,15 +26,29 @@ SECTIONS = {
     "success": "Success",
     "statistics": "Statistics",
     "parameters": "Parameters",
-    "interactions": "Two noises together",
+    "interactions": "Two noises combined",
     "robustness": "Robustness",
     "summary": "All results",
     "missing": "Runs left out",
 }
 FIGURES_OF = {"best_curves": "early_performance", "curves": "early_performance"}
 FOLDED = ("curves", "parameters")  # where there are several: one for each noise
-ROWS = 15  # a longer table is folded
+MOST_ROWS = 15  # a longer table is folded
 DOCS = Path(__file__).parents[1] / "docs/statistics.md"  # how all numbers are computed
+
+
+@dataclass
+class Results:
+    """What an analysis has found, as it is printed and written."""
+
+    studies: list
+    tables: dict  # name -> Table
+    sentences: pd.DataFrame  # see verdicts.in_sentences
+    robustness: list  # sentences
+    overview: str
+    problems: str  # runs that were left out, or ""
+    notes: list
+    versions: list  # notes on versions of code and libraries, which change no verdict
 
 
 def breakable(text):
@@ -52,7 +66,7 @@ def source(path):
     return f"data:image/svg+xml;base64,{base64.b64encode(path.read_bytes()).decode()}"
 
 
-def sections_of(out, tables, drawn):
+def sections_of(out, results, drawn):
     """Arrange the tables and figures as the page shows them; a section without any is left out.
 
     drawn: every Drawing. Return the figures of the effects, which are in no section, and a list of
@@ -63,16 +77,14 @@ def sections_of(out, tables, drawn):
         for key, title in SECTIONS.items()
     }
     effects = []
-    for table in tables.values():
-        if len(table.frame):
-            text = shown(table)
+    for table in results.tables.values():
+        text = shown(table)
+        if len(text):
             text = text.loc[:, (text != "\u2013").any()]  # a column of dashes says nothing
             entry = {"name": table.name, "caption": table.caption, "note": table.note}
             entry |= {"columns": text.columns, "rows": text.values.tolist()}
             sections[table.section]["tables"].append(entry)
-    if "robustness_score" in tables:
-        said = robustness_sentences(tables["robustness_score"].frame)
-        sections["robustness"]["said"] = list(said)
+    sections["robustness"]["said"] = results.robustness
     kinds = [drawing.kind for drawing in drawn]
     for drawing in drawn:
         section = sections.get(FIGURES_OF.get(drawing.kind, drawing.kind))
@@ -88,28 +100,23 @@ def sections_of(out, tables, drawn):
     return effects, shown_ones
 
 
-def write_report(out, verdicts, tables, drawn, overview, problems, notes):
+def write_report(out, results, drawn):
     """Write report.html: the effects and the verdicts first, then everything else."""
     pages = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True
     )
     pages.filters["breakable"] = breakable
-    effects, sections = sections_of(out, tables, drawn)
-    first, rest = clear_first(verdicts)
-    averaged = [note for note in notes if AVERAGED in note]  # these change no verdict
+    effects, sections = sections_of(out, results, drawn)
+    first, rest = clear_first(results.sentences)
     html = pages.get_template("report.html.jinja").render(
+        results=results,
         effects=effects,
-        headlines=headlines(tables["statistics"].frame, tables["best"].frame),
+        headlines=headlines(results.tables["statistics"].frame, results.tables["best"].frame),
         first=first.to_dict("records"),
         rest=rest.to_dict("records"),
         rest_tally=tally(rest["verdict"]),
-        with_all=(rest["scope"] == "all").any(),
         sections=sections,
         docs=os.path.relpath(DOCS, out),
-        most_rows=ROWS,
-        overview=overview,
-        problems=problems,
-        notes=[note for note in notes if note not in averaged],
-        averaged=averaged,
+        most_rows=MOST_ROWS,
     )
     (out / "report.html").write_text(html, "utf-8")

@@ -8,7 +8,8 @@ conditions. A condition counts if it is not clean, none of its wrappers was in t
 reward noise or early termination, which change no policy's behaviour in a test. It is compared with
 that of the policies trained without noise under the same conditions, by the test of all verdicts
 (statistics.compare), with Holm's correction over the training configurations of an algorithm; tests
-in another environment than the training's have a correction of their own.
+in another environment than the training's have a correction of their own. All of this may be of the
+rate of success instead of the return, in percentage points.
 """
 
 from pathlib import Path
@@ -16,12 +17,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from analysis.formatting import P_VALUE, SHARE, WHOLE, Table
+from analysis.formatting import P_VALUE, SHARE, WHOLE, Table, in_metric
 from analysis.runs import (
     ELSEWHERE,
     KEYS,
     ROBUSTNESS_COLUMNS,
     STUDY,
+    SUCCESS,
     study_name,
     where_tested,
 )
@@ -54,17 +56,19 @@ FORMATS |= dict.fromkeys(("effect_size", "t"), SHARE)
 ONLY_CSV = {"robustness_score": ("t", "pooled_std", "smallest_p"), "robustness": ("score_percent",)}
 CAPTIONS = {  # at most two lines in the report; docs/statistics.md says how they are computed
     "robustness_score": """Primary figure of robustness: the mean return under noise that was not in
-training, of policies trained with noise and without. Scores: relative to the clean return.""",
+training, of policies trained with noise and without.""",
     "robustness": """Return under every test condition: mean \u00b1 standard deviation over n seeds,
 and difference from the policies trained without noise.""",
 }
-CAPTIONS = {name: " ".join(text.split()) for name, text in CAPTIONS.items()}
+NOTES = {"robustness_score": "Scores: relative to the clean return.", "robustness": ""}
 
 
-def read_robustness(runs_dir, runs):
+def read_robustness(runs_dir, runs, metric="return"):
     """Read robustness.csv (or .csv.gz) of every finished run: one row per run and condition.
 
-    Return the frame (RUN_COLUMNS) and notes on the files that could not be read.
+    metric: what `mean` is of, "return" or "success rate" (in percent); of the latter, only
+    conditions in which the environment tells it. Return the frame (RUN_COLUMNS) and notes on the
+    files that could not be read.
     """
     rows, notes = [], []
     for run in runs[runs["status"] == "finished"].itertuples():
@@ -73,7 +77,7 @@ def read_robustness(runs_dir, runs):
         if not paths:
             continue
         try:
-            episodes = read_episodes(paths[0])
+            episodes = read_episodes(paths[0], metric)
         except (OSError, ValueError, EOFError) as error:
             notes.append(f"{run.run}: {paths[0].name} is left out: {' '.join(str(error).split())}")
             continue
@@ -85,29 +89,32 @@ def read_robustness(runs_dir, runs):
     return pd.DataFrame(rows, columns=RUN_COLUMNS), notes
 
 
-def read_episodes(path):
-    """Read one file: {(Configuration, environment): returns of its episodes}.
+def read_episodes(path, metric="return"):
+    """Read one file: {(Configuration, environment): results of its episodes}.
 
-    The environment is empty for that of the training. Raises ValueError.
+    The environment is empty for that of the training. A result is a return, or of success 100 or 0.
+    Raises ValueError.
     """
     text = {"noise": str, "noise_rate": str, "environment": str}
-    table = pd.read_csv(path, dtype=text, keep_default_na=False)
+    table = pd.read_csv(path, dtype=text).fillna(dict.fromkeys(text, ""))
     known, more = table.columns[: len(ROBUSTNESS_COLUMNS)], table.columns[len(ROBUSTNESS_COLUMNS) :]
     if list(known) != ROBUSTNESS_COLUMNS or not set(more) <= {"success", "environment"}:
         raise ValueError("unexpected header")
-    if "environment" not in more:
-        table["environment"] = ""
     returns = pd.to_numeric(table["episodic_return"])
     if not np.isfinite(returns).all() or not len(returns):
         raise ValueError("no episodes, or a return that is not finite")
-    keys = [table[name] for name in ("noise", "noise_rate", "environment")]
-    groups = returns.groupby(keys, sort=False)
-    found = {
-        (Configuration.parse(*key[:2]), key[2]): group.to_numpy(float) for key, group in groups
-    }
-    for name in set().union(*(condition.wrappers for condition, _ in found)) - WRAPPERS.keys():
-        if ":" not in name:  # else one of the user's own
-            raise ValueError(f"unknown noise {name!r}")
+    results = returns
+    if metric == SUCCESS:
+        results = 100 * pd.to_numeric(table.get("success", returns * np.nan)).dropna()
+    table = table.reindex(columns=[*text], fill_value="").loc[results.index]
+    keys = [table[name] for name in table]
+    found = {}
+    for (noise, rate, environment), group in results.groupby(keys, sort=False):
+        condition = Configuration.parse(noise, rate)
+        unknown = [name for name in condition.wrappers if name not in WRAPPERS and ":" not in name]
+        if unknown:  # and none of the user's own
+            raise ValueError(f"unknown noise {unknown[0]!r}")
+        found[condition, environment] = group.to_numpy(float)
     return found
 
 
@@ -273,7 +280,7 @@ def primary(scores):
     return of_all | ~of_all.groupby([*keys, tested_elsewhere(scores)]).transform("any")
 
 
-def robustness_tables(runs):
+def robustness_tables(runs, metric="return"):
     """Compute the tables of robustness from read_robustness's frame: name -> Table."""
     if runs.empty:
         return {}
@@ -283,33 +290,42 @@ def robustness_tables(runs):
     keys = [judged[name] for name in STUDY]
     for _, family in judged.groupby([*keys, tested_elsewhere(judged)]):
         scores.loc[family.index, "p_holm"] = holm(family["p"].to_numpy(float))
-    return {
-        name: Table(name, frame, CAPTIONS[name], "robustness", FORMATS, only_csv=ONLY_CSV[name])
-        for name, frame in (("robustness_score", scores), ("robustness", table))
-    }
+    tables = {}
+    for name, frame in (("robustness_score", scores), ("robustness", table)):
+        note, caption = NOTES[name], in_metric(" ".join(CAPTIONS[name].split()), metric)
+        if metric == SUCCESS:  # never percent of a rate; the worst tenth of episodes is 0 or 100
+            note = "Rates are in percent of the episodes, differences in percentage points."
+            percents = [column for column in frame if column.endswith("_percent")]
+            frame[frame.columns.intersection([*percents, "cvar", "worst_condition"])] = np.nan
+        shape = {"formats": FORMATS, "only_csv": ONLY_CSV[name], "note": note}
+        tables[name] = Table(name, frame, caption, "robustness", **shape)
+    return tables
 
 
-def robustness_sentences(scores):
-    """Yield one plain sentence for each training configuration: is it more robust?"""
+def robustness_sentences(scores, unit=""):
+    """Yield one plain sentence for each training configuration: is it more robust?
+
+    unit: of the difference, such as POINTS.
+    """
     for row in scores[primary(scores)].itertuples():
         where = row.environment or "all environments together"
         study = study_name(row.algorithm, row.exp_name, row.phase)
         start = f"{study} on {where}, trained with {row.noise} at rate {row.noise_rate}"
-        evidence, limit = difference(row), ""
+        evidence, limit = difference(row, unit), ""
         if pd.isna(row.p):
-            verdict = "too few seeds for a test of robustness to new noise"
+            shown = "too few seeds for a test of robustness to new noise"
         elif significant(row.p):
             more = "more" if row.t > 0 else "less"
-            verdict = f"{'' if significant(row.p_holm) else 'perhaps '}{more} robust to new noise"
+            shown = f"{'' if significant(row.p_holm) else 'perhaps '}{more} robust to new noise"
         else:
-            verdict = "no clear difference in robustness to new noise"
+            shown = "no clear difference in robustness to new noise"
         if pd.notna(row.p):
             evidence += f", p {p_value(row.p)}, Holm {p_value(row.p_holm).removeprefix('= ')}"
         if not significant(row.smallest_p):
             limit = f"; {counted(row.n, 'seed')} against {row.n_baseline} cannot show any"
         elif not significant(row.p) and row.detectable > 0:
-            found = rounded(row.detectable, spread_of(row))
+            found = rounded(row.detectable, spread_of(row)) + unit
             limit = f"; a difference of {found} would have been seen (80 % power)"
         if pd.notna(row.clean_change_percent):
             evidence += f"; clean return {percent(row.clean_change_percent)}"
-        yield f"{start}: {verdict} ({evidence}){limit}.{borderline(row)}"
+        yield f"{start}: {shown} ({evidence}){limit}.{borderline(row)}"

@@ -89,10 +89,10 @@ def evaluations(text, episodes, total):
         raise ValueError("the last line is half-written")
     if text.count("\n") == 1:
         raise ValueError("no evaluation")
-    rows = np.loadtxt(io.StringIO(text), delimiter=",", skiprows=1, ndmin=2, comments=None)
-    if rows.shape[1] != len(names) or len(rows) % episodes or not np.isfinite(rows).all():
+    numbers = np.loadtxt(io.StringIO(text), delimiter=",", skiprows=1, ndmin=2, comments=None)
+    if numbers.shape[1] != len(names) or len(numbers) % episodes or not np.isfinite(numbers).all():
         raise ValueError("incomplete or non-numeric lines")
-    table = np.moveaxis(rows.reshape(-1, episodes, len(names)), 2, 0)
+    table = np.moveaxis(numbers.reshape(-1, episodes, len(names)), 2, 0)
     step, episode, episodic_return, _, *success = table
     if (episode != np.arange(episodes)).any() or (step != step[:, :1]).any():
         raise ValueError("an evaluation is incomplete")
@@ -166,28 +166,18 @@ def leave_out_different(rows):
 
 
 def usual_settings(settings):
-    """Return the arguments that most runs of a study agree on.
+    """Return the most frequent value of every argument of a study.
 
     settings: a dict for each run. An argument that a run lacks, because an older version made it,
-    is no difference. Of equally frequent ones, those of the longest runs are the study.
+    is no difference. Of equally frequent values, that of the longest runs is taken.
     """
-    counts = Counter(json.dumps(each, sort_keys=True) for each in settings)
-    kinds = {text: json.loads(text) for text in sorted(counts)}
-    usual = {}
-    while True:
-        open_to = {
-            text: kind
-            for text, kind in kinds.items()
-            if kind.keys() - usual.keys() and not difference(kind, usual)
-        }
-        if not open_to:
-            return usual
-
-        def support(text, among=open_to):
-            alike = [other for other in among if not difference(among[text], among[other])]
-            return sum(counts[other] for other in alike), among[text].get("total_timesteps", 0)
-
-        usual |= open_to[max(open_to, key=support)]
+    found = {}  # argument -> {value as text: how many runs have it, the steps of the longest}
+    for run in settings:
+        for name, value in run.items():
+            runs, steps = found.setdefault(name, {}).get(json.dumps(value), (0, 0))
+            longest = max(steps, run.get("total_timesteps", 0))
+            found[name][json.dumps(value)] = runs + 1, longest
+    return {name: json.loads(max(counts, key=counts.get)) for name, counts in found.items()}
 
 
 def set_older_versions_apart(runs):
@@ -270,17 +260,17 @@ def missing_runs(runs):
     for study, group in runs.groupby(STUDY):
         if study[2] == SEARCH:
             continue
-        cells = group.groupby(["environment", "configuration"])["seed"].agg(set).to_dict()
-        baselines = {(environment, BASELINE) for environment, _ in cells}
-        usual = [seeds for key, seeds in cells.items() if key not in baselines]
+        found = group.groupby(["environment", "configuration"])["seed"].agg(set).to_dict()
+        baselines = {(environment, BASELINE) for environment, _ in found}
+        usual = [seeds for key, seeds in found.items() if key not in baselines]
         if not usual:
-            usual = list(cells.values())
+            usual = list(found.values())
         counts = Counter(seed for seeds in usual for seed in seeds)
         expected = {seed for seed, n in counts.items() if 2 * n >= len(usual)}
-        for key in sorted(cells.keys() | baselines):
+        for key in sorted(found.keys() | baselines):
             environment, config = key
             keys = (*study, environment, config.noise, config.noise_rate)
-            for seed in sorted(expected - cells.get(key, set())):
+            for seed in sorted(expected - found.get(key, set())):
                 rows.append((*keys, int(seed), "missing", "no run folder"))
     return pd.DataFrame(rows, columns=[*KEYS, "seed", "status", "reason"])
 
@@ -360,7 +350,7 @@ class Study:
             return difference * np.nan
         return percent_of(difference, self.final(BASELINE)[:, e])
 
-    def unlearned(self):
+    def all_equal(self):
         """Return the environments where all tests of two or more runs are equal: {name: value}."""
         found = {}
         for e, env in enumerate(self.environments):
@@ -410,23 +400,20 @@ def make_studies(runs, metric="return"):
                 f"{name} is apart, because averages over environments take the newest version of "
                 f"each: {', '.join(envs)}"
             )
-        notes += version_notes(name, group["versions"])
         studies.append(study)
     return studies, notes
 
 
-AVERAGED = "some rows average runs"  # of different versions: in the notes that say so
-
-
-def version_notes(name, versions):
-    """Say in words where runs of one study differ in versions of code or libraries."""
+def version_notes(runs):
+    """Say in words where finished runs of one study differ in versions of code or libraries."""
     notes = []
-    for library in sorted(set().union(*versions)):
-        counts = Counter(str(version.get(library)) for version in versions)
-        if len(counts) > 1:
-            found = ", ".join(f"{version} (n = {n})" for version, n in sorted(counts.items()))
-            what = f"with different {library}"
-            if library == "git commit":
+    for key, group in runs[runs["status"] == "finished"].groupby(STUDY):
+        for library in sorted(set().union(*group["versions"])):
+            counts = Counter(str(versions.get(library)) for versions in group["versions"])
+            if len(counts) > 1:
+                found = ", ".join(f"{version} (n = {n})" for version, n in sorted(counts.items()))
                 what = "of different code versions"
-            notes.append(f"{name}: {AVERAGED} {what}: {found}")
+                if library != "git commit":
+                    what = f"with different {library}"
+                notes.append(f"{study_name(*key)}: some rows average runs {what}: {found}")
     return notes

@@ -90,20 +90,20 @@ def bootstrap_iqm(scores, baseline=None, resamples=RESAMPLES):
         pairs = [(a, np.asarray(iqm(b))[..., None]) for a, b in zip(x, y, strict=True)]
         return iqm(np.concatenate([100 * (a - middle) / abs(middle) for a, middle in pairs], -1))
 
-    def estimate(cells):
-        x, y = cells[: len(noisy)], cells[len(noisy) :]
+    def estimate(samples):
+        x, y = samples[: len(noisy)], samples[len(noisy) :]
         return improvement(x, y) - improvement(y, y) if y else iqm(np.concatenate(x, axis=-1))
 
     noisy = columns(scores)
-    cells = noisy + ([] if baseline is None else columns(baseline))
-    value = estimate(cells)
-    n = np.array([len(cell) for cell in cells])
+    samples = noisy + ([] if baseline is None else columns(baseline))
+    value = estimate(samples)
+    n = np.array([len(sample) for sample in samples])
     if n.min() < SEEDS_FOR_IQM:
         return value, np.nan, np.nan
-    observed = [np.broadcast_to(cell, (resamples, len(cell))) for cell in cells]
-    variances = np.empty(len(cells))
-    for i, cell in enumerate(cells):
-        drawn = cell[rng.integers(n[i], size=(resamples, n[i]))]
+    observed = [np.broadcast_to(sample, (resamples, len(sample))) for sample in samples]
+    variances = np.empty(len(samples))
+    for i, sample in enumerate(samples):
+        drawn = sample[rng.integers(n[i], size=(resamples, n[i]))]
         estimates = estimate([*observed[:i], drawn, *observed[i + 1 :]])
         variances[i] = n[i] / (n[i] - 1) * estimates.var(ddof=1)
     variance = variances.sum()
@@ -155,25 +155,25 @@ def probability_of_improvement(x, y):
 
 @lru_cache(maxsize=4)  # one may take 50 MB
 def partitions(n, m):
-    """Return ways to divide n + m values: rows of 1 (first sample) and 0, the actual one first.
+    """Return ways to divide n + m values, the actual one first; 1: first sample, 0: second.
 
     All of them, or, where there are more than MOST_PARTITIONS, RANDOM_PARTITIONS after the actual
     one, from seed 0.
     """
     if comb(n + m, n) <= MOST_PARTITIONS:
         chosen = list(combinations(range(n + m), n))
-        rows = np.zeros((len(chosen), n + m))
-        np.put_along_axis(rows, np.array(chosen), 1, axis=1)
-        return rows
+        divisions = np.zeros((len(chosen), n + m))
+        np.put_along_axis(divisions, np.array(chosen), 1, axis=1)
+        return divisions
     return random_partitions(n, m, RANDOM_PARTITIONS, np.random.default_rng(0))
 
 
 def random_partitions(n, m, number, rng):
     """Return the actual division of n + m values and a number of random ones; see partitions."""
-    rows = np.zeros((1 + number, n + m))
-    rows[:, :n] = 1
-    rows[1:] = rng.permuted(rows[1:], axis=1)
-    return rows
+    divisions = np.zeros((1 + number, n + m))
+    divisions[:, :n] = 1
+    divisions[1:] = rng.permuted(divisions[1:], axis=1)
+    return divisions
 
 
 def welch_t(values, chosen):
@@ -292,25 +292,6 @@ def compare(x, y):
     return Comparison(*sizes, *found, t, p, smallest_p, detectable, needed)
 
 
-def leave_one_seed_out(finals):
-    """Value of choosing the best configuration, without the luck of choosing on the same seeds.
-
-    It values the procedure, not the configuration that is best on all seeds: another one may be
-    chosen each time. It is descriptive: the terms share seeds, so it has no honest interval. The
-    configuration that is best on all other seeds is measured on the seed s that was left out:
-    mean over s of finals[argmax_c mean_{t != s} finals[c, t], s].
-
-    finals (configs x seeds) -> float.
-    """
-    held_out = []
-    for seed in range(finals.shape[1]):
-        others = np.delete(finals, seed, axis=1)
-        able = np.isfinite(finals[:, seed]) & np.isfinite(others).any(axis=1)
-        if able.any():
-            held_out.append(finals[able, seed][np.nanmean(others[able], axis=1).argmax()])
-    return np.mean(held_out) if held_out else np.nan
-
-
 def steps_to_reach(curves, steps, target):
     """First step with a mean over seeds of at least `target`, or NaN. curves (steps x seeds)."""
     curves = curves[:, np.isfinite(curves).all(axis=0)]
@@ -320,18 +301,18 @@ def steps_to_reach(curves, steps, target):
     return steps[reached[0]] if len(reached) else np.nan
 
 
-def contrast(cells, weights):
+def contrast(samples, weights):
     """Weighted sum of the means of independent samples, with its standard error and 95 % interval.
 
     Student's t with Satterthwaite's degrees of freedom: each sample has a variance of its own.
-    cells: arrays (n_i), weights: numbers -> estimate, standard error, low, high; NaN where a sample
-    has fewer than two values.
+    samples: arrays (n_i), weights: numbers -> estimate, standard error, low, high; NaN where a
+    sample has fewer than two values.
     """
-    estimate = sum(weight * np.mean(cell) for cell, weight in zip(cells, weights, strict=True))
-    sizes = np.array([len(cell) for cell in cells])
+    estimate = sum(w * np.mean(sample) for w, sample in zip(weights, samples, strict=True))
+    sizes = np.array([len(sample) for sample in samples])
     if sizes.min() < 2:
         return estimate, nan, nan, nan
-    variances = np.array([np.var(cell, ddof=1) for cell in cells])
+    variances = np.array([np.var(sample, ddof=1) for sample in samples])
     if not variances.any():
         return estimate, 0.0, estimate, estimate
     error, half = satterthwaite(np.square(weights) * variances / sizes, sizes)

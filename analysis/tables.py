@@ -18,20 +18,27 @@ from analysis.luck import (
     luck_rows,
 )
 from analysis.paper import compare_tables
-from analysis.runs import KEYS, STUDY, SUCCESS, rows_of, study_name
+from analysis.runs import KEYS, STUDY, SUCCESS, study_name
 from analysis.statistics import (
     LEVEL,
     bootstrap_iqm,
     compare,
     contrast,
     holm,
-    leave_one_seed_out,
     mean_std,
     probability_of_improvement,
     steps_to_reach,
 )
-from analysis.verdicts import UNLEARNED, counted, difference, listed, seeds_of, verdict
-from noisy_wrappers import BASELINE, rounded
+from analysis.verdicts import (
+    ALL_EQUAL,
+    counted,
+    difference,
+    listed,
+    seeds_of,
+    verdict,
+    what_all_runs_do,
+)
+from noisy_wrappers import BASELINE
 
 PERCENTS = ("difference_percent", "iqm_change_percent", "iqm_change_low", "iqm_change_high")
 INTERVAL = ("difference_low", "difference_high")
@@ -42,7 +49,7 @@ _COLUMNS = {
         baseline_std difference improvement_percent p steps_to_baseline""",
     "best": """environment noise noise_rate baseline_mean baseline_std noisy_mean
         noisy_std difference improvement_percent p p_adjusted luck_median luck_95 p_luck
-        leave_one_seed_out_percent n n_baseline chosen_from leave_one_seed_out_mean""",
+        n n_baseline chosen_from""",
     "consistency": """noise noise_rate percent_of_environments
         average_improvement_percent std_improvement_percent p p_adjusted p_luck
         environments without_percent n fails_at_every_rate""",
@@ -111,22 +118,13 @@ def summary_rows(study):
         yield row
 
 
-def best_rows(study, summary):
-    """Yield the best noise per environment, with the leave-one-seed-out value of choosing it."""
+def best_rows(summary):
+    """Yield the best noise of every study and environment, from the rows of a summary."""
     noisy = summary[summary["difference"].notna()]
-    for env, group in noisy[rows_of(noisy, study.key)].groupby("environment"):
+    for _, group in noisy.groupby([*STUDY, "environment"]):
         best = group.loc[group["mean"].idxmax()]
-        e = study.environments.index(env)
-        finals = np.stack([study.final(c)[:, e] for c in study.returns if c != BASELINE])
-        held_out = leave_one_seed_out(finals)
-        gain = held_out - best["baseline_mean"]
-        yield best.to_dict() | {
-            "noisy_mean": best["mean"],
-            "noisy_std": best["std"],
-            "chosen_from": len(group),
-            "leave_one_seed_out_mean": held_out,
-            "leave_one_seed_out_percent": study.percent_of(gain, e),
-        }
+        named = {"noisy_mean": best["mean"], "noisy_std": best["std"]}
+        yield best.to_dict() | named | {"chosen_from": len(group)}
 
 
 def consistency_rows(summary):
@@ -182,15 +180,15 @@ def statistics_rows(study):
     places = [("environment", env, [e]) for e, env in enumerate(study.environments)]
     if study.phase != "confirmation":  # there each environment has its one comparison
         places.append(("all", "", list(range(len(study.environments)))))
-    limits, unlearned = baseline_limits(study), study.unlearned()
-    learned = np.array([env not in unlearned for env in study.environments])
+    limits, all_equal = baseline_limits(study), study.all_equal()
+    differing = np.array([env not in all_equal for env in study.environments])
     for (scope, environment, chosen), config in product(places, study.returns):
         x, y = study.final(config)[:, chosen], study.final(BASELINE)[:, chosen]
         seeds = np.isfinite(x).sum(axis=0)
         fewest = 2 if scope == "all" else 1
         both = (seeds >= fewest) & (np.isfinite(y).sum(axis=0) >= fewest)
         if scope == "all":
-            both &= learned
+            both &= differing
         row = row_keys(study, environment, config) | {"scope": scope}
         if scope == "all":
             if config == BASELINE or both.sum() < 2:
@@ -205,9 +203,9 @@ def statistics_rows(study):
             row |= against_baseline(x[:, both], y[:, both], clear)
             if study.metric == SUCCESS:  # never percent of a rate
                 row |= dict.fromkeys(PERCENTS, np.nan)
-            if environment in unlearned:
+            if environment in all_equal:
                 row |= dict.fromkeys([*PERCENTS, *INTERVAL, "t", "p"], np.nan)
-                row["verdict"] = UNLEARNED
+                row["verdict"] = ALL_EQUAL
         yield row
 
 
@@ -235,7 +233,7 @@ def against_baseline(x, y, clear):
 
 
 def interaction_rows(study):
-    """Yield, for two noises and both together: how much more do they change than their sum?
+    """Yield, for two noises and both at once: how much more do they change than their sum?
 
     I = J(A + B) - J(A) - J(B) + J(0) of the mean final returns, in every environment where all
     four have at least SEEDS_FOR_INTERACTION seeds, with a 95 % interval; then relative to |J(0)|.
@@ -244,18 +242,18 @@ def interaction_rows(study):
         parts = config.parts
         if len(parts) != 2 or parts[0] == parts[1]:
             continue
-        cells = []
+        samples = []
         for part in (config, *parts, BASELINE):
             finals = study.final(part)[:, e] if part in study.returns else np.empty(0)
-            cells.append(finals[np.isfinite(finals)])
-        if min(map(len, cells)) < SEEDS_FOR_INTERACTION:
+            samples.append(finals[np.isfinite(finals)])
+        if min(map(len, samples)) < SEEDS_FOR_INTERACTION:
             continue
-        both, first, second, alone = cells
-        value, error, low, high = contrast(cells, [1, -1, -1, 1])
+        both, first, second, alone = samples
+        value, error, low, high = contrast(samples, [1, -1, -1, 1])
         percent = study.percent_of(1.0, e)
         yield {
             **row_keys(study, environment, config),
-            "n": min(map(len, cells)),
+            "n": min(map(len, samples)),
             "both_mean": both.mean(),
             "first_mean": first.mean(),
             "second_mean": second.mean(),
@@ -294,7 +292,7 @@ def split_consistency(consistency):
 
 
 def adjust(statistics):
-    """Add p corrected for all comparisons of a family, the smallest in reach, and verdicts.
+    """Add p corrected for all comparisons of a family, the smallest possible, and verdicts.
 
     A family is a study in one environment, or in all, corrected with Benjamini and Hochberg's
     method. The confirmations of `./benchmark.sh choose` were fixed beforehand: they are one family,
@@ -333,7 +331,7 @@ def with_p(table, statistics):
 def family_notes(statistics):
     """Say where the number of seeds is too small to show a difference, if corrected."""
     notes = []
-    compared = statistics[statistics["verdict"].notna() & (statistics["verdict"] != UNLEARNED)]
+    compared = statistics[statistics["verdict"].notna() & (statistics["verdict"] != ALL_EQUAL)]
     keys = ["comparisons", "smallest_p"]
     for study, rows in compared.groupby(STUDY):
         best = rows.sort_values("smallest_p", kind="stable")
@@ -357,19 +355,14 @@ def family_notes(statistics):
     return notes
 
 
-def unlearned_notes(studies):
-    """Say where no run has learned anything, so that comparisons say nothing."""
-    notes = []
-    for study in studies:
-        for environment, value in study.unlearned().items():
-            result = f"return {rounded(value)}"
-            if study.metric == SUCCESS:
-                result = f"succeed in {value:.0f} % of the episodes"
-            notes.append(
-                f"{study.name} on {environment}: all runs {result}: nothing was learned in "
-                f"{study.steps[-1]:,} steps, so they say nothing about noise."
-            )
-    return notes
+def all_equal_notes(studies):
+    """Say where all tests of all runs have the same result, so that comparisons say nothing."""
+    return [
+        f"{study.name} on {environment}: {what_all_runs_do(value, study.metric)} in "
+        f"{study.steps[-1]:,} steps, so they say nothing about noise."
+        for study in studies
+        for environment, value in study.all_equal().items()
+    ]
 
 
 def success_table(studies):
@@ -399,8 +392,8 @@ seeds, and the difference from no noise. Here p is not corrected.""",
 95 % interval, and its test. The effect size is the difference in standard deviations.""",
     "success": """Success rate in the final test, in percent of its episodes: mean \u00b1 standard
 deviation over n seeds, and the difference from no noise in percentage points.""",
-    "interactions": """What two noises do together beyond the sum of their effects, with 95 %
-intervals. Above zero, both together are better than the sum.""",
+    "interactions": """What two combined noises do beyond the sum of their effects, with 95 %
+intervals. Above zero, both at once are better than the sum.""",
     "choice": """How the noise was chosen: each round of the search drops the worse half, and fresh
 seeds confirm the winner or not.""",
     "missing": "Runs that are in no table and no figure, with their seeds.",
@@ -433,11 +426,12 @@ def make_tables(studies, paper=None):
     # The seeds of a search chose the noise, so they cannot judge it.
     judging = [study for study in studies if study.phase != "search"]
     judged = summary[summary["phase"] != "search"]
-    best = frame("best", (row for study in judging for row in best_rows(study, judged)))
+    best = frame("best", best_rows(judged))
     consistency = frame("consistency", consistency_rows(judged))
     early = frame("early_performance", (row for study in studies for row in early_rows(study)))
     statistics = frame("statistics", (row for study in judging for row in statistics_rows(study)))
     statistics = adjust(statistics)
+    compared = statistics[statistics["verdict"].notna()]
     summary, judged, best, consistency = (
         with_p(table, statistics) for table in (summary, judged, best, consistency)
     )
@@ -456,7 +450,7 @@ def make_tables(studies, paper=None):
         table_of("consistent", good, note=note),
         table_of("consistently_worse", bad, note=f"{failing} {note}".strip()),
         table_of("luck", luck, only_csv=LUCK_ONLY_CSV),
-        table_of("statistics", statistics, only_csv=STATISTICS_ONLY_CSV, note=note),
+        table_of("statistics", statistics, view=compared, only_csv=STATISTICS_ONLY_CSV, note=note),
         table_of("early_performance", early, rates_beside=True),
     ]
     found = frame("interactions", (row for study in judging for row in interaction_rows(study)))

@@ -9,15 +9,15 @@ from math import nan
 
 import pandas as pd
 
-from analysis.runs import STUDY, rows_of, study_name
+from analysis.runs import STUDY, SUCCESS, rows_of, study_name
 from analysis.statistics import LEVEL, SEEDS_FOR_INTERVAL
 from noisy_wrappers import rounded
 
 UNCLEAR = "no clear difference"
 TOO_FEW = "too few seeds"
-UNLEARNED = "nothing learned"
+ALL_EQUAL = "all equal"  # all tests of all runs
 CLEAR = ["better", "worse"]
-VERDICTS = [*CLEAR, "perhaps better", "perhaps worse", UNCLEAR, TOO_FEW, UNLEARNED]  # in this order
+VERDICTS = [*CLEAR, "perhaps better", "perhaps worse", UNCLEAR, TOO_FEW, ALL_EQUAL]  # in this order
 POINTS = " percentage points of success"
 MAX_SEEDS = 1000  # a difference that would take more seeds is said to take more than these
 
@@ -26,8 +26,8 @@ def verdict(row):
     """Name the verdict of a row of statistics: one of VERDICTS, or NaN without a baseline."""
     if pd.isna(row["n_baseline"]):
         return nan
-    if row.get("verdict") == UNLEARNED:
-        return UNLEARNED
+    if row.get("verdict") == ALL_EQUAL:
+        return ALL_EQUAL
     if pd.isna(row["p"]):
         return TOO_FEW
     if not significant(row["p"]):
@@ -45,22 +45,22 @@ def significant(p):
 
 
 def percent(value, sign="+"):
-    """Spell a percentage: whole from 10 on, with a decimal below."""
+    """Write a percentage: whole from 10 on, with a decimal below."""
     return f"{value:{sign}z,.{0 if abs(value) >= 10 else 1}f} %"
 
 
 def counted(number, word):
-    """Spell how many there are: "1 seed", "5 seeds"."""
+    """Write how many there are: "1 seed", "5 seeds"."""
     return f"{number:.0f} {word}" + ("" if number == 1 else "s")
 
 
 def seeds_of(n, n_baseline):
-    """Spell the seeds with and without noise: "5", or "5/10" where they differ."""
+    """Write the seeds with and without noise: "5", or "5/10" where they differ."""
     return f"{n:.0f}" if n == n_baseline else f"{n:.0f}/{n_baseline:.0f}"
 
 
 def p_value(p):
-    """Spell a p-value for a sentence: "= 0.04", or "< 0.001"."""
+    """Write a p-value for a sentence: "= 0.04", or "< 0.001"."""
     return f"= {p:.2g}" if p >= 0.001 else "< 0.001"
 
 
@@ -71,7 +71,7 @@ def spread_of(row):
 
 
 def difference(row, unit=""):
-    """Spell what a comparison found: "+11.8 [8.4, 15.3] (+21 %)", of several environments in sd.
+    """Write what a comparison found: "+11.8 [8.4, 15.3] (+21 %)", of several environments in sd.
 
     unit: of the difference, such as POINTS.
     """
@@ -93,7 +93,7 @@ def difference(row, unit=""):
 
 
 def corrected(p, number, what):
-    """Spell a p-value that is corrected for a number of comparisons, if there are several."""
+    """Write a p-value that is corrected for a number of comparisons, if there are several."""
     if number == 1:
         return ""
     return f", corrected for {number:.0f} {what}s {p_value(p).removeprefix('= ')}"
@@ -125,8 +125,8 @@ def sentence(row, unit=""):
         where = f"all {row['environments']:.0f} environments together"
     study = study_name(*row[STUDY])
     start = f"{study} on {where} with {row['noise']} at rate {row['noise_rate']}"
-    if row["verdict"] == UNLEARNED:
-        return f"{start} cannot be judged: all runs have the same results, nothing was learned."
+    if row["verdict"] == ALL_EQUAL:
+        return f"{start} cannot be judged: all tests of all runs have the same result."
     if row["verdict"] == TOO_FEW:
         return f"{start} has too few seeds for a test: {difference(row, unit)}."
     evidence = f"{difference(row, unit)}, p {p_value(row['p'])}{smallest(row)}"
@@ -135,6 +135,14 @@ def sentence(row, unit=""):
     alone = ", the only comparison" if row["comparisons"] == 1 else ""
     evidence += alone or corrected(row["p_adjusted"], row["comparisons"], "comparison")
     return f"{start} is {row['verdict']} than no noise: {evidence}.{borderline(row)}"
+
+
+def what_all_runs_do(value, metric):
+    """Say what runs do whose tests all have the same result; what was learned, it cannot tell."""
+    if metric != SUCCESS:
+        return f"all tests of all runs return {rounded(value)}"
+    always = {0: "no run ever solves the task", 100: "all runs solve the task in every test"}
+    return always.get(value, f"all tests of all runs have a success rate of {value:.0f} %")
 
 
 def power(row):
@@ -204,34 +212,37 @@ def listed(names):
 def headlines(statistics, best):
     """Return for each study its name, its comparisons in words, its counts of verdicts, its luck.
 
-    Counted are the verdicts of single environments. statistics, best: the frames of these tables.
+    statistics, best: the frames of these tables.
     """
     lines = []
-    alone = statistics[statistics["verdict"].notna() & (statistics["scope"] == "environment")]
-    for key, rows in alone.groupby(STUDY, sort=False):
+    judged = statistics[statistics["verdict"].notna()]
+    for key, rows in judged.groupby(STUDY, sort=False):
+        alone, together = rows[rows["scope"] != "all"], (rows["scope"] == "all").sum()
         noises = counted(len(rows.drop_duplicates(["noise", "noise_rate"])), "noise")
-        tried = f"{noises} in {counted(rows['environment'].nunique(), 'environment')}"
+        tried = f"{noises} in {counted(alone['environment'].nunique(), 'environment')}"
+        if together:
+            tried += f", {together} in all environments together"
         if len(rows) > 1:
             tried = f"{counted(len(rows), 'comparison')} ({tried})"
         counts = [(word, (rows["verdict"] == word).sum()) for word in VERDICTS]
         counts = [(word, n) for word, n in counts if n or word in CLEAR]
         luck = ""
-        if (rows["verdict"] != UNLEARNED).any():
+        if (rows["verdict"] != ALL_EQUAL).any():
             luck = luck_sentence(best[rows_of(best, key)])
         lines.append({"name": study_name(*key), "tried": tried, "counts": counts, "luck": luck})
     return lines
 
 
-def clear_first(verdicts, number=10):
+def clear_first(judged, number=10):
     """Split a frame of sentences: the first clear ones, at most `number`, and all others.
 
     What is better comes before what is worse.
     """
-    clear = verdicts[verdicts["verdict"].isin(CLEAR)].sort_values("verdict", kind="stable")
-    return clear[:number], verdicts.drop(clear.index[:number])
+    clear = judged[judged["verdict"].isin(CLEAR)].sort_values("verdict", kind="stable")
+    return clear[:number], judged.drop(clear.index[:number])
 
 
-def sentences(statistics, unit=""):
+def in_sentences(statistics, unit=""):
     """Return a frame with a verdict and a sentence for all that was compared.
 
     unit: behind each difference, such as POINTS.

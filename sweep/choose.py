@@ -17,7 +17,7 @@ from analysis.errors import fail
 from analysis.folders import CONFIRMATION, SEARCH, flat_choice, read_config
 from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED, SUCCESS, read_run
 from analysis.statistics import detectable_shift, holm
-from analysis.verdicts import POINTS
+from analysis.verdicts import POINTS, what_all_runs_do
 from noisy_wrappers import BASELINE, Configuration, rounded
 from sweep import halving
 from sweep.environment import ask_all, remember, remembered, run_seconds, time_left, wall_time
@@ -117,10 +117,9 @@ def follow(args, algorithm, env_id, environment):
     check_frequencies(runs[key] for key in returns)
     if len(different) == 1 and (state.rounds or not state.due):
         fail(
-            f"{algorithm.upper()} on {env_id}: all {len(returns)} runs have a {metric} of "
-            f"{rounded(*different)} in every test: nothing was learned in "
-            f"{args.total_timesteps:,} steps, so further runs would say nothing about noise; "
-            "train for longer, or leave this out",
+            f"{algorithm.upper()} on {env_id}: {what_all_runs_do(*different, metric)} in "
+            f"{args.total_timesteps:,} steps (runs: {len(returns)}), so further runs would say "
+            "nothing about noise; change --total-timesteps, or leave this out",
             code=1,
         )
     taken = [taken for taken in map(wall_time, map(runs.get, returns)) if taken]
