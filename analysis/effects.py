@@ -12,6 +12,7 @@ from analysis.style import (
     DIVERGING,
     NARROW_WIDTH,
     UNCLEAR,
+    WIDTH,
     WIDTHS,
     broken,
     color_limit,
@@ -72,7 +73,7 @@ def effects_figure(statistics, narrow=False):
     draw = heat_panel if len(configurations(rows)) > MOST_IN_FOREST else forest_panel
     panels = dict(list(rows.groupby("environment")))
     across = 1 if narrow else min(2, len(panels))
-    width = NARROW_WIDTH if narrow else WIDTHS[across - 1]
+    width = NARROW_WIDTH if narrow else WIDTHS[0] if across == 1 else WIDTH
     lines = [len("\n".join(labels_of(panel, draw)).split("\n")) for panel in panels.values()]
     lines = [max(lines[i : i + across]) for i in range(0, len(lines), across)]
     heights = [0.75 + (0.18 if narrow else 0.22) * number for number in lines]
@@ -85,10 +86,10 @@ def effects_figure(statistics, narrow=False):
         labels = labels_of(panel, draw)
         ax.set_yticks(range(len(labels)), labels, fontsize=6.5 if narrow else 8)
         ax.set_title(environment, fontsize=9)
+    write_below = fig.supxlabel if across > 1 else axes[len(panels) - 1].set_xlabel
+    write_below(LABEL if draw is forest_panel else "noise rate", fontsize=9)
     if draw is forest_panel:
-        fig.supxlabel(LABEL, fontsize=9)
         return fig
-    fig.supxlabel("noise rate", fontsize=9)
     column, unit, limit = heatmap_scale(rows)
     beyond = "both" if rows[column].abs().max() > limit else "neither"
     place = {"location": "bottom", "fraction": 0.05} if narrow else {"fraction": 0.02}
@@ -173,7 +174,7 @@ def heatmap(ax, grid, limit, number, dots, size):
             look = {"ha": "center", "va": "center", "color": ink_on(value, limit)}
             ax.text(j, i, number(value), fontsize=size, **look)
         if dots.iat[i, j]:
-            ax.plot(j + 0.38, i - 0.3, "o", color="black", markersize=2.5)
+            ax.plot(j + 0.36, i - 0.28, "o", color="black", markersize=2.5)
     ax.set_xticks(range(len(grid.columns)), grid.columns)
     ax.set_facecolor("0.93")  # where there is no number
     return image
