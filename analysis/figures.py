@@ -294,7 +294,7 @@ def robustness_heatmap(algorithm, environment, rows, clean, metric):
     )
     same = by_condition(rows, rows["tested_on"] == "the same noise").eq(True)
     form = (lambda value: percent(value).removesuffix(" %")) if in_percent else rounded
-    drawing = Drawing("robustness", f"heatmap {name}", None, caption)
+    drawing = Drawing("robustness", f"heatmap {algorithm} {environment}", None, caption)
     drawing.figure = heatmap_figure(grid, limit, form, same, name)
     drawing.narrow = heatmap_figure(grid.T, limit, form, same.T, name, narrow=True)
     return drawing

@@ -201,7 +201,7 @@ def test_interactions_by_hand(tmp_path):
     assert found["interaction_high"] == pytest.approx(41 + half)
     assert found["interaction_percent"] == pytest.approx(41 / 1.04)
     assert found["percent_high"] == pytest.approx((41 + half) / 1.04)
-    assert "Two noises together" in (tmp_path / "results/report.html").read_text()
+    assert "Two noises combined" in (tmp_path / "results/report.html").read_text()
 
 
 def test_no_interactions_without_combinations(tmp_path):

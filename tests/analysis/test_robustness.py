@@ -285,9 +285,9 @@ def test_heatmap_and_curves(tmp_path):
     numbers = {text.get_position(): text.get_text() for text in ax.texts}
     assert numbers[columns.index(f"{SENSOR}, 0.20"), 1] == "-12"  # 87.5, of 100
     assert numbers[columns.index("clean"), 2] == "+10"
-    frames = {(round(box.get_x() + 0.46), round(box.get_y() + 0.46)) for box in ax.patches}
+    dots = {tuple(np.round(line.get_xydata()[0] + (-0.36, 0.28)).astype(int)) for line in ax.lines}
     same = {(columns.index(f"{PUSH}, 1.00"), 1), (columns.index(f"{SENSOR}, 0.20"), 2)}
-    assert frames == same and "Framed" in drawn[heatmap].caption
+    assert dots == same and "A dot marks" in drawn[heatmap].caption
 
     [ax] = drawn[curves].figure.axes
     assert len(ax.lines) == 3

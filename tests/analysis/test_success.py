@@ -1,4 +1,4 @@
-"""Success beside the return, and what is said where nothing was learned."""
+"""Success beside the return, and what is said where all tests are equal."""
 
 import json
 import re
@@ -75,10 +75,10 @@ def test_returns_that_are_all_equal_say_nothing(tmp_path, capsys):
             write_run(tmp_path / "runs", [-50.0] * 2, env=ENV, seed=seed, spread=0.0, **noise)
     tables = run(tmp_path)
     said = capsys.readouterr().out
-    told = "all runs return -50.00: nothing was learned in 20,000 steps, so they say nothing about "
+    told = "all tests of all runs return -50.00 in 20,000 steps, so they say nothing about noise"
     assert told in said and "success" not in tables
     judged = row(tables["statistics"], noise=SCALE)
-    assert judged["verdict"] == "nothing learned" and np.isnan(judged["p"])
+    assert judged["verdict"] == "all equal" and np.isnan(judged["p"])
     assert "no clear difference" not in said and "+0.0 %" not in said
     with pytest.raises(SystemExit):
         analyze.main(analyze.Args(tmp_path / "runs", metric="success_rate"))

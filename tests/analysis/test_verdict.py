@@ -34,7 +34,7 @@ def judge(baseline, noisy):
     table = analysis.tables.adjust(
         analysis.tables.frame("statistics", analysis.tables.statistics_rows(one))
     )
-    return table[table["verdict"].notna()], analysis.verdicts.sentences(table)
+    return table[table["verdict"].notna()], analysis.verdicts.in_sentences(table)
 
 
 TEN = np.arange(100.0, 110)
@@ -139,7 +139,7 @@ def test_where_interval_and_p_differ_is_borderline():
         (
             [5.0] * 5,
             [5.0] * 5,
-            "all runs have the same results, nothing was learned.",
+            "all tests of all runs have the same result.",
         ),
         ([0.0] * 5, [0.0] * 5, "cannot be judged"),
         ([0.0] * 5, [1.0] * 5, "is better than no noise: +1.000 [1.000, 1.000], p = 0.0079"),
