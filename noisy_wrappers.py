@@ -101,7 +101,6 @@ __all__ = [
     "refusals",
     "reset_worker_signals",
     "rounded",
-    "run_folder",
     "run_name",
     "seed_globals",
     "seeded_globals",
@@ -1515,24 +1514,6 @@ def run_name(
     if len(first + end) > 240:  # a file's name has at most 255 bytes
         first = f"{first[:100]}_{hashlib.sha256(first.encode()).hexdigest()[:16]}"
     return first + end
-
-
-def run_folder(
-    runs_dir: str | Path,
-    env_id: str,
-    exp_name: str,
-    noises: Sequence[str],
-    rates: Sequence[float | str],
-    seed: int,
-) -> Path:
-    """Return a run's folder: :func:`run_name` in runs_dir, or the folder that version 0.1 made."""
-    configuration = Configuration.read(noises, rates)
-    pairs = zip(configuration.noises, configuration.rates, strict=True)
-    slug = "+".join(f"{_words(noise)}_p{_rate_word(rate)}" for noise, rate in pairs) or "baseline"
-    old_name = f"{safe_name(env_id)}__{safe_name(exp_name)}__{slug}__{seed}"
-    if len(old_name) <= 240 and Path(runs_dir, old_name).is_dir():
-        return Path(runs_dir, old_name)
-    return Path(runs_dir, run_name(env_id, exp_name, noises, rates, seed))
 
 
 def _words(noise: str) -> str:
