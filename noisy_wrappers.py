@@ -1088,17 +1088,22 @@ def _read_noise(text: str) -> Noise:
     try:
         inspect.signature(wrapper).bind(None, 1.0, *args, **kwargs)
     except TypeError as error:
-        raise _bad_noise(text, str(error), module) from None
+        raise _bad_noise(text, str(error)) from None
     try:
         recorded = wrapper(_ProbeEnv(), 1.0, *args, **kwargs).parameters
     except ValueError as error:
-        raise _bad_noise(text, str(error), module) from None
-    used = [p for p in _parameters(wrapper) if recorded[p.name] != p.default]
+        raise _bad_noise(text, str(error)) from None
+    parameters = _parameters(wrapper)
+    for p in parameters:
+        if p.name not in recorded:
+            call = f"super().__init__(env, noise_rate, {p.name}={p.name})"
+            raise _bad_noise(text, f"its constructor must pass {p.name} on: {call}")
+    used = [p for p in parameters if recorded[p.name] != p.default]
     return Noise(
         wrapper,
         tuple(recorded[p.name] for p in used if p.kind is not p.KEYWORD_ONLY),
         tuple((p.name, recorded[p.name]) for p in used if p.kind is p.KEYWORD_ONLY),
-        module,
+        "" if wrapper is WRAPPERS.get(name) else module,
     )
 
 
@@ -1124,17 +1129,20 @@ def _import_wrapper(module: str, name: str, text: str) -> type[NoiseWrapper]:
     _import_module(module, f"bad noise {text!r}")
     wrapper = getattr(sys.modules[module], name, None)
     if not isinstance(wrapper, type):
-        raise _bad_noise(text, f"{module} has no class {name}", module)
+        raise _bad_noise(text, f"{module} has no class {name}")
     if not issubclass(wrapper, NoiseWrapper):
-        raise _bad_noise(text, f"{name} must be a subclass of noisy_wrappers.NoiseWrapper", module)
+        raise _bad_noise(text, f"{name} must be a subclass of noisy_wrappers.NoiseWrapper")
+    kind, kinds = getattr(wrapper, "kind", None), ("observation", "reward", "action", "dynamics")
+    if kind not in kinds:
+        raise _bad_noise(text, f"{name}.kind must be one of {', '.join(kinds)}, not {kind!r}")
     return wrapper
 
 
 _EXPECTED = "expected Name(number, ..., keyword=value)"
 
 
-def _bad_noise(text: str, reason: str, module: str = "") -> ValueError:
-    if module:
+def _bad_noise(text: str, reason: str) -> ValueError:
+    if ":" in str(text).partition("(")[0]:  # the user's own, which is none of the list
         return ValueError(f"bad noise {text!r}: {reason}")
     return ValueError("\n  ".join([f"bad noise {text!r}: {reason}; valid are", *signatures()]))
 
@@ -1651,7 +1659,8 @@ class _ProbeEnv(gym.Env[Any, Any]):
 
 def _parameters(wrapper: type[NoiseWrapper]) -> list[inspect.Parameter]:
     """Return a wrapper's own parameters, those after self, env and noise_rate."""
-    return list(inspect.signature(wrapper.__init__).parameters.values())[3:]
+    parameters = inspect.signature(wrapper.__init__).parameters.values()
+    return [p for p in parameters if p.kind is not p.VAR_KEYWORD][3:]
 
 
 def _number(name: str, value: float, low: float = -math.inf, high: float = math.inf) -> float:
