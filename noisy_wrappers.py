@@ -29,6 +29,7 @@ import functools
 import hashlib
 import importlib
 import importlib.machinery
+import importlib.metadata
 import inspect
 import math
 import numbers
@@ -98,6 +99,7 @@ __all__ = [
     "outcome",
     "parse_noise",
     "rate_order",
+    "reason",
     "refusals",
     "reset_worker_signals",
     "rounded",
@@ -2014,14 +2016,28 @@ def refusals(env_id: str) -> tuple[type[Exception], ...]:
     """Return the errors that ``make_flat(gymnasium.make(env_id))`` raises on purpose.
 
     They are Gymnasium's and this module's. Of Gymnasium's own environments a missing dependency is
-    an ImportError, and those of Gymnasium-Robotics fail an assertion where MuJoCo is too new. Any
-    other error comes from the environment's code.
+    an ImportError, and some of Gymnasium-Robotics fail an assertion where MuJoCo is too new. Any
+    other error comes from the environment's code. :func:`reason` puts them into words.
     """
     spec = gym.registry.get(env_id.rpartition(":")[2])
     maker: Any = spec.entry_point if spec else ""  # "package.module:Class" or a function
     package = getattr(maker, "__module__", str(maker)).partition(".")[0]
     more = {"gymnasium": (ImportError,), "gymnasium_robotics": (AssertionError,)}
     return (gym.error.Error, SpaceError, *more.get(package, ()))
+
+
+def reason(error: BaseException) -> str:
+    r"""Return what an error says, as one line.
+
+    >>> reason(ValueError("low must not\nexceed high")), reason(KeyError())
+    ('low must not exceed high', 'KeyError')
+    """
+    text = " ".join(str(error).split())
+    if not text and isinstance(error, AssertionError) and "gymnasium_robotics" in sys.modules:
+        packages = ("gymnasium-robotics", "mujoco")
+        now = " and ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)
+        text = f'{now} do not work together here; try pip install "mujoco<3.12" (docs/training.md)'
+    return text or type(error).__name__
 
 
 def seed_globals(seed: int) -> None:

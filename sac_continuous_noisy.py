@@ -393,8 +393,7 @@ def fail_on(errors, message, code=2):
     except errors as error:
         hidden = isinstance(error.__context__, OSError)  # by torch.save: the disk is full, say
         error = error.__context__ if hidden else error
-        reason = " ".join(str(error).split()) or f"{type(error).__name__}, see docs/training.md"
-        fail(f"{message}: {reason}", code)
+        fail(f"{message}: {noisy.reason(error)}", code)
     except Exception as error:  # of the environment, say: its traceback is what the user needs
         error.add_note(f"({message})")
         raise
