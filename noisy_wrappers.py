@@ -41,6 +41,7 @@ import signal
 import subprocess
 import sys
 import traceback
+import warnings
 import zlib
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -847,7 +848,7 @@ class RandomEarlyTermination(NoiseWrapper):
             only = self.low == limit and not self.truncate
             effect = "only turns truncated into terminated there" if only else "never acts"
             most = f"episodes have at most {limit} steps"
-            gym.logger.warn(f"RandomEarlyTermination({self.low}) {effect}: {most}", stacklevel=3)
+            warnings.warn(f"RandomEarlyTermination({self.low}) {effect}: {most}", stacklevel=3)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and decide when the episode ends."""
