@@ -115,7 +115,7 @@ def why_unfit(env, configuration, time_limit, deadline):
         with warnings.catch_warnings(action="ignore"):  # of what is said below
             noisy_env = configuration.wrap(env)
     except ValueError as error:
-        return " ".join(str(error).split())
+        return noisy.reason(error)
     for wrapper in noisy.noise_wrappers(noisy_env).values():
         if isinstance(wrapper, noisy.RandomEarlyTermination) and (wrapper.low or 0) > time_limit:
             return f"an episode has at most {time_limit} steps"
@@ -133,7 +133,7 @@ def why_unfit(env, configuration, time_limit, deadline):
 
 def in_a_line(error, env_id=""):
     """Say what an error says; if it is not Gymnasium's or ours, also where it was raised."""
-    reason = " ".join(str(error).split())
+    reason = noisy.reason(error)
     if isinstance(error, (*noisy.refusals(env_id), noisy.NotFiniteError)):
         return reason
     frames = traceback.extract_tb(error.__traceback__)
