@@ -30,7 +30,7 @@ from typing import NamedTuple
 from analysis.errors import take_over_terminal
 from analysis.folders import STOPPED, Log, is_locked, read_log
 from sweep.environment import cost
-from sweep.grid import check_extra, check_rollouts, command_line, grid, result, runs_in
+from sweep.grid import check_rollouts, command_line, grid, result, runs_in
 from sweep.options import check_arguments, parse_args
 
 YOUNG = 120  # seconds: a run writes a line at least every ten, except in a test or in compiling
@@ -88,8 +88,8 @@ def summary(runs, progresses):
     speeds = {}
     for run, progress in zip(runs, progresses, strict=True):
         count[progress.state] += 1
-        if progress.log.steps_per_second:  # from the most particular to the most general
-            for key in (run.kind, run.kind[0], None):
+        if progress.log.steps_per_second:
+            for key in (run.kind, None):
                 speeds.setdefault(key, []).append(progress.log.steps_per_second)
     if not count[PROBABLY]:
         del count[PROBABLY]
@@ -99,8 +99,7 @@ def summary(runs, progresses):
     if running and speed:
         seconds = 0
         for run, progress in zip(runs, progresses, strict=True):
-            expected = speed.get(run.kind) or speed.get(run.kind[0]) or speed[None]
-            seconds += remaining(run, progress) / expected
+            seconds += remaining(run, progress) / speed.get(run.kind, speed[None])
         now = sum(progress.log.steps_per_second for progress in running)
         left = timedelta(seconds=round(seconds / len(running)))
         text += f"; about {left} left, {now:,.0f} steps/s"  # a narrow terminal cuts the end off
@@ -111,18 +110,14 @@ def show_slowest(runs, progresses):
     """Print those of the running runs that will take longest."""
     left = []
     for run, progress in zip(runs, progresses, strict=True):
-        if progress.state in (RUNNING, PROBABLY) and progress.log.steps_per_second:
-            seconds = remaining(run, progress) / progress.log.steps_per_second
-            left.append((seconds, run, progress.log))
-    if not left:
-        return
-    left.sort(key=lambda item: item[0], reverse=True)
-    print("slowest of those running (time left, steps per second, step):")
-    rows = []
-    for seconds, run, log in left[:5]:
-        time_left = str(timedelta(seconds=round(seconds)))
-        rows.append((time_left, f"{log.steps_per_second}/s", str(log.step), str(run.folder)))
-    table(rows)
+        speed = progress.log.steps_per_second
+        if progress.state in (RUNNING, PROBABLY) and speed:
+            shown = f"{speed}/s", str(progress.log.step), str(run.folder)
+            left.append((remaining(run, progress) / speed, *shown))
+    if left:
+        print("slowest of those running (time left, steps per second, step):")
+        slowest = sorted(left, reverse=True)[:5]
+        table([(str(timedelta(seconds=round(seconds))), *shown) for seconds, *shown in slowest])
 
 
 def table(rows):
@@ -145,8 +140,6 @@ def show_list(sweep, with_cost=False):
             print(f"warning: {damage}", file=sys.stderr)
     if "todo" in states:
         check_rollouts(sweep.runs)
-        if sweep.args.extra:
-            check_extra(sweep.runs)
     for run, state in zip(sweep.runs, states, strict=True):
         folder = f"{run.folder.parent}/{run.folder.name}"  # with a slash, for --runs-dir . too
         print(folder, state, command_line(run), sep="\t")
@@ -156,10 +149,9 @@ def show_list(sweep, with_cost=False):
 
         plan = choose.plan(sweep.choices, sweep.args)
     elif with_cost and "todo" in states:
-        runs = {state: [] for state in ("done", "damaged", "todo")}
-        for run, state in zip(sweep.runs, states, strict=True):
-            runs[state].append(run)
-        plan[0] += "; " + cost(sweep.args, runs["done"], runs["todo"])
+        todo = [run for run, state in zip(sweep.runs, states, strict=True) if state == "todo"]
+        done = [run for run, state in zip(sweep.runs, states, strict=True) if state == "done"]
+        plan[0] += "; " + cost(sweep.args, done, todo)
     for line in plan:
         print(line, file=sys.stderr)
     return 0
@@ -276,7 +268,7 @@ def main(view, caller, argv):
 
             ask = view in ("list", "dry-run")
             choices = choose.choices(args, ask, keep=view == "list")
-            runs = choose.runs_of(choices)
+            runs = choose.planned_runs(choices)
         else:
             runs = grid(args)
     return VIEWS[view](Sweep(args, runs, choices))

@@ -13,15 +13,22 @@ import sys
 from statistics import fmean
 from typing import NamedTuple
 
-from analysis.errors import fail
-from analysis.folders import CONFIRMATION, SEARCH, flat_choice, read_config
+from analysis.errors import fail, in_words
+from analysis.folders import CONFIRMATION, SEARCH, flat_choice
 from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED, SUCCESS, read_run
 from analysis.statistics import detectable_shift, holm
 from analysis.verdicts import POINTS
 from noisy_wrappers import BASELINE, Configuration, rounded
 from sweep import halving
 from sweep.environment import ask_all, remember, remembered, run_seconds, time_left, wall_time
-from sweep.grid import PlannedRun, cell, cells, make_run, of_the_paper, result
+from sweep.grid import (
+    PlannedRun,
+    configuration_of,
+    configurations,
+    make_run,
+    of_the_paper,
+    result,
+)
 
 
 class Choice(NamedTuple):
@@ -92,7 +99,7 @@ def follow(args, algorithm, env_id, environment):
     last_seed = sum(seeds for _, seeds in schedule)
     if last_seed >= FIRST_CONFIRMATION_SEED:
         fail(f"--budget {budget} is too large: the best noises would run with {last_seed} seeds")
-    runs, returns, last_tests, different = {}, {}, {}, set()
+    runs, returns, last_tests, results, tested = {}, {}, {}, set(), {}
     metric = args.metric.replace("_", " ")
     while True:
         state = halving.advance(noises, budget, args.confirm, returns)
@@ -103,22 +110,28 @@ def follow(args, algorithm, env_id, environment):
             check_place(run)
             if result(run)[0]:
                 run, row = with_row(run)
-                tests = tests_of(run, row, metric) if row else ()
-                different |= set(tests)
-                if row and phase == CONFIRMATION:
+                if row:
+                    tests = tests_of(run, row, metric)
+                    results |= set(tests)
+                    tested.setdefault(tuple(row["steps"]), run.folder)
                     finished[noise, seed] = tests[-1]
-                elif row:
-                    finished[noise, seed] = halving.score(row["steps"], tests)
-                    last_tests.setdefault(noise, []).append(tests[-1])
+                    if phase == SEARCH:
+                        finished[noise, seed] = halving.score(row["steps"], tests)
+                        last_tests.setdefault(noise, []).append(tests[-1])
             runs[noise, seed] = run
         if not finished:
             break
         returns |= finished
-    check_frequencies(runs[key] for key in returns)
-    if len(different) == 1 and (state.rounds or not state.due):
+    if len(tested) > 1:  # then their scores do not compare
+        one, other, *_ = tested.values()
+        fail(
+            f"{one} and {other} were not tested at the same steps: choose another --runs-dir, or "
+            "move the runs of one kind away"
+        )
+    if len(results) == 1 and (state.rounds or not state.due):
         fail(
             f"{algorithm.upper()} on {env_id}: all {len(returns)} runs have a {metric} of "
-            f"{rounded(*different)} in every test: nothing was learned in "
+            f"{rounded(*results)} in every test: nothing was learned in "
             f"{args.total_timesteps:,} steps, so further runs would say nothing about noise; "
             "train for longer, or leave this out",
             code=1,
@@ -142,22 +155,20 @@ def follow(args, algorithm, env_id, environment):
     )
 
 
-def runs_of(found):
-    """Return the runs of all choices together, the first seed of everything first."""
-    runs = []
-    for choice in found:
-        runs += [(seed, run) for (_, seed), run in choice.runs.items()]
+def planned_runs(found):
+    """Return the runs of all choices, the first seed of everything first."""
+    runs = [(seed, run) for choice in found for (_, seed), run in choice.runs.items()]
     return [run for _, run in sorted(runs, key=lambda pair: pair[0])]
 
 
 def candidates(args, algorithm, env_id, unfit=()):
     """Return the noises to choose from, each once, but for those that cannot act there."""
-    noises = dict.fromkeys(cells(args, algorithm, env_id))
+    noises = dict.fromkeys(configurations(args, algorithm, env_id))
     noises.pop(BASELINE, None)  # at rate 0 a noise is none
     for pairs in args.exclude:
         if any(rate is None for _, rate in pairs):
             fail('--exclude needs a rate with each noise, as in "NOISE@0.1"')
-        excluded = cell(pairs)
+        excluded = configuration_of(pairs)
         if excluded not in noises:
             fail(f"--exclude: {excluded} is not among the noises")
         del noises[excluded]
@@ -192,21 +203,6 @@ def tests_of(run, row, metric):
     return row["success_rates"]
 
 
-def check_frequencies(runs):
-    """Exit if finished runs were not all tested equally often: their scores do not compare."""
-    found = {}
-    for run in runs:
-        made_with = read_config(run.folder)["args"]
-        if "eval_frequency" in made_with:
-            found.setdefault(made_with["eval_frequency"], run.folder)
-    if len(found) > 1:
-        (every, one), (other, another), *_ = found.items()
-        fail(
-            f"{one} was tested every {every} steps and {another} every {other}: choose another "
-            f"--runs-dir, or move the runs of one kind away"
-        )
-
-
 # ---------------------------------------------------------------------------------------- in words
 
 
@@ -221,7 +217,7 @@ def plan(found, args):
     if not any(choice.returns for choice in found):
         lines = [*map(question, found), *lines]
     lines.append(total(found, args))
-    lines += filter(None, (reach(choice, len(found)) for choice in found))
+    lines += filter(None, (detectable_gain(choice, len(found)) for choice in found))
     return [*dict.fromkeys(lines), f"runs, logs and the verdict are stored in {args.runs_dir}"]
 
 
@@ -261,7 +257,7 @@ def left(choice):
     return [len(choice.state.due), *numbers[len(choice.state.rounds) + 1 :]]
 
 
-def reach(choice, verdicts):
+def detectable_gain(choice, verdicts):
     """Say what gain the confirmation can show, or nothing once runs are done without a spread."""
     gain = detectable_shift(choice.confirm, choice.confirm, halving.LEVEL / verdicts)
     seeds = f"{choice.confirm} fresh seeds confirm a true gain of"
@@ -312,33 +308,22 @@ def standing(found, args):
 
 def report(found, path):
     """Print the verdicts, and write choice.csv; or, where runs are left, what to do about them."""
-    finished = rows(found)
-    if finished:
-        write_choice(path, finished)
-    print(*conclusion(found), sep="\n")
-
-
-def conclusion(found):
-    """Yield the verdicts, one line for each choice.
-
-    While runs of a choice are left, there is none: then say what to do about them.
-    """
     if any(choice.state.due for choice in found):
-        for choice in found:
-            yield obstacle(choice) if choice.state.due else describe(choice)
+        lines = [obstacle(choice) if choice.state.due else describe(choice) for choice in found]
     else:
-        yield from verdicts(found, judged(found))
+        judgements = judged(found)
+        write_choice(path, records(found, judgements))
+        lines = verdicts(found, judgements)
+    print(*lines, sep="\n")
 
 
-def rows(found):
-    """Return the rows of choice.csv; there are none while runs of a choice are left."""
-    if any(choice.state.due for choice in found):
-        return []
+def records(found, judgements):
+    """Return the records of choice.csv."""
     result = []
-    for choice, (comparison, p) in zip(found, judged(found), strict=True):
+    for choice, (comparison, p) in zip(found, judgements, strict=True):
         names = choice.algorithm.upper(), choice.env_id
         helped = halving.helps(comparison, p)
-        result += halving.rows(*names, choice.state, choice.returns, helped)
+        result += halving.records(*names, choice.state, choice.returns, helped)
     return result
 
 
@@ -380,26 +365,27 @@ def obstacle(choice):
     return text
 
 
-def write_choice(path, rows):
+def write_choice(path, new):
     """Write choice.csv whole or not at all; it keeps what other commands have chosen."""
     try:
         with open(path.with_name(".choice.lock"), "w", encoding="utf-8") as lock:
             fcntl.lockf(lock, fcntl.LOCK_EX)  # until it is closed: commands may end side by side
-            replace_choice(path, rows)
+            replace_choice(path, new)
     except (OSError, KeyError, ValueError) as error:
-        fail(f"cannot write {path} ({type(error).__name__}: {error})")
+        fail(f"cannot write {path} ({in_words(error)})")
 
 
-def replace_choice(path, rows):
-    """Replace the lines of what was chosen now, and keep the others."""
-    ours = {(row["algorithm"], row["environment"]) for row in rows}
+def replace_choice(path, new):
+    """Replace the records of what was chosen now, and keep the others."""
+    chosen_now = {(record["algorithm"], record["environment"]) for record in new}
+    old = []
     if path.exists():
         with open(path, newline="", encoding="utf-8") as file:
             old = list(csv.DictReader(file))
-        rows = [r for r in old if (r["algorithm"], r["environment"]) not in ours] + rows
+    others = [r for r in old if (r["algorithm"], r["environment"]) not in chosen_now]
     temporary = path.with_suffix(".tmp")
     with open(temporary, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, CHOICE_COLUMNS, lineterminator="\n")
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows(others + new)
     os.replace(temporary, path)

@@ -24,12 +24,11 @@ it logs nothing, and in PPO it normalizes neither observations nor rewards.
 --jobs N compares N runs side by side, on a core each, with one alone.
 --estimate compares the speed with the one that `benchmark.sh --dry-run` counts on; the exit status
 is 1 if it is wrong by more than 1.5 times.
---checkpoint measures one checkpoint, after --stored steps (at least one rollout). SAC and TD3 keep
-all of them in the replay buffer.
 """
 
 import argparse
 import contextlib
+import itertools
 import json
 import math
 import os
@@ -83,8 +82,8 @@ class Marks:
         self.wait()
 
 
-def child_script(script, marked_tag, *flags):
-    """Run a script as the command line does, with a mark at every step that logs such a tag."""
+def child_script(script, *flags):
+    """Run a script as the command line does, with a mark at every step that logs losses."""
     from torch.utils.tensorboard import SummaryWriter
 
     marks, last_step = Marks(), 0
@@ -92,19 +91,14 @@ def child_script(script, marked_tag, *flags):
 
     def watched(self, tag, scalar_value, global_step=None, *args, **kwargs):
         nonlocal last_step
-        if tag.startswith(marked_tag) and global_step != last_step:
+        if tag.startswith("losses/") and global_step != last_step:
             last_step = global_step
             marks.mark(global_step)
         add_scalar(self, tag, scalar_value, global_step, *args, **kwargs)
 
     SummaryWriter.add_scalar = watched
     sys.argv = [script, *flags]
-    try:
-        runpy.run_path(script, run_name="__main__")
-    except SystemExit as end:
-        if end.code == 128 + signal.SIGTERM:  # asked to stop, it has saved a checkpoint
-            marks.mark(last_step)
-        raise
+    runpy.run_path(script, run_name="__main__")
 
 
 def child_sbx(algo, env_id, learning_starts):
@@ -211,13 +205,13 @@ def flags(algo, env_id, options):
     return shared if algo == "ppo" else [*shared, "--learning-starts", options.stored]
 
 
-def ours(algo, env_id, options, name="ours", folder=None, job=0, tag="losses/"):
+def ours(algo, env_id, options, name="ours", folder=None, job=0):
     """Start one of this project's scripts, without tests and checkpoints."""
     core = options.cores[job % len(options.cores)]
     script = (folder or PROJECT).resolve() / f"{algo}_continuous_noisy.py"
     never_save = ["--eval-frequency", 0, "--checkpoint-frequency", TOTAL_TIMESTEPS]
     arguments = [*flags(algo, env_id, options), *never_save, *options.flags]
-    return Program(name, core, "_script", script, tag, *arguments)
+    return Program(name, core, "_script", script, *arguments)
 
 
 def ours_and_others(algo, env_id, options):
@@ -228,7 +222,7 @@ def ours_and_others(algo, env_id, options):
         yield ours(algo, env_id, options, "checkout", options.against_checkout)
     if options.against_cleanrl:
         script = options.against_cleanrl.resolve() / "cleanrl" / f"{algo}_continuous_action.py"
-        arguments = [script, "losses/", *flags(algo, env_id.replace("-v5", "-v4"), options)]
+        arguments = [script, *flags(algo, env_id.replace("-v5", "-v4"), options)]
         python = options.cleanrl_python
         yield Program("CleanRL", core, "_script", *arguments, "--no-cuda", python=python)
     if options.against_sbx:
@@ -265,16 +259,14 @@ def compare(algo, env_id, options):
             "ours / its": median(ratios),
             "from": low,
             "to": high,
-            "speeds": program.speeds,
-            "ratios": ratios,
         }
         rows.append(row)
     return rows
 
 
 def side_by_side(algo, env_id, options):
-    """Run one alone and several together, alternately."""
-    programs, alone, together = [], [], []
+    """Run one alone and several at once, alternately."""
+    programs, alone, at_once = [], [], []
     with contextlib.ExitStack() as stack:
         for job in range(options.jobs):
             programs.append(stack.enter_context(ours(algo, env_id, options, job=job)))
@@ -283,32 +275,13 @@ def side_by_side(algo, env_id, options):
             measure(options, programs[0])
             alone.append(programs[0].speeds[-1])
             measure(options, *programs)
-            together.append(sum(program.speeds[-1] for program in programs))
-    efficiencies = [b / (a * options.jobs) for a, b in zip(alone, together, strict=True)]
+            at_once.append(sum(program.speeds[-1] for program in programs))
+    efficiencies = [b / (a * options.jobs) for a, b in zip(alone, at_once, strict=True)]
     row = {
         "alone": median(alone),
-        f"{options.jobs} jobs": median(together),
+        f"{options.jobs} jobs": median(at_once),
         "efficiency": median(efficiencies),
-        "efficiencies": efficiencies,
     }
-    return [row]
-
-
-def checkpoint(algo, env_id, options):
-    """Let a run save a checkpoint when an episode has ended and its return is logged."""
-    with ours(algo, env_id, options, tag="charts/episodic_return") as program:
-        while program.step <= max(options.stored, ROLLOUT):
-            advance(program)
-        memory, wall = program.memory, program.wall
-        program.process.terminate()
-        advance(program)
-        [file] = Path(program.folder.name).glob("runs/*/checkpoint.pt")
-        row = {
-            "step": program.step,
-            "MB": file.stat().st_size / 2**20,
-            "seconds": program.wall - wall,
-            "extra memory MB": program.memory - memory,
-        }
     return [row]
 
 
@@ -326,14 +299,6 @@ def estimate(algo, env_id, options):
     seconds = learning_seconds(algo, environment) + environment.step_seconds
     speed = median(program.speeds)
     return [{"steps/s": speed, "estimated": 1 / seconds, "real / estimated": speed * seconds}]
-
-
-def table(rows):
-    """Return the rows as text; the lists in them are for --json only."""
-    from tabulate import tabulate  # here, since the children's interpreters may not have it
-
-    shown = [{k: v for k, v in row.items() if not isinstance(v, list)} for row in rows]
-    return tabulate(shown, headers="keys", floatfmt=".4g")
 
 
 def interpreter(name):
@@ -363,8 +328,6 @@ def parse(argv):
     add("--against-checkout", type=Path, metavar="PATH", help="another version of this project")
     add("--jobs", type=int, metavar="N", help="compare N runs side by side with one")
     add("--estimate", action="store_true", help="check what benchmark.sh --dry-run counts on")
-    add("--checkpoint", action="store_true", help="size and time of checkpoints")
-    add("--json", type=Path, metavar="FILE", help="write all figures, block by block, to a file")
     end = argv.index("--") if "--" in argv else len(argv)
     options = parser.parse_args(argv[:end])
     options.flags = argv[end + 1 :]
@@ -375,9 +338,7 @@ def parse(argv):
         if value is not None and not value >= low:
             fail(f"--{name} must be at least {low}, not {value}")
     if bool(options.against_cleanrl) != bool(options.cleanrl_python):
-        fail("--against-cleanrl and --cleanrl-python go together")
-    if options.json and not options.json.parent.is_dir():
-        fail(f"--json: there is no folder {options.json.parent}")
+        fail("--against-cleanrl and --cleanrl-python need each other")
     files = {"cleanrl": "cleanrl/sac_continuous_action.py", "checkout": "sac_continuous_noisy.py"}
     for name, file in files.items():
         folder = getattr(options, f"against_{name}")
@@ -388,30 +349,23 @@ def parse(argv):
 
 def main(argv):
     """Measure and print."""
+    from tabulate import tabulate  # here, since the children's interpreters may not have it
+
     options = parse(argv)
-    modes, figures = [], {}
-    if options.jobs:
-        modes.append(side_by_side)
-    if options.checkpoint:
-        modes.append(checkpoint)
-    if options.estimate:
-        modes.append(estimate)
-    if not modes or options.against_cleanrl or options.against_sbx or options.against_checkout:
-        modes.append(compare)
+    against_others = options.against_cleanrl or options.against_sbx or options.against_checkout
+    modes = [side_by_side] if options.jobs else []
+    modes += [compare] if against_others or not (options.jobs or options.estimate) else []
+    modes += [estimate] if options.estimate else []
     for mode in modes:
         rows = []
-        for algo in options.algos:
-            for env_id in options.envs:
-                print(f"{mode.__name__} {algo} {env_id}", file=sys.stderr)
-                for row in mode(algo, env_id, options):
-                    rows.append({"script": algo, "env_id": env_id, **row})
-        print(table(rows), flush=True)
-        figures[mode.__name__] = rows
-    if options.json:
-        options.json.write_text(json.dumps(figures, indent=2) + "\n")
-    ratios = [row["real / estimated"] for row in figures.get("estimate", [])]
-    if any(not 1 / LARGEST_ERROR <= ratio <= LARGEST_ERROR for ratio in ratios):
-        fail(f"an estimated speed is wrong by more than {LARGEST_ERROR} times", code=1)
+        for algo, env_id in itertools.product(options.algos, options.envs):
+            print(f"{mode.__name__} {algo} {env_id}", file=sys.stderr)
+            cell = {"script": algo, "env_id": env_id}
+            rows += [cell | row for row in mode(algo, env_id, options)]
+        print(tabulate(rows, headers="keys", floatfmt=".4g"), flush=True)
+        ratios = [row.get("real / estimated", 1) for row in rows]
+        if not all(1 / LARGEST_ERROR <= ratio <= LARGEST_ERROR for ratio in ratios):
+            fail(f"an estimated speed is wrong by more than {LARGEST_ERROR} times", code=1)
 
 
 if __name__ == "__main__":
