@@ -101,7 +101,6 @@ __all__ = [
     "refusals",
     "reset_worker_signals",
     "rounded",
-    "run_folder",
     "run_name",
     "seed_globals",
     "seeded_globals",
@@ -172,7 +171,7 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.schedule = _schedule(noise_rate)
         self._training_progress = 0.0
         self._noise_rate = self.schedule[0]
-        RecordConstructorArgs.__init__(self, noise_rate=_spelled(self.schedule), **parameters)
+        RecordConstructorArgs.__init__(self, noise_rate=_as_written(self.schedule), **parameters)
         self.parameters = parameters
         self.opportunities = 0
         self.times_applied = 0
@@ -383,12 +382,12 @@ class ObservationNoise(NoiseWrapper):
             parts[path] = _cast(part.reshape(box.shape), box.dtype)
         return _replaced(observation, parts)
 
-    def _widen(self, reach: Callable[[NDArray[Any]], Sequence[Any]]) -> None:
-        """Extend the observation space to what ``reach`` says noise makes of its bounds."""
+    def _widen(self, ends_of: Callable[[NDArray[Any]], Sequence[Any]]) -> None:
+        """Extend the observation space to what ``ends_of`` says noise makes of its bounds."""
         widened = {}
         for path, box in self._boxes.items():
             with np.errstate(over="ignore", invalid="ignore"):
-                ends = [*reach(box.low.astype(np.float64)), *reach(box.high.astype(np.float64))]
+                ends = [*ends_of(box.low.astype(np.float64)), *ends_of(box.high.astype(np.float64))]
                 reached = np.stack([np.broadcast_to(end, box.shape) for end in ends])
                 reached[np.isnan(reached)] = 0.0  # 0 * inf is 0 here
                 low = np.minimum(box.low, _cast(reached.min(axis=0), box.dtype))
@@ -1199,7 +1198,7 @@ class Configuration:
     @property
     def texts(self) -> tuple[list[str], list[float | str]]:
         """The noises and the rates as config.json holds them and the scripts read them."""
-        return list(self.noises), [_spelled(rate) for rate in self.rates]
+        return list(self.noises), [_as_written(rate) for rate in self.rates]
 
     @property
     def columns(self) -> tuple[str, str]:
@@ -1215,11 +1214,11 @@ class Configuration:
     @property
     def noise_rate(self) -> str:
         """The rates as tables and the paper have them: "0.05"; the baseline's is "0.00"."""
-        spelled = []
+        written = []
         for rate in self.rates or [(0.0, 0.0)]:
             start, end = (f"{r:.2f}" if round(r, 2) == r else f"{r:g}" for r in rate)
-            spelled.append(start if rate[0] == rate[1] else f"{start} to {end}")
-        return " + ".join(spelled)
+            written.append(start if rate[0] == rate[1] else f"{start} to {end}")
+        return " + ".join(written)
 
     @property
     def is_baseline(self) -> bool:
@@ -1517,24 +1516,6 @@ def run_name(
     return first + end
 
 
-def run_folder(
-    runs_dir: str | Path,
-    env_id: str,
-    exp_name: str,
-    noises: Sequence[str],
-    rates: Sequence[float | str],
-    seed: int,
-) -> Path:
-    """Return a run's folder: :func:`run_name` in runs_dir, or the folder that version 0.1 made."""
-    configuration = Configuration.read(noises, rates)
-    pairs = zip(configuration.noises, configuration.rates, strict=True)
-    slug = "+".join(f"{_words(noise)}_p{_rate_word(rate)}" for noise, rate in pairs) or "baseline"
-    old_name = f"{safe_name(env_id)}__{safe_name(exp_name)}__{slug}__{seed}"
-    if len(old_name) <= 240 and Path(runs_dir, old_name).is_dir():
-        return Path(runs_dir, old_name)
-    return Path(runs_dir, run_name(env_id, exp_name, noises, rates, seed))
-
-
 def _words(noise: str) -> str:
     """Return a noise as a part of a file's name; different noises have different ones."""
     plain = noise.replace("=(", "=").replace("', '", "-").replace("'", "")  # keys=a-b
@@ -1545,7 +1526,7 @@ def _words(noise: str) -> str:
 
 
 def _rate_word(rate: tuple[float, float]) -> str:
-    return str(_spelled(rate)).replace(":", "to")
+    return str(_as_written(rate)).replace(":", "to")
 
 
 def safe_name(text: str) -> str:
@@ -1778,7 +1759,7 @@ def _schedule(noise_rate: float | str) -> tuple[float, float]:
         ) from None
 
 
-def _spelled(schedule: tuple[float, float]) -> float | str:
+def _as_written(schedule: tuple[float, float]) -> float | str:
     """Return a schedule as it is written: one number, or "start:end" where they differ."""
     start, end = schedule
     return start if start == end else f"{start}:{end}"

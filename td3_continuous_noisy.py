@@ -506,7 +506,7 @@ class Run:
     def __init__(self, args, algorithm, precision, env):
         """Open the folder; fail if another process uses it, or if it holds a different run."""
         configuration = (args.env_id, args.exp_name, args.noise, args.noise_rate, args.seed)
-        self.folder = noisy.run_folder(args.runs_dir, *configuration)
+        self.folder = Path(args.runs_dir, noisy.run_name(*configuration))
         self.args, self.start = args, time.monotonic() - 1e-6  # not 0 s ago: clocks may stand still
         self.noise, self.returns = noisy.noise_wrappers(env), env.get_wrapper_attr("return_queue")
         self.outcomes = deque(maxlen=100)  # of the last training episodes

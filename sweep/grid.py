@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from analysis.errors import fail
 from analysis.folders import PHASES, DamageError, read_config, read_result, runs_of
-from noisy_wrappers import BASELINE, MAY_DIFFER_IN_A_RUN, Configuration, run_folder
+from noisy_wrappers import BASELINE, MAY_DIFFER_IN_A_RUN, Configuration, run_name
 
 PROJECT = Path(__file__).resolve().parent.parent
 SEEDS = {"sac": range(1, 6), "td3": range(1, 6), "ppo": range(1, 11)}  # the paper's
@@ -247,7 +247,7 @@ def make_run(args, algorithm, env_id, configuration, seed, phase=""):
     arguments += ["--total-timesteps", str(args.total_timesteps)]
     arguments += ["--runs-dir", runs_dir, *args.extra]
     exp_name, kind = script.removesuffix(".py"), (algorithm, env_id)
-    folder = run_folder(runs_dir, env_id, exp_name, noises, rates, seed)
+    folder = Path(runs_dir, run_name(env_id, exp_name, noises, rates, seed))
     options = script_options(script, tuple(args.extra))
     return PlannedRun(folder, kind, args.total_timesteps, script, arguments, options)
 

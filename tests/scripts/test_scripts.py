@@ -353,17 +353,6 @@ def test_the_default_frequency_of_a_long_run_is_that_of_the_paper(algorithm):
     assert (50_000 if algorithm == "PPO" else 10_000) == SCRIPTS[algorithm].EVAL_FREQUENCY
 
 
-@one_script
-def test_a_folder_of_version_0_1_is_known(algorithm, tmp_path, capsys):
-    folder = run(algorithm, tmp_path)
-    exp_name = SCRIPTS[algorithm].Args.exp_name
-    old = folder.rename(tmp_path / f"toy_envs--Tiny-v0__{exp_name}__baseline__1")
-    capsys.readouterr()
-    run(algorithm, tmp_path)
-    assert capsys.readouterr().out.startswith(f"{old} is finished: mean test return ")
-    assert list(tmp_path.iterdir()) == [old]
-
-
 @pytest.mark.parametrize("content", ["", "{}", "[]", '{"final_return_mean": 1'])
 @one_script
 def test_a_result_that_cannot_be_read_is_no_result(algorithm, content, tmp_path, capsys):

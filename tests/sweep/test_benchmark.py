@@ -530,16 +530,18 @@ def test_a_choice_never_mixes_runs_with_other_options(tmp_path):
 def test_status_without_a_grid_reads_the_folder(tmp_path):
     for seed in (1, 2):
         finish(tmp_path / f"baseline_s{seed}__Hopper-v5__sac")
-    finish(tmp_path / "Hopper-v5__ppo__baseline__1")
-    (tmp_path / "Hopper-v5__ppo__baseline__1/result.json").unlink()
-    log_of(tmp_path / "Hopper-v5__ppo__baseline__2").parent.mkdir()  # it has no folder
+    finish(tmp_path / "baseline_s1__Hopper-v5__ppo")
+    (tmp_path / "baseline_s1__Hopper-v5__ppo/result.json").unlink()
+    log_of(tmp_path / "baseline_s2__Hopper-v5__ppo").parent.mkdir()  # it has no folder
     log = "# now host: python x.py\nerror: \x1b[31mbad\n# now host: exit=2\n"
-    log_of(tmp_path / "Hopper-v5__ppo__baseline__2").write_text(log)
+    log_of(tmp_path / "baseline_s2__Hopper-v5__ppo").write_text(log)
     for words in (["status"], ["status", "custom"]):
         result = run(*words, "--runs-dir", tmp_path)
         assert result.code == 0, result.err
         assert "4 runs: 2 done, 0 running, 1 failed, 1 to do" in result.out
-        assert re.search(r"exit 2 .*baseline__2.log +error: \?\[31mbad\n", result.out)
+        assert re.search(
+            r"exit 2 .*baseline_s2__Hopper-v5__ppo.log +error: \?\[31mbad\n", result.out
+        )
         assert "\x1b" not in result.out
     empty = run("status", "--runs-dir", tmp_path / "none")
     assert empty.code == 2 and f"error: no runs in {tmp_path}/none" in empty.err

@@ -14,7 +14,6 @@ from noisy_wrappers import (
     canonical_env_id,
     canonical_noises,
     refusals,
-    run_folder,
     run_name,
 )
 from sweep.grid import NOISES as NOISES_OF_THE_PAPER
@@ -48,18 +47,6 @@ def test_31_characters_of_a_name_tell_rate_seed_and_kind(noise, seed):
     assert (rate, shown_seed) == ("p0.01", f"s{seed}")
     [kind] = [kind for kind in kinds if text.startswith(kind) or kind.startswith(text)]
     assert noise.startswith(f"Random{kind}(")
-
-
-def test_a_folder_of_version_0_1_is_found(tmp_path):
-    run = ("ALE/Pong-v5", "x", [A, C], ["1:0", 0.5], 3)
-    new = tmp_path / "p0.5+1.0to0.0_s3_EarlyTermination_9+NormalNoisyReward_1.0__ALE-Pong-v5__x"
-    assert run_folder(tmp_path, *run) == new
-    name = "ALE-Pong-v5__x__RandomEarlyTermination_9_p0.5+RandomNormalNoisyReward_1.0_p1.0to0.0__3"
-    (tmp_path / name).mkdir()
-    assert run_folder(tmp_path, *run) == tmp_path / name
-    (tmp_path / "Hopper-v5__x__baseline__1").mkdir()
-    found = run_folder(str(tmp_path), "Hopper-v5", "x", [], [], 1)
-    assert found == tmp_path / "Hopper-v5__x__baseline__1"
 
 
 def test_long_run_names_fit_into_a_file_system():
