@@ -24,6 +24,7 @@ import sys
 import tempfile
 import time
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -131,7 +132,10 @@ def table(rows):
 
 
 def show_list(sweep, with_cost=False):
-    """Print the runs for benchmark.sh: folder, state and command; and what a batch will take."""
+    """Print the runs for benchmark.sh: folder, state and command; on stderr how many there are.
+
+    with_cost: also what they will take. A choice says it of each of its batches.
+    """
     states = []
     for run in sweep.runs:
         done, damage = result(run)
@@ -155,11 +159,6 @@ def show_list(sweep, with_cost=False):
     for line in plan:
         print(line, file=sys.stderr)
     return 0
-
-
-def show_dry_run(sweep):
-    """Print the same, with what a sweep costs."""
-    return show_list(sweep, with_cost=True)
 
 
 def watch(sweep):
@@ -246,7 +245,7 @@ def check_disk(folder):
 
 VIEWS = {
     "list": show_list,
-    "dry-run": show_dry_run,
+    "dry-run": partial(show_list, with_cost=True),
     "status": show_status,
     "stopped": show_stopped,
     "report": show_report,

@@ -37,6 +37,7 @@ class Choice(NamedTuple):
     name: str  # "PPO on Hopper-v5"
     algorithm: str
     env_id: str
+    noises: int  # that it began with
     schedule: list[tuple[int, int]]  # of its search
     confirm: int  # fresh seeds of the confirmation
     state: halving.State
@@ -44,7 +45,7 @@ class Choice(NamedTuple):
     returns: dict[tuple[Configuration, int], float]  # of those that are finished
     spread: float  # standard deviation over seeds of the search's last tests; NaN if unknown
     run_seconds: float | None  # about what a run takes, if anything tells
-    metric: str = "return"  # or "success rate": then `returns` has rates of success in percent
+    metric: str  # "return", or "success rate": then `returns` has rates of success in percent
 
 
 def choices(args, ask=False, keep=False):
@@ -75,11 +76,11 @@ def choices(args, ask=False, keep=False):
 
 def leave_out(args, env_id, unfit):
     """Say which noises cannot act in an environment; exit if the user has named them."""
-    reasons = {}
+    noises_of = {}
     for noise, reason in unfit.items():
         reason = reason.removeprefix(noise.partition("(")[0]).strip()  # of several noises, often
-        reasons.setdefault(reason, []).append(noise)
-    told = "; ".join(f"{', '.join(noises)} ({reason})" for reason, noises in reasons.items())
+        noises_of.setdefault(reason, []).append(noise)
+    told = "; ".join(f"{', '.join(noises)} ({reason})" for reason, noises in noises_of.items())
     if told and args.noises and not of_the_paper(args):
         fail(f"--noises: these cannot act in {env_id}: {told}")
     if told:
@@ -99,29 +100,26 @@ def follow(args, algorithm, env_id, environment):
     last_seed = sum(seeds for _, seeds in schedule)
     if last_seed >= FIRST_CONFIRMATION_SEED:
         fail(f"--budget {budget} is too large: the best noises would run with {last_seed} seeds")
-    runs, returns, last_tests, results, tested = {}, {}, {}, set(), {}
     metric = args.metric.replace("_", " ")
+    runs, returns, last_tests, results, tested = {}, {}, {}, set(), {}
     while True:
         state = halving.advance(noises, budget, args.confirm, returns)
         phase = SEARCH if len(state.rounds) < len(schedule) else CONFIRMATION
-        finished = {}
+        known = len(returns)
         for noise, seed in state.due:
-            run = make_run(args, algorithm, env_id, noise, seed, phase)
-            check_place(run)
-            if result(run)[0]:
-                run, row = with_row(run)
-                if row:
-                    tests = tests_of(run, row, metric)
-                    results |= set(tests)
-                    tested.setdefault(tuple(row["steps"]), run.folder)
-                    finished[noise, seed] = tests[-1]
-                    if phase == SEARCH:
-                        finished[noise, seed] = halving.score(row["steps"], tests)
-                        last_tests.setdefault(noise, []).append(tests[-1])
+            run, row = read(make_run(args, algorithm, env_id, noise, seed, phase))
             runs[noise, seed] = run
-        if not finished:
+            if row is None:
+                continue
+            tests = tests_of(run, row, metric)
+            results |= set(tests)
+            tested.setdefault(tuple(row["steps"]), run.folder)
+            returns[noise, seed] = tests[-1]
+            if phase == SEARCH:
+                returns[noise, seed] = halving.score(row["steps"], tests)
+                last_tests.setdefault(noise, []).append(tests[-1])
+        if len(returns) == known:
             break
-        returns |= finished
     if len(tested) > 1:  # then their scores do not compare
         one, other, *_ = tested.values()
         fail(
@@ -144,6 +142,7 @@ def follow(args, algorithm, env_id, environment):
         name=f"{algorithm.upper()} on {env_id}",
         algorithm=algorithm,
         env_id=env_id,
+        noises=len(noises),
         schedule=schedule,
         confirm=args.confirm,
         state=state,
@@ -178,15 +177,13 @@ def candidates(args, algorithm, env_id, unfit=()):
     return noises
 
 
-def check_place(run):
-    """Exit if the runs of an earlier version are side by side, not in the folders of the phases."""
-    phase = run.folder.parent
-    if not phase.exists() and (phase.parent / run.folder.name).exists():
-        fail(f"{flat_choice(phase.parent)} (or choose another --runs-dir, if it is another sweep)")
-
-
-def with_row(run):
-    """Return a finished run and its data; or the run with what is damaged in it, and None."""
+def read(run):
+    """Return a run, with what is damaged in it, and its data, None if it has not finished."""
+    runs_dir, phase = run.folder.parents[1], run.folder.parent
+    if not phase.exists() and (runs_dir / run.folder.name).exists():
+        fail(f"{flat_choice(runs_dir)} (or choose another --runs-dir, if it is another sweep)")
+    if not result(run)[0]:
+        return run, None
     row = read_run(run.folder)
     if row["status"] == "finished":
         return run, row
@@ -223,8 +220,7 @@ def plan(found, args):
 
 def question(choice):
     """Say what a choice will decide."""
-    noises = choice.schedule[0][0] if choice.schedule else 1
-    which = f"the best of {noises} noises" if noises > 1 else "the noise"
+    which = f"the best of {choice.noises} noises" if choice.noises > 1 else "the noise"
     return (
         f"{choice.name}: is {which} better than no noise? "
         f"{choice.confirm} fresh seeds of each will decide"
@@ -282,7 +278,7 @@ def describe(choice):
     seeds = f"seeds {state.seeds[0]} to {state.seeds[-1]}" if len(state.seeds) > 1 else "seed 1"
     due = f"{seeds}; runs to do: {len(state.due)}"
     if number <= rounds:
-        noises = f"{len(state.noises)} of {choice.schedule[0][0]} noises"
+        noises = f"{len(state.noises)} of {choice.noises} noises"
         return f"{choice.name}, round {number} of {rounds}: {noises}, {due}"
     [winner] = state.noises
     return f"{choice.name}, confirmation: {winner} against no noise, {due}"
@@ -348,9 +344,9 @@ def judged(found):
 def verdicts(found, judgements):
     """Yield what came out, one line for each choice."""
     for choice, (comparison, p) in zip(found, judgements, strict=True):
-        noises = choice.schedule[0][0] if choice.schedule else 1
         [winner] = choice.state.noises
-        yield halving.sentence(choice.name, winner, noises, comparison, p, len(found), unit(choice))
+        searched = choice.name, winner, choice.noises
+        yield halving.sentence(*searched, comparison, p, len(found), unit(choice))
 
 
 def obstacle(choice):
