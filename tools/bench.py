@@ -12,9 +12,7 @@ its defaults, but neither tests its policy nor saves. Whenever it logs losses to
 program starts once, reports three times to warm up, and then runs in blocks of --seconds, of which
 --pairs are measured. A speed is the median of its blocks.
 
-    core %       the share of the core that the process got; below 97 the machine was busy
-    memory MB    the most that the process held; --stored 1000000 fills the replay buffer first
-
+"core %" is the share of the core that the process got; below 97 the machine was busy.
 With --clock cpu only time on the core counts, which depends less on other processes.
 --against-... runs other programs and ours in turn, one block each. "ours / its" is the median of
 the ratios of neighbouring blocks; "from" and "to" are the 95 % interval of this median (with fewer
@@ -32,7 +30,6 @@ import itertools
 import json
 import math
 import os
-import resource
 import runpy
 import shutil
 import signal
@@ -45,6 +42,7 @@ from statistics import median
 
 PROJECT = Path(__file__).resolve().parent.parent
 ALGOS = ("sac", "td3", "ppo")
+LEARNING_STARTS = 1000  # random steps of SAC and TD3, fewer than by default: they are not measured
 ROLLOUT = 2048  # the steps of PPO's rollout, the default of all programs here
 LARGEST_ERROR = 1.5  # of an estimated speed: LEARNING in sweep/environment.py
 TOTAL_TIMESTEPS = 2_000_000  # more than any program takes before it is ended
@@ -77,8 +75,7 @@ class Marks:
         """Report that the program has reached a step, and wait."""
         self.wall += time.perf_counter() - self.resumed[0]
         self.cpu += time.process_time() - self.resumed[1]
-        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        print("mark", json.dumps([step, self.wall, self.cpu, memory]), flush=True)
+        print("mark", json.dumps([step, self.wall, self.cpu]), flush=True)
         self.wait()
 
 
@@ -101,7 +98,7 @@ def child_script(script, *flags):
     runpy.run_path(script, run_name="__main__")
 
 
-def child_sbx(algo, env_id, learning_starts):
+def child_sbx(algo, env_id):
     """Run SBX with our sizes; those of batches and buffer, and activations, are its defaults."""
     import gymnasium
     import numpy as np
@@ -119,7 +116,7 @@ def child_sbx(algo, env_id, learning_starts):
     width = 64 if algo == "ppo" else 256
     options = {"policy_kwargs": {"net_arch": [width, width]}, "learning_rate": 3e-4, "seed": 1}
     if algo != "ppo":
-        options["learning_starts"] = int(learning_starts)
+        options["learning_starts"] = LEARNING_STARTS
     if algo == "sac":
         options["qf_learning_rate"] = 1e-3
     if algo == "td3":
@@ -146,7 +143,7 @@ class Program(contextlib.AbstractContextManager):
 
     def __init__(self, name, core, *arguments, python=sys.executable):
         self.name, self.speeds, self.shares = name, [], []
-        self.step = self.wall = self.cpu = self.memory = 0
+        self.step = self.wall = self.cpu = 0
         self.folder = tempfile.TemporaryDirectory()
         command = [str(word) for word in (python, __file__, core, *arguments)]
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
@@ -166,7 +163,7 @@ class Program(contextlib.AbstractContextManager):
         for line in self.process.stdout:
             word, _, value = line.partition(" ")
             if word == "mark":
-                self.step, self.wall, self.cpu, self.memory = json.loads(value)
+                self.step, self.wall, self.cpu = json.loads(value)
                 return
             printed += [word for word in line.split() if word.strip("─│╭╮╰╯")]  # without boxes
         code = 2 if self.process.wait() == 2 else 1  # 2: bad arguments
@@ -199,10 +196,10 @@ def measure(options, *programs):
         program.shares.append((program.cpu - cpu) / (program.wall - wall))
 
 
-def flags(algo, env_id, options):
+def flags(algo, env_id):
     """Return the flags that our scripts and CleanRL's share."""
     shared = ["--env-id", env_id, "--total-timesteps", TOTAL_TIMESTEPS]
-    return shared if algo == "ppo" else [*shared, "--learning-starts", options.stored]
+    return shared if algo == "ppo" else [*shared, "--learning-starts", LEARNING_STARTS]
 
 
 def ours(algo, env_id, options, name="ours", folder=None, job=0):
@@ -210,7 +207,7 @@ def ours(algo, env_id, options, name="ours", folder=None, job=0):
     core = options.cores[job % len(options.cores)]
     script = (folder or PROJECT).resolve() / f"{algo}_continuous_noisy.py"
     never_save = ["--eval-frequency", 0, "--checkpoint-frequency", TOTAL_TIMESTEPS]
-    arguments = [*flags(algo, env_id, options), *never_save, *options.flags]
+    arguments = [*flags(algo, env_id), *never_save, *options.flags]
     return Program(name, core, "_script", script, *arguments)
 
 
@@ -222,12 +219,12 @@ def ours_and_others(algo, env_id, options):
         yield ours(algo, env_id, options, "checkout", options.against_checkout)
     if options.against_cleanrl:
         script = options.against_cleanrl.resolve() / "cleanrl" / f"{algo}_continuous_action.py"
-        arguments = [script, *flags(algo, env_id.replace("-v5", "-v4"), options)]
+        arguments = [script, *flags(algo, env_id.replace("-v5", "-v4"))]
         python = options.cleanrl_python
         yield Program("CleanRL", core, "_script", *arguments, "--no-cuda", python=python)
     if options.against_sbx:
         python = options.against_sbx
-        yield Program("SBX", core, "_sbx", algo, env_id, options.stored, python=python)
+        yield Program("SBX", core, "_sbx", algo, env_id, python=python)
 
 
 def interval_of_median(values):
@@ -255,7 +252,6 @@ def compare(algo, env_id, options):
             "program": program.name,
             "steps/s": median(program.speeds),
             "core %": 100 * median(program.shares),
-            "memory MB": program.memory,
             "ours / its": median(ratios),
             "from": low,
             "to": high,
@@ -277,12 +273,8 @@ def side_by_side(algo, env_id, options):
             measure(options, *programs)
             at_once.append(sum(program.speeds[-1] for program in programs))
     efficiencies = [b / (a * options.jobs) for a, b in zip(alone, at_once, strict=True)]
-    row = {
-        "alone": median(alone),
-        f"{options.jobs} jobs": median(at_once),
-        "efficiency": median(efficiencies),
-    }
-    return [row]
+    speeds = {"alone": median(alone), f"{options.jobs} jobs": median(at_once)}
+    return [speeds | {"efficiency": median(efficiencies)}]
 
 
 def estimate(algo, env_id, options):
@@ -320,7 +312,6 @@ def parse(argv):
     add("--envs", nargs="+", default=["HalfCheetah-v5", "Humanoid-v5"], metavar="ENV_ID")
     add("--pairs", type=int, default=20, help="blocks of each program (default: 20)")
     add("--seconds", type=float, default=2.0, help="shortest length of a block (default: 2)")
-    add("--stored", type=int, default=1000, help="random steps before learning (default: 1000)")
     add("--clock", choices=("wall", "cpu"), default="wall")
     add("--against-cleanrl", type=Path, metavar="PATH", help="a checkout of CleanRL")
     add("--cleanrl-python", type=interpreter, metavar="PYTHON", help="with CleanRL's requirements")
@@ -333,7 +324,7 @@ def parse(argv):
     options.flags = argv[end + 1 :]
     options.cores = sorted(os.sched_getaffinity(0), reverse=True)
 
-    for name, low in (("pairs", 1), ("seconds", 0.1), ("stored", 1), ("jobs", 2)):
+    for name, low in (("pairs", 1), ("seconds", 0.1), ("jobs", 2)):
         value = getattr(options, name)
         if value is not None and not value >= low:
             fail(f"--{name} must be at least {low}, not {value}")
@@ -360,8 +351,8 @@ def main(argv):
         rows = []
         for algo, env_id in itertools.product(options.algos, options.envs):
             print(f"{mode.__name__} {algo} {env_id}", file=sys.stderr)
-            cell = {"script": algo, "env_id": env_id}
-            rows += [cell | row for row in mode(algo, env_id, options)]
+            case = {"script": algo, "env_id": env_id}
+            rows += [case | row for row in mode(algo, env_id, options)]
         print(tabulate(rows, headers="keys", floatfmt=".4g"), flush=True)
         ratios = [row.get("real / estimated", 1) for row in rows]
         if not all(1 / LARGEST_ERROR <= ratio <= LARGEST_ERROR for ratio in ratios):

@@ -62,8 +62,7 @@ def test_waiting_is_not_counted(monkeypatch, capsys):
     reported = [
         json.loads(line.removeprefix("mark ")) for line in capsys.readouterr().out.split("\n")[:2]
     ]
-    assert [values[:3] for values in reported] == [[100, 3, 2], [200, 6, 4]]
-    assert all(memory > 1 for *_, memory in reported)
+    assert reported == [[100, 3, 2], [200, 6, 4]]
 
 
 def test_an_orphan_ends(monkeypatch):
@@ -120,7 +119,6 @@ def test_programs_run_in_turn(tmp_path, monkeypatch):
     assert (ours["program"], theirs["program"]) == ("ours", "checkout")
     ratios = [a / b for a, b in zip(speeds["ours"], speeds["checkout"], strict=True)]
     assert len(ratios) == 3 and theirs["ours / its"] == median(ratios)
-    assert theirs["memory MB"] > 1
 
 
 def test_side_by_side(tmp_path, monkeypatch):
@@ -179,9 +177,10 @@ def test_a_failure_is_told(tmp_path, monkeypatch, capsys, text, code, message):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("algo", ["td3", "ppo"])
-def test_the_real_scripts_are_measured(algo, capsys):
+def test_the_real_scripts_are_measured(algo, monkeypatch, capsys):
     words = ["--algos", algo, "--envs", "Pendulum-v1", "--pairs", "1", "--seconds", "0.1"]
-    bench.main([*words, "--stored", "300", "--", "--no-compile"])
+    monkeypatch.setattr(bench, "LEARNING_STARTS", 300)
+    bench.main([*words, "--", "--no-compile"])
     *_, row = capsys.readouterr().out.splitlines()
     script, env_id, program, speed, *_ = row.split()
     assert (script, env_id, program) == (algo, "Pendulum-v1", "ours") and float(speed) > 0
@@ -202,7 +201,6 @@ def test_a_relative_interpreter_is_found_from_the_folder_of_a_run(tmp_path, monk
         ("--seconds nan", "--seconds must be at least 0.1, not nan"),
         ("--pairs 0", "--pairs must be at least 1, not 0"),
         ("--jobs 1", "--jobs must be at least 2, not 1"),
-        ("--stored 0", "--stored must be at least 1, not 0"),
         ("--against-checkout .github", "--against-checkout: there is no .github/sac_continuous"),
         ("--against-cleanrl .", "--against-cleanrl and --cleanrl-python need each other"),
         ("--against-cleanrl . --cleanrl-python python3", "--against-cleanrl: there is no"),
