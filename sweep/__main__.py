@@ -54,7 +54,7 @@ class Progress(NamedTuple):
     log: Log
 
 
-def judge(run, over):
+def progress_of(run, over):
     """Return a run's progress; where its sweep is over, no young log means that it is running."""
     log = read_log(run.folder)
     done, damage = result(run)
@@ -174,7 +174,7 @@ def watch(sweep):
     while os.getppid() == parent:
         if time.monotonic() - shown >= pause:
             shown = time.monotonic()
-            line = summary(sweep.runs, [judge(run, over=False) for run in sweep.runs])
+            line = summary(sweep.runs, [progress_of(run, over=False) for run in sweep.runs])
             if terminal:
                 width = shutil.get_terminal_size().columns - 1
                 line = f"\r{line[:width].ljust(width)}"
@@ -222,7 +222,7 @@ def show_report(sweep):
 
 def show_progress(sweep, title, over):
     """Print the summary and the runs that are not on their way; return the progress of all."""
-    progresses = [judge(run, over) for run in sweep.runs]
+    progresses = [progress_of(run, over) for run in sweep.runs]
     print(f"{sweep.args.runs_dir}: {summary(sweep.runs, progresses)}")
     everything = title == "not finished"
     named = [p for p in progresses if p.state == "failed" or (everything and p.reason)]

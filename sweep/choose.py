@@ -101,31 +101,15 @@ def follow(args, algorithm, env_id, environment):
     if last_seed >= FIRST_CONFIRMATION_SEED:
         fail(f"--budget {budget} is too large: the best noises would run with {last_seed} seeds")
     metric = args.metric.replace("_", " ")
-    runs, returns, last_tests, results, tested = {}, {}, {}, set(), {}
-    while True:
-        state = halving.advance(noises, budget, args.confirm, returns)
-        phase = SEARCH if len(state.rounds) < len(schedule) else CONFIRMATION
-        known = len(returns)
-        for noise, seed in state.due:
-            run, row = read(make_run(args, algorithm, env_id, noise, seed, phase))
-            runs[noise, seed] = run
-            if row is None:
-                continue
-            tests = tests_of(run, row, metric)
-            results |= set(tests)
-            tested.setdefault(tuple(row["steps"]), run.folder)
-            returns[noise, seed] = tests[-1]
-            if phase == SEARCH:
-                returns[noise, seed] = halving.score(row["steps"], tests)
-                last_tests.setdefault(noise, []).append(tests[-1])
-        if len(returns) == known:
-            break
-    if len(tested) > 1:  # then their scores do not compare
-        one, other, *_ = tested.values()
+    state, runs, tests, returns = walk(args, algorithm, env_id, noises, budget, metric)
+    folders = {steps: runs[key].folder for key, (steps, _) in tests.items()}
+    if len(folders) > 1:  # then their scores do not compare
+        one, other, *_ = folders.values()
         fail(
             f"{one} and {other} were not tested at the same steps: choose another --runs-dir, or "
             "move the runs of one kind away"
         )
+    results = set().union(*(values for _, values in tests.values()))
     if len(results) == 1 and (state.rounds or not state.due):
         fail(
             f"{algorithm.upper()} on {env_id}: all {len(returns)} runs have a {metric} of "
@@ -134,6 +118,10 @@ def follow(args, algorithm, env_id, environment):
             "train for longer, or leave this out",
             code=1,
         )
+    last_tests = {}  # of the search
+    for (noise, seed), (_, values) in tests.items():
+        if seed < FIRST_CONFIRMATION_SEED:
+            last_tests.setdefault(noise, []).append(values[-1])
     taken = [taken for taken in map(wall_time, map(runs.get, returns)) if taken]
     seconds = fmean(taken) if taken else None
     if environment and not taken:
@@ -152,6 +140,30 @@ def follow(args, algorithm, env_id, environment):
         run_seconds=seconds,
         metric=metric,
     )
+
+
+def walk(args, algorithm, env_id, noises, budget, metric):
+    """Go from batch to batch as long as runs are finished.
+
+    Returns the state; the runs that were due; the steps and the results of the tests of those that
+    are finished; and their scores. All but the state are {(configuration, seed): ...}.
+    """
+    rounds = len(halving.schedule(len(noises), budget))
+    runs, tests, returns = {}, {}, {}
+    while True:
+        state = halving.advance(noises, budget, args.confirm, returns)
+        phase = SEARCH if len(state.rounds) < rounds else CONFIRMATION
+        known = len(returns)
+        for noise, seed in state.due:
+            run, row = read(make_run(args, algorithm, env_id, noise, seed, phase))
+            runs[noise, seed] = run
+            if row:
+                steps, values = row["steps"], tests_of(run, row, metric)
+                tests[noise, seed] = tuple(steps), values
+                score = halving.score(steps, values) if phase == SEARCH else values[-1]
+                returns[noise, seed] = score
+        if len(returns) == known:
+            return state, runs, tests, returns
 
 
 def planned_runs(found):
@@ -290,7 +302,7 @@ def standing(found, args):
     When all choices are finished, these are the verdicts.
     """
     if not any(choice.state.due for choice in found):
-        yield from verdicts(found, judged(found))
+        yield from sentences(found, judged(found))
         return
     for choice in found:
         yield describe(choice)
@@ -309,7 +321,7 @@ def report(found, path):
     else:
         judgements = judged(found)
         write_choice(path, records(found, judgements))
-        lines = verdicts(found, judgements)
+        lines = sentences(found, judgements)
     print(*lines, sep="\n")
 
 
@@ -341,8 +353,8 @@ def judged(found):
     return list(zip(comparisons, corrected, strict=True))
 
 
-def verdicts(found, judgements):
-    """Yield what came out, one line for each choice."""
+def sentences(found, judgements):
+    """Yield the verdicts, a sentence for each choice."""
     for choice, (comparison, p) in zip(found, judgements, strict=True):
         [winner] = choice.state.noises
         searched = choice.name, winner, choice.noises

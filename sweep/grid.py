@@ -152,19 +152,19 @@ def script_options(script, words):
     return options
 
 
-def option_value(name, text, kind):
-    """Read an option's value as the script does; kind: its type there, such as "int | None"."""
-    if "None" in kind and text == "None":
+def option_value(name, text, annotation):
+    """Read an option's value as the script does; annotation: its type, such as "int | None"."""
+    if "None" in annotation and text == "None":
         return None
-    if kind.startswith("Literal"):
-        choices = ast.literal_eval(kind.removeprefix("Literal"))
+    if annotation.startswith("Literal"):
+        choices = ast.literal_eval(annotation.removeprefix("Literal"))
         if text not in choices:
             fail(f"--{name} must be one of {', '.join(choices)}, not {text!r}")
         return text
     try:
-        return (float if "float" in kind else int)(text)
+        return (float if "float" in annotation else int)(text)
     except ValueError:
-        fail(f"--{name} takes a {'whole ' * ('int' in kind)}number, not {text!r}")
+        fail(f"--{name} takes a {'whole ' * ('int' in annotation)}number, not {text!r}")
 
 
 # ----------------------------------------------------------------------------------------- the runs

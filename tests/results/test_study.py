@@ -52,7 +52,7 @@ def data(tmp_path, monkeypatch):
     ],
 )
 def test_verdicts_have_known_answers(tests, claimed, of, expected):
-    assert compare.verdict(tests, claimed, of) == expected
+    assert compare.judge_claim(tests, claimed, of) == expected
 
 
 @pytest.mark.parametrize(
