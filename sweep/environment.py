@@ -21,7 +21,7 @@ import gymnasium as gym
 import numpy as np
 
 import noisy_wrappers as noisy
-from analysis.errors import fail
+from analysis.errors import fail, in_words
 from analysis.folders import read_json
 from sweep.grid import PROJECT, script_of, script_options
 
@@ -133,14 +133,13 @@ def why_unfit(env, configuration, time_limit, deadline):
 
 def in_a_line(error, env_id=""):
     """Say what an error says; if it is not Gymnasium's or ours, also where it was raised."""
-    reason = noisy.reason(error)
     if isinstance(error, (*noisy.refusals(env_id), noisy.NotFiniteError)):
-        return reason
+        return noisy.reason(error)
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if "site-packages" not in frame.filename]
     ours = Path(own[-1].filename).name in ("environment.py", "noisy_wrappers.py")
     last = frames[-1] if ours else own[-1]
-    return f"{type(error).__name__}: {reason} ({last.filename}, line {last.lineno})"
+    return f"{in_words(error)} ({last.filename}, line {last.lineno})"
 
 
 def ask_all(args, configurations):
@@ -225,7 +224,7 @@ def wall_time(run):
 
 
 def hours_of(seconds):
-    """Spell a time in hours: 1,330 or 4.9 or 0.076."""
+    """Return a time in hours as text: 1,330 or 4.9 or 0.076."""
     hours = seconds / 3600
     return f"{hours:,.0f}" if hours >= 100 else f"{hours:.1f}" if hours >= 0.1 else f"{hours:.2g}"
 

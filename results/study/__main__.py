@@ -3,7 +3,7 @@
 The other tables are of finished studies, see results/tables/README.md.
 """
 
-from results.study import baselines, claims, pooled
+from results.study import baselines, claims, physics, pooled
 from results.study.compare import comparisons
 from results.study.returns import RESULTS, read_returns
 
@@ -23,6 +23,7 @@ def tables():
         "pusher_steps": pooled.pusher_steps(),
         "sac_headline": pooled.sac_headline(),
         "claims": claims.table(),
+        **physics.tables(),
     }
 
 
@@ -34,3 +35,5 @@ def as_csv(table):
 if __name__ == "__main__":
     for name, table in tables().items():
         (RESULTS / f"tables/{name}.csv").write_text(as_csv(table), encoding="utf-8")
+    if len(tests := physics.read_tests()):
+        physics.draw(tests, RESULTS / "figures/physics.svg")

@@ -1,6 +1,8 @@
 """The choice of a noise, with training replaced by returns that are known."""
 
+import contextlib
 import csv
+import io
 import math
 import multiprocessing
 import os
@@ -23,7 +25,7 @@ from sweep.halving import (
     compare,
     fewest_seeds,
     helps,
-    rows,
+    records,
     schedule,
     score,
     sentence,
@@ -131,17 +133,6 @@ def test_a_planted_noise_is_found_and_confirmed():
         assert helps(comparison, comparison.p)
 
 
-@pytest.mark.slow
-def test_useless_noises_are_rarely_taken_for_better():
-    rng = np.random.default_rng(0)
-    claims = 0
-    for _ in range(400):
-        state, returns = play(named(90), 270, draw(rng, np.zeros(90)))
-        comparison = compare(state.noises[0], state.seeds, returns)
-        claims += helps(comparison, comparison.p)
-    assert 1 <= claims <= 18  # 2.5 % of 400 are 10; 4.5 % are 18
-
-
 def test_the_choice_is_as_good_as_a_grid_of_ten_seeds():
     """By the simulation, which the next test compares with the search."""
     rng, choices = np.random.default_rng(0), 2000
@@ -153,7 +144,7 @@ def test_the_choice_is_as_good_as_a_grid_of_ten_seeds():
     assert effects[numbers, chosen].mean() >= effects[numbers, grid].mean()
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 10, 90])
+@pytest.mark.parametrize("count", [1, 3, 90])
 def test_the_simulation_searches_by_the_rule(count):
     rng = np.random.default_rng(count)
     tables = [draw(rng, rng.normal(0, 0.3, count)) for _ in range(40)]
@@ -187,8 +178,7 @@ def test_the_default_finds_and_confirms_what_docs_say(noises):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("draw", ["normal", "high_peak", "failing"])
-@pytest.mark.parametrize("spread", [1, 0.5, 2])
+@pytest.mark.parametrize(("draw", "spread"), [("normal", 1), ("high_peak", 0.5), ("failing", 2)])
 def test_useless_noises_are_claimed_to_help_in_at_most_four_percent(draw, spread):
     """Also where they change the spread of the returns."""
     draw = getattr(simulate_choose, draw)
@@ -197,13 +187,11 @@ def test_useless_noises_are_claimed_to_help_in_at_most_four_percent(draw, spread
     assert abs(draw(np.random.default_rng(0), 10**6).mean()) < 0.005
 
 
-@pytest.mark.parametrize("noises", [1, 4, 10])
-def test_few_noises_are_chosen_no_worse_than_with_equal_rounds_and_ten_fresh_seeds(noises):
-    before = simulate_choose.equal_shares(noises, 3 * noises)
+def test_few_noises_are_chosen_no_worse_than_with_equal_rounds_and_ten_fresh_seeds():
+    now, before = schedule(4, 12), simulate_choose.equal_shares(4, 12)
     for gain in (1.0, 1.5, 2.0):
-        _, old, _ = simulate_choose.simulate(noises, before, 10, gain, trials=4000)
-        now = schedule(noises, 3 * noises)
-        assert simulate_choose.simulate(noises, now, 25, gain, trials=4000)[1] > old
+        _, old, _ = simulate_choose.simulate(4, before, 10, gain, trials=4000)
+        assert simulate_choose.simulate(4, now, 25, gain, trials=4000)[1] > old
 
 
 def test_a_run_scores_the_mean_of_its_tests_in_the_last_15_percent():
@@ -290,10 +278,10 @@ def test_a_comparison_by_hand(baseline, expected):
     assert expected in sentence("PPO on X", noise, 2, found, found.p, 1)
 
 
-def test_rows_of_choice_csv():
+def test_records_of_choice_csv():
     table = np.arange(4.0)[:, None] + np.zeros(SEARCH_SEEDS + CONFIRM)
     state, returns = play(named(3), 3, table)
-    lines = rows("PPO", "X", state, returns, helped=False)
+    lines = records("PPO", "X", state, returns, helped=False)
     assert [list(line) for line in lines] == [CHOICE_COLUMNS] * len(lines)
     search = "PPO X search"
     assert [" ".join(str(value) for value in line.values()) for line in lines] == [
@@ -318,10 +306,10 @@ def arguments(text, tmp_path):
 
 
 def conclude(args, folder):
-    """What `report` does with a choice that is over: write choice.csv, and say the verdicts."""
-    found = choose.choices(args)
-    choose.write_choice(folder / "choice.csv", choose.rows(found))
-    return list(choose.conclusion(found))
+    """What `report` does with a choice: write choice.csv, and say the verdicts, line by line."""
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        choose.report(choose.choices(args), folder / "choice.csv")
+    return out.getvalue().splitlines()
 
 
 def batches(args):
@@ -591,4 +579,4 @@ def test_status_says_who_survives(tmp_path, monkeypatch):
     [verdict] = choose.standing(finished, args)
     assert verdict.startswith("PPO on Pendulum-v1: ") and "4 fresh seeds" in verdict
     assert not (tmp_path / "choice.csv").exists()  # the status only looks
-    assert [verdict] == list(choose.conclusion(finished))
+    assert [verdict] == conclude(args, tmp_path)

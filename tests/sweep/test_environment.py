@@ -198,7 +198,7 @@ def test_runs_at_a_time(executor, jobs, hosts, expected, monkeypatch):
 
 def test_a_plan_says_what_it_will_decide(tmp_path):
     shown = choose("Slow", "--runs-dir", tmp_path)
-    speed, left_out, question, first, total, reach, place = shown.err.splitlines()
+    speed, left_out, question, first, total, gain, place = shown.err.splitlines()
     assert "RandomDynamics" in left_out
     milliseconds = float(re.fullmatch(r"toy_envs:Slow-v0: ([\d.]+) ms a step", speed)[1])
     assert question.startswith("PPO on toy_envs:Slow-v0: is the best of 18 noises better than no ")
@@ -208,7 +208,7 @@ def test_a_plan_says_what_it_will_decide(tmp_path):
     # with 20 tests of ten episodes of 100 steps, and learning
     assert hours == pytest.approx(99 * (1.02e6 * milliseconds / 1000 + 114) / 3600, rel=0.06)
     assert clock == pytest.approx(hours / 2, rel=0.02)
-    assert reach.startswith("25 fresh seeds confirm a true gain of 0.8 standard deviations")
+    assert gain.startswith("25 fresh seeds confirm a true gain of 0.8 standard deviations")
     assert place == f"runs, logs and the verdict are stored in {tmp_path}"
 
 
