@@ -263,7 +263,6 @@ def test_verdicts_in_words():
     ("baseline", "expected"),
     [
         ([8.0, 9.0, 11.0, 12.0], "+3.5 (+35 %), p = 0.057 (smallest possible: 0.029); with 4"),
-        ([0.0, 0.0, 0.0, 0.0], "beats no noise: 4 fresh seeds, +13.50, p = 0.029 (smallest"),
         ([-1e-6, 0.0, 1e-6, 0.0], "beats no noise: 4 fresh seeds, +13.50, p = 0.029 (smallest"),
         ([-12.0, -13.0, -14.0, -15.0], "+27.0 (+200 %), p = 0.029"),
     ],
