@@ -58,7 +58,13 @@ ABLATION = [(f"RandomUniformScaleReward({2 - b:.1f}, {b})", 0.05) for b in (1.1,
 ABLATION += [
     (f"RandomUniformNoisyObservation(-{b}, {b})", 1.0) for b in (0.0001, 0.001, 0.01, 0.1, 1.0)
 ]
-PRESETS = {  # the grid options that a preset sets; its noises are in preset_pairs
+PAIRS = {  # presets, and their noises with rates
+    "demo": [("RandomNormalNoisyObservation(1.0)", 1.0)],  # harms with any five seeds
+    "paper": list(itertools.product(NOISES, RATES)),
+    "choose": list(itertools.product(CHOOSE_NOISES, CHOOSE_RATES)),
+    "ablation": ABLATION,
+}
+PRESETS = {  # the grid options that a preset sets
     "demo": {
         "algos": ["ppo"],
         "envs": ["InvertedPendulum-v5"],
@@ -172,18 +178,10 @@ def option_value(name, text, annotation):
 
 def preset_pairs(preset, algorithm, env_id):
     """Return a preset's (noise, rate) pairs for one algorithm and environment."""
-    if preset == "demo":
-        return [("RandomNormalNoisyObservation(1.0)", 1.0)]  # harms with any five seeds
-    if preset == "paper":
-        return list(itertools.product(NOISES, RATES))
-    if preset == "choose":
-        return list(itertools.product(CHOOSE_NOISES, CHOOSE_RATES))
-    if preset == "ablation":
-        return ABLATION
-    if preset == "best":
-        pair = best_pairs().get((algorithm, env_id.rpartition("-v")[0]))
-        return [pair] if pair else fail(f"the paper has no best noise for {algorithm} on {env_id}")
-    return []
+    if preset != "best":
+        return PAIRS.get(preset, [])
+    pair = best_pairs().get((algorithm, env_id.rpartition("-v")[0]))
+    return [pair] if pair else fail(f"the paper has no best noise for {algorithm} on {env_id}")
 
 
 @functools.cache
