@@ -252,29 +252,22 @@ def make_run(args, algorithm, env_id, configuration, seed, phase=""):
 
 def grid(args):
     """Return the runs, each once, the first seed of everything first."""
-    seeds_of = {}
-    for algorithm in args.algos:
-        seeds_of[algorithm] = set(itertools.chain(*(args.seeds or [SEEDS[algorithm]])))
     runs = {}
-    for seed in sorted(set().union(*seeds_of.values())):
-        for algorithm, env_id in itertools.product(seeds_of, args.envs):
-            if seed not in seeds_of[algorithm]:
-                continue
-            for configuration in [BASELINE, *configurations(args, algorithm, env_id)]:
-                run = make_run(args, algorithm, env_id, configuration, seed)
-                runs.setdefault(run.folder, run)
-    return list(runs.values())
+    for algorithm, env_id in itertools.product(args.algos, args.envs):
+        noisy = configurations(args, algorithm, env_id)
+        seeds = set(itertools.chain(*(args.seeds or [SEEDS[algorithm]])))
+        for seed, configuration in itertools.product(sorted(seeds), [BASELINE, *noisy]):
+            run = make_run(args, algorithm, env_id, configuration, seed)
+            runs.setdefault(run.folder, (seed, run))
+    return [run for _, run in sorted(runs.values(), key=lambda pair: pair[0])]
 
 
 def runs_in(folder):
     """Return the runs that a folder or its logs tell of, for a status that names no grid."""
     folder = Path(folder)
-    places = [folder, *(folder / phase for phase in PHASES)]
     folders = set(runs_of(folder))
-    for place in places:
-        for log in place.glob("logs/*__*.log"):
-            if not any((other / log.stem).exists() for other in places if other != place):
-                folders.add(place / log.stem)
+    for place in (folder, *(folder / phase for phase in PHASES)):
+        folders |= {place / log.stem for log in place.glob("logs/*__*.log")}
     if not folders:
         fail(f"no runs in {folder}; name their folder with --runs-dir")
     runs = []
