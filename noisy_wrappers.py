@@ -29,6 +29,7 @@ import functools
 import hashlib
 import importlib
 import importlib.machinery
+import importlib.metadata
 import inspect
 import math
 import numbers
@@ -40,6 +41,7 @@ import signal
 import subprocess
 import sys
 import traceback
+import warnings
 import zlib
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -98,6 +100,7 @@ __all__ = [
     "outcome",
     "parse_noise",
     "rate_order",
+    "reason",
     "refusals",
     "reset_worker_signals",
     "rounded",
@@ -845,7 +848,7 @@ class RandomEarlyTermination(NoiseWrapper):
             only = self.low == limit and not self.truncate
             effect = "only turns truncated into terminated there" if only else "never acts"
             most = f"episodes have at most {limit} steps"
-            gym.logger.warn(f"RandomEarlyTermination({self.low}) {effect}: {most}", stacklevel=3)
+            warnings.warn(f"RandomEarlyTermination({self.low}) {effect}: {most}", stacklevel=3)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and decide when the episode ends."""
@@ -1088,17 +1091,22 @@ def _read_noise(text: str) -> Noise:
     try:
         inspect.signature(wrapper).bind(None, 1.0, *args, **kwargs)
     except TypeError as error:
-        raise _bad_noise(text, str(error), module) from None
+        raise _bad_noise(text, str(error)) from None
     try:
         recorded = wrapper(_ProbeEnv(), 1.0, *args, **kwargs).parameters
     except ValueError as error:
-        raise _bad_noise(text, str(error), module) from None
-    used = [p for p in _parameters(wrapper) if recorded[p.name] != p.default]
+        raise _bad_noise(text, str(error)) from None
+    parameters = _parameters(wrapper)
+    for p in parameters:
+        if p.name not in recorded:
+            call = f"super().__init__(env, noise_rate, {p.name}={p.name})"
+            raise _bad_noise(text, f"its constructor must pass {p.name} on: {call}")
+    used = [p for p in parameters if recorded[p.name] != p.default]
     return Noise(
         wrapper,
         tuple(recorded[p.name] for p in used if p.kind is not p.KEYWORD_ONLY),
         tuple((p.name, recorded[p.name]) for p in used if p.kind is p.KEYWORD_ONLY),
-        module,
+        "" if wrapper is WRAPPERS.get(name) else module,
     )
 
 
@@ -1124,17 +1132,20 @@ def _import_wrapper(module: str, name: str, text: str) -> type[NoiseWrapper]:
     _import_module(module, f"bad noise {text!r}")
     wrapper = getattr(sys.modules[module], name, None)
     if not isinstance(wrapper, type):
-        raise _bad_noise(text, f"{module} has no class {name}", module)
+        raise _bad_noise(text, f"{module} has no class {name}")
     if not issubclass(wrapper, NoiseWrapper):
-        raise _bad_noise(text, f"{name} must be a subclass of noisy_wrappers.NoiseWrapper", module)
+        raise _bad_noise(text, f"{name} must be a subclass of noisy_wrappers.NoiseWrapper")
+    kind, kinds = getattr(wrapper, "kind", None), ("observation", "reward", "action", "dynamics")
+    if kind not in kinds:
+        raise _bad_noise(text, f"{name}.kind must be one of {', '.join(kinds)}, not {kind!r}")
     return wrapper
 
 
 _EXPECTED = "expected Name(number, ..., keyword=value)"
 
 
-def _bad_noise(text: str, reason: str, module: str = "") -> ValueError:
-    if module:
+def _bad_noise(text: str, reason: str) -> ValueError:
+    if ":" in str(text).partition("(")[0]:  # the user's own, which is none of the list
         return ValueError(f"bad noise {text!r}: {reason}")
     return ValueError("\n  ".join([f"bad noise {text!r}: {reason}; valid are", *signatures()]))
 
@@ -1651,7 +1662,8 @@ class _ProbeEnv(gym.Env[Any, Any]):
 
 def _parameters(wrapper: type[NoiseWrapper]) -> list[inspect.Parameter]:
     """Return a wrapper's own parameters, those after self, env and noise_rate."""
-    return list(inspect.signature(wrapper.__init__).parameters.values())[3:]
+    parameters = inspect.signature(wrapper.__init__).parameters.values()
+    return [p for p in parameters if p.kind is not p.VAR_KEYWORD][3:]
 
 
 def _number(name: str, value: float, low: float = -math.inf, high: float = math.inf) -> float:
@@ -2005,14 +2017,28 @@ def refusals(env_id: str) -> tuple[type[Exception], ...]:
     """Return the errors that ``make_flat(gymnasium.make(env_id))`` raises on purpose.
 
     They are Gymnasium's and this module's. Of Gymnasium's own environments a missing dependency is
-    an ImportError, and those of Gymnasium-Robotics fail an assertion where MuJoCo is too new. Any
-    other error comes from the environment's code.
+    an ImportError, and some of Gymnasium-Robotics fail an assertion where MuJoCo is too new. Any
+    other error comes from the environment's code. :func:`reason` puts them into words.
     """
     spec = gym.registry.get(env_id.rpartition(":")[2])
     maker: Any = spec.entry_point if spec else ""  # "package.module:Class" or a function
     package = getattr(maker, "__module__", str(maker)).partition(".")[0]
     more = {"gymnasium": (ImportError,), "gymnasium_robotics": (AssertionError,)}
     return (gym.error.Error, SpaceError, *more.get(package, ()))
+
+
+def reason(error: BaseException) -> str:
+    r"""Return what an error says, as one line.
+
+    >>> reason(ValueError("low must not\nexceed high")), reason(KeyError())
+    ('low must not exceed high', 'KeyError')
+    """
+    text = " ".join(str(error).split())
+    if not text and isinstance(error, AssertionError) and "gymnasium_robotics" in sys.modules:
+        packages = ("gymnasium-robotics", "mujoco")
+        now = " and ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)
+        text = f'{now} do not work together here; try pip install "mujoco<3.12" (docs/training.md)'
+    return text or type(error).__name__
 
 
 def seed_globals(seed: int) -> None:

@@ -20,6 +20,7 @@ import signal
 import sys
 import tempfile
 import time
+import warnings
 import zipfile
 from collections import deque
 from dataclasses import asdict, dataclass, replace
@@ -393,8 +394,7 @@ def fail_on(errors, message, code=2):
     except errors as error:
         hidden = isinstance(error.__context__, OSError)  # by torch.save: the disk is full, say
         error = error.__context__ if hidden else error
-        reason = " ".join(str(error).split()) or f"{type(error).__name__}, see docs/training.md"
-        fail(f"{message}: {reason}", code)
+        fail(f"{message}: {noisy.reason(error)}", code)
     except Exception as error:  # of the environment, say: its traceback is what the user needs
         error.add_note(f"({message})")
         raise
@@ -450,8 +450,13 @@ def make_envs(args):
     limit = {"max_episode_steps": args.max_episode_steps}
     noisy.seed_globals(args.seed)
     with make_env(env_id, **limit) as test_env, make_env(env_id, **limit) as env:
-        with fail_on(ValueError, f"--noise in {env_id}"):
+        with (
+            fail_on(ValueError, f"--noise in {env_id}"),
+            warnings.catch_warnings(record=True) as notes,
+        ):
             env = noisy.make_noisy(env, noise, noise_rate)
+        for note in notes:
+            say(f"note: {note.message}")
         if not isinstance(env.unwrapped.observation_space, gym.spaces.Box):
             say(f"{env_id}: observations are flattened to {test_env.observation_space}")
         if not (args.max_episode_steps or gym.spec(env_id.rpartition(":")[2]).max_episode_steps):

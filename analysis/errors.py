@@ -6,6 +6,8 @@ import sys
 import traceback
 from pathlib import Path
 
+from noisy_wrappers import reason
+
 CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")  # all but tab and the ends of lines
 
 # These call what users write, and are not the place of its errors
@@ -30,7 +32,7 @@ def with_place(error, plain=()):
     That is the last place in the code of a user, if there is one.
     """
     if isinstance(error, plain):
-        return " ".join(str(error).split())
+        return reason(error)
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if "site-packages" not in frame.filename]
     place = frames[-1] if Path(own[-1].filename).name in PROGRAMS else own[-1]

@@ -103,7 +103,8 @@ def summary(runs, progresses):
             seconds += remaining(run, progress) / speed.get(run.kind, speed[None])
         now = sum(progress.log.steps_per_second for progress in running)
         left = timedelta(seconds=round(seconds / len(running)))
-        text += f"; about {left} left, {now:,.0f} steps/s"  # a narrow terminal cuts the end off
+        text += f"; about {left} left"
+        text += f", {now:,.0f} steps/s" * bool(now)  # a narrow terminal cuts the end off
     return text
 
 

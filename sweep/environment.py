@@ -115,7 +115,7 @@ def why_unfit(env, configuration, time_limit, deadline):
         with warnings.catch_warnings(action="ignore"):  # of what is said below
             noisy_env = configuration.wrap(env)
     except ValueError as error:
-        return " ".join(str(error).split())
+        return noisy.reason(error)
     for wrapper in noisy.noise_wrappers(noisy_env).values():
         if isinstance(wrapper, noisy.RandomEarlyTermination) and (wrapper.low or 0) > time_limit:
             return f"an episode has at most {time_limit} steps"

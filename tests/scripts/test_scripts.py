@@ -600,9 +600,13 @@ def test_rewards_of_shape_1_are_numbers(algorithm, tmp_path):
 @one_script
 def test_a_time_limit_of_ones_own(algorithm, tmp_path, capsys):
     limit = {"env_id": "toy_envs:Endless-v0", "max_episode_steps": 5}
-    run_dir = run(algorithm, tmp_path, **limit)
+    run_dir = run(
+        algorithm, tmp_path, **limit, noise=("RandomEarlyTermination(6)",), noise_rate=(1,)
+    )
     assert {row[2:] for row in evaluations(run_dir)} == {(5.0, 5)}
-    assert "time limit" not in capsys.readouterr().out
+    said = capsys.readouterr()
+    note = "note: RandomEarlyTermination(6) never acts: episodes have at most 5 steps"
+    assert said.out.splitlines()[0] == note and "time limit" not in said.out and not said.err
     assert json.loads((run_dir / "config.json").read_text())["args"]["max_episode_steps"] == 5
     run(algorithm, tmp_path / "none", env_id="toy_envs:NoLimit-v0")
     assert capsys.readouterr().out.count("toy_envs:NoLimit-v0 declares no time limit") == 1

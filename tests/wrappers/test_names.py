@@ -13,6 +13,7 @@ from noisy_wrappers import (
     WRAPPERS,
     canonical_env_id,
     canonical_noises,
+    reason,
     refusals,
     run_name,
 )
@@ -156,3 +157,15 @@ def test_an_assertion_is_a_refusal_only_of_a_package_that_asserts_its_versions()
     gym.register("Own-v0", "my_envs:Env")
     assert AssertionError in refusals("Asserting-v0")
     assert not {AssertionError, ImportError} & set(refusals("my_envs:Own-v0"))
+
+
+def test_an_assertion_without_words_is_told_with_versions(monkeypatch):
+    assert reason(AssertionError()) == "AssertionError"
+    monkeypatch.setitem(sys.modules, "gymnasium_robotics", sys)
+    monkeypatch.setattr(
+        "importlib.metadata.version", {"gymnasium-robotics": "1.4", "mujoco": "3.15"}.get
+    )
+    told = reason(AssertionError())
+    assert told.startswith("gymnasium-robotics 1.4 and mujoco 3.15 do not work together")
+    assert 'pip install "mujoco<3.12"' in told and "\n" not in told
+    assert reason(AssertionError("its own words")) == "its own words"
