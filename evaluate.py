@@ -27,7 +27,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import traceback
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
@@ -40,7 +39,7 @@ from gymnasium.wrappers import RecordVideo
 from tabulate import tabulate
 from tqdm import tqdm
 
-from analysis.errors import fail, in_words, take_over_terminal
+from analysis.errors import fail, in_words, take_over_terminal, with_place
 from analysis.folders import (
     PHASES,
     DamageError,
@@ -264,12 +263,6 @@ def tell(bad):
     for reason, (first, *others) in folders.items():
         more = f" and {len(others)} more" if others else ""
         print(f"error: {first}{more}: {reason}", file=sys.stderr)
-
-
-def with_place(error):
-    """Return an exception as one line that says where it was raised."""
-    place = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{in_words(error)} ({place.filename}, line {place.lineno})"
 
 
 def play(run, condition, args):

@@ -275,9 +275,6 @@ def main(view, caller, argv):
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] in ([], ["-h"], ["--help"]):
-        print(__doc__)
-        sys.exit()
     names = {"encoding": sys.getfilesystemencoding(), "errors": sys.getfilesystemencodeerrors()}
     if sys.argv[1] in ("list", "dry-run"):  # folders as they are: bash starts their runs
         sys.stdout.reconfigure(**names)

@@ -302,7 +302,7 @@ def standing(found, args):
     When all choices are finished, these are the verdicts.
     """
     if not any(choice.state.due for choice in found):
-        yield from sentences(found, judged(found))
+        yield from sentences(judged(found))
         return
     for choice in found:
         yield describe(choice)
@@ -320,15 +320,15 @@ def report(found, path):
         lines = [obstacle(choice) if choice.state.due else describe(choice) for choice in found]
     else:
         judgements = judged(found)
-        write_choice(path, records(found, judgements))
-        lines = sentences(found, judgements)
+        write_choice(path, records(judgements))
+        lines = sentences(judgements)
     print(*lines, sep="\n")
 
 
-def records(found, judgements):
+def records(judgements):
     """Return the records of choice.csv."""
     result = []
-    for choice, (comparison, p) in zip(found, judgements, strict=True):
+    for choice, comparison, p in judgements:
         names = choice.algorithm.upper(), choice.env_id
         helped = halving.helps(comparison, p)
         result += halving.records(*names, choice.state, choice.returns, helped)
@@ -341,7 +341,7 @@ def unit(choice):
 
 
 def judged(found):
-    """Return each finished choice's comparison, and its p corrected for all of them."""
+    """Return finished choices, each with its comparison and the p corrected for all of them."""
     comparisons = []
     for choice in found:
         [winner] = choice.state.noises
@@ -350,15 +350,15 @@ def judged(found):
             comparison = comparison._replace(difference_percent=math.nan)  # never percent of a rate
         comparisons.append(comparison)
     corrected = holm([comparison.p for comparison in comparisons])
-    return list(zip(comparisons, corrected, strict=True))
+    return list(zip(found, comparisons, corrected, strict=True))
 
 
-def sentences(found, judgements):
+def sentences(judgements):
     """Yield the verdicts, a sentence for each choice."""
-    for choice, (comparison, p) in zip(found, judgements, strict=True):
+    for choice, comparison, p in judgements:
         [winner] = choice.state.noises
-        searched = choice.name, winner, choice.noises
-        yield halving.sentence(*searched, comparison, p, len(found), unit(choice))
+        found = choice.name, winner, choice.noises, comparison, p
+        yield halving.sentence(*found, len(judgements), unit(choice))
 
 
 def obstacle(choice):

@@ -11,7 +11,6 @@ import math
 import re
 import sys
 import time
-import traceback
 import warnings
 from pathlib import Path
 from statistics import fmean
@@ -21,7 +20,7 @@ import gymnasium as gym
 import numpy as np
 
 import noisy_wrappers as noisy
-from analysis.errors import fail, in_words
+from analysis.errors import fail, with_place
 from analysis.folders import read_json
 from sweep.grid import PROJECT, script_of, script_options
 
@@ -76,7 +75,8 @@ def ask(env_id, configurations=(), max_episode_steps=None, clock=time.perf_count
                 unfit={noise.noise: reason for noise, reason in reasons.items() if reason},
             )
     except Exception as error:
-        raise Refused(in_a_line(error, env_id)) from error
+        plain = *noisy.refusals(env_id), noisy.NotFiniteError
+        raise Refused(with_place(error, plain)) from error
 
 
 def time_steps(env, time_limit, deadline, clock):
@@ -127,19 +127,8 @@ def why_unfit(env, configuration, time_limit, deadline):
                 if terminated or truncated:
                     break
     except Exception as error:  # the environment's own, where noise has led it
-        return in_a_line(error)
+        return with_place(error, (gym.error.Error, noisy.NotFiniteError))
     return ""
-
-
-def in_a_line(error, env_id=""):
-    """Say what an error says; if it is not Gymnasium's or ours, also where it was raised."""
-    if isinstance(error, (*noisy.refusals(env_id), noisy.NotFiniteError)):
-        return noisy.reason(error)
-    frames = traceback.extract_tb(error.__traceback__)
-    own = [frame for frame in frames if "site-packages" not in frame.filename]
-    ours = Path(own[-1].filename).name in ("environment.py", "noisy_wrappers.py")
-    last = frames[-1] if ours else own[-1]
-    return f"{in_words(error)} ({last.filename}, line {last.lineno})"
 
 
 def ask_all(args, configurations):

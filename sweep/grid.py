@@ -58,7 +58,13 @@ ABLATION = [(f"RandomUniformScaleReward({2 - b:.1f}, {b})", 0.05) for b in (1.1,
 ABLATION += [
     (f"RandomUniformNoisyObservation(-{b}, {b})", 1.0) for b in (0.0001, 0.001, 0.01, 0.1, 1.0)
 ]
-PRESETS = {  # the grid options that a preset sets; its noises are in preset_pairs
+PAIRS = {  # presets, and their noises with rates
+    "demo": [("RandomNormalNoisyObservation(1.0)", 1.0)],  # harms with any five seeds
+    "paper": list(itertools.product(NOISES, RATES)),
+    "choose": list(itertools.product(CHOOSE_NOISES, CHOOSE_RATES)),
+    "ablation": ABLATION,
+}
+PRESETS = {  # the grid options that a preset sets
     "demo": {
         "algos": ["ppo"],
         "envs": ["InvertedPendulum-v5"],
@@ -172,18 +178,10 @@ def option_value(name, text, annotation):
 
 def preset_pairs(preset, algorithm, env_id):
     """Return a preset's (noise, rate) pairs for one algorithm and environment."""
-    if preset == "demo":
-        return [("RandomNormalNoisyObservation(1.0)", 1.0)]  # harms with any five seeds
-    if preset == "paper":
-        return list(itertools.product(NOISES, RATES))
-    if preset == "choose":
-        return list(itertools.product(CHOOSE_NOISES, CHOOSE_RATES))
-    if preset == "ablation":
-        return ABLATION
-    if preset == "best":
-        pair = best_pairs().get((algorithm, env_id.rpartition("-v")[0]))
-        return [pair] if pair else fail(f"the paper has no best noise for {algorithm} on {env_id}")
-    return []
+    if preset != "best":
+        return PAIRS.get(preset, [])
+    pair = best_pairs().get((algorithm, env_id.rpartition("-v")[0]))
+    return [pair] if pair else fail(f"the paper has no best noise for {algorithm} on {env_id}")
 
 
 @functools.cache
@@ -254,29 +252,22 @@ def make_run(args, algorithm, env_id, configuration, seed, phase=""):
 
 def grid(args):
     """Return the runs, each once, the first seed of everything first."""
-    seeds_of = {}
-    for algorithm in args.algos:
-        seeds_of[algorithm] = set(itertools.chain(*(args.seeds or [SEEDS[algorithm]])))
     runs = {}
-    for seed in sorted(set().union(*seeds_of.values())):
-        for algorithm, env_id in itertools.product(seeds_of, args.envs):
-            if seed not in seeds_of[algorithm]:
-                continue
-            for configuration in [BASELINE, *configurations(args, algorithm, env_id)]:
-                run = make_run(args, algorithm, env_id, configuration, seed)
-                runs.setdefault(run.folder, run)
-    return list(runs.values())
+    for algorithm, env_id in itertools.product(args.algos, args.envs):
+        noisy = configurations(args, algorithm, env_id)
+        seeds = set(itertools.chain(*(args.seeds or [SEEDS[algorithm]])))
+        for seed, configuration in itertools.product(sorted(seeds), [BASELINE, *noisy]):
+            run = make_run(args, algorithm, env_id, configuration, seed)
+            runs.setdefault(run.folder, (seed, run))
+    return [run for _, run in sorted(runs.values(), key=lambda pair: pair[0])]
 
 
 def runs_in(folder):
     """Return the runs that a folder or its logs tell of, for a status that names no grid."""
     folder = Path(folder)
-    places = [folder, *(folder / phase for phase in PHASES)]
     folders = set(runs_of(folder))
-    for place in places:
-        for log in place.glob("logs/*__*.log"):
-            if not any((other / log.stem).exists() for other in places if other != place):
-                folders.add(place / log.stem)
+    for place in (folder, *(folder / phase for phase in PHASES)):
+        folders |= {place / log.stem for log in place.glob("logs/*__*.log")}
     if not folders:
         fail(f"no runs in {folder}; name their folder with --runs-dir")
     runs = []

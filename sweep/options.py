@@ -105,10 +105,7 @@ def whole_number(text):
 def seeds(text):
     """Read a seed, "3", or a range of seeds, "1-5"."""
     match = re.fullmatch(r"(\d+)(?:-(\d+))?", text)
-    values = range(0)
-    if match:
-        first, last = match.groups(default=match[1])
-        values = range(int(first), int(last) + 1)
+    values = range(int(match[1]), int(match[2] or match[1]) + 1) if match else ()
     if not values:
         fail(f"--seeds takes numbers and ranges, separated by spaces: 1 2 3 or 1-3, not {text!r}")
     return values

@@ -449,11 +449,10 @@ def undisturbed(folder, *command):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["parallel", "slurm"], indirect=True)
-def test_choose_on_other_engines(engine, tmp_path):
-    executor, env = engine
+def test_choose_submits_one_batch_after_another(slurm, tmp_path):
     command = [*CHOOSE[:-1], "--budget", "2"]  # a batch of 2 runs, and one of 8
-    result = run(*command, "--runs-dir", tmp_path / "runs", *executor, env=env)
+    executor = ["--executor", "slurm"]
+    result = run(*command, "--runs-dir", tmp_path / "runs", *executor, env=slurm)
     assert result.code == 0, result.out + result.err
     found = *chosen(tmp_path / "runs"), verdicts(result.out)
     assert found == undisturbed(tmp_path / "expected", *command) and len(found[1]) == 10

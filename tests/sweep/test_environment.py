@@ -3,8 +3,10 @@
 import contextlib
 import json
 import re
+import shlex
 
 import pytest
+import stub_run
 import toy_envs
 from views import view
 
@@ -247,6 +249,17 @@ def test_a_status_makes_no_environment(tmp_path, monkeypatch):
     monkeypatch.setattr(environment, "ask", None)
     shown = choose("Tiny", *words, view_name="status").out
     assert "8 of 8 noises" in shown and "core-hours are left" in shown
+
+
+def test_a_choice_that_has_begun_is_not_asked_again(tmp_path, monkeypatch):
+    words = ["--runs-dir", tmp_path, "--noises", f"{SCALE}@1", "--confirm", "4"]
+    words += ["--total-timesteps", "4000"]
+    command = choose("Tiny", *words).out.splitlines()[0].split("\t")[2]
+    stub_run.train(shlex.split(command[command.index("ppo_") :]))  # it says that it took 36 seconds
+    monkeypatch.setattr(environment, "ask", None)
+    shown = choose("Tiny", *words)
+    assert shown.code == 0
+    assert "1 are done, about 0.07 core-hours are left" in shown.err
 
 
 def test_what_cannot_be_read_is_asked_again(tmp_path):
