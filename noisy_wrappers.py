@@ -1,10 +1,10 @@
 """Gymnasium wrappers that perturb observations, rewards, episode ends and actions at random.
 
 Nine implement section 3 of Khraishi and Okhrati, "Simple Noisy Environment Augmentation for
-Reinforcement Learning"; RandomNormalNoisyAction is our own. Every wrapper is
-``Wrapper(env, noise_rate, <its parameters>)``: with probability p = ``noise_rate`` a step (or an
-episode) is perturbed, otherwise the data of the environment pass through untouched. Wrappers
-combine by nesting, or with :func:`make_noisy`.
+Reinforcement Learning"; RandomNormalNoisyAction, RandomActionDelay and RandomDynamics are our own.
+Every wrapper is ``Wrapper(env, noise_rate, <its parameters>)``: with probability p = ``noise_rate``
+a step (or an episode) is perturbed, otherwise the data of the environment pass through untouched.
+Wrappers combine by nesting, or with :func:`make_noisy`.
 
 A rate that changes during training is written "start:end": ``"1.0:0.0"`` goes linearly from 1 to 0.
 Call :func:`set_progress` to say how much of the training is done; the next ``reset()`` sets the
