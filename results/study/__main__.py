@@ -13,7 +13,8 @@ SETS = ("ppo_hopper", "sac_200k", "td3_200k", "ppo_walker2d")  # of plans.md, as
 def tables():
     """Return {name: frame}."""
     sets = {name: read_returns(name) for name in SETS}
-    found = {name: comparisons(runs) for name, runs in sets.items() if len(runs)}
+    sets = {name: runs for name, runs in sets.items() if len(runs) and runs["seed"].nunique() > 1}
+    found = {name: comparisons(runs) for name, runs in sets.items()}
     return found | {
         "all_runs_batches": pooled.batches(),
         "all_runs_best_noises": pooled.best_noises(),
