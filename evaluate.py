@@ -464,15 +464,6 @@ def draw_without_display():
     )
 
 
-def make_folder(folder):
-    """Make the folder of the videos."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        fail(f"--video: cannot write to {folder}: {error}")
-
-
 def show(runs, conditions, args):
     """Play an episode of each condition in a window or into a video; return whether one failed."""
     tasks = list(itertools.product(runs, conditions))
@@ -530,7 +521,11 @@ def main(args):
     if not runs:
         fail(f"there is no finished run in {', '.join(map(str, args.runs))}")
     if args.video:
-        make_folder(args.video)
+        try:
+            args.video.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=args.video).close()
+        except OSError as error:
+            fail(f"--video: cannot write to {args.video}: {error}")
     if args.video or args.render:
         return show(runs, conditions, args) or bool(bad)
     if not storing:

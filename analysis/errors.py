@@ -10,8 +10,10 @@ from noisy_wrappers import reason
 
 CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")  # all but tab and the ends of lines
 
+PROJECT = Path(__file__).resolve().parents[1]
 # These call what users write, and are not the place of its errors
-PROGRAMS = ("evaluate.py", "environment.py", "noisy_wrappers.py")
+PROGRAMS = {PROJECT / name for name in ("evaluate.py", "noisy_wrappers.py", "sweep/environment.py")}
+PROGRAMS |= {PROJECT / f"{name}_continuous_noisy.py" for name in ("sac", "td3", "ppo")}
 
 
 def fail(message, code=2):
@@ -35,7 +37,7 @@ def with_place(error, plain=()):
         return reason(error)
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if "site-packages" not in frame.filename]
-    place = frames[-1] if Path(own[-1].filename).name in PROGRAMS else own[-1]
+    place = frames[-1] if Path(own[-1].filename).resolve() in PROGRAMS else own[-1]
     return f"{in_words(error)} ({place.filename}, line {place.lineno})"
 
 

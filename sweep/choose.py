@@ -319,20 +319,14 @@ def report(found, path):
     if any(choice.state.due for choice in found):
         lines = [obstacle(choice) if choice.state.due else describe(choice) for choice in found]
     else:
-        judgements = judged(found)
-        write_choice(path, records(judgements))
+        judgements, records = judged(found), []
+        for choice, comparison, p in judgements:
+            names = choice.algorithm.upper(), choice.env_id
+            helped = halving.helps(comparison, p)
+            records += halving.records(*names, choice.state, choice.returns, helped)
+        write_choice(path, records)
         lines = sentences(judgements)
     print(*lines, sep="\n")
-
-
-def records(judgements):
-    """Return the records of choice.csv."""
-    result = []
-    for choice, comparison, p in judgements:
-        names = choice.algorithm.upper(), choice.env_id
-        helped = halving.helps(comparison, p)
-        result += halving.records(*names, choice.state, choice.returns, helped)
-    return result
 
 
 def unit(choice):

@@ -145,7 +145,10 @@ def ask_all(args, configurations):
         except Refused as error:  # others may be wrong, too
             reasons.append(f"no algorithm can be trained in {env_id}: {error}")
             continue
-        print(speed_of(env_id, answer), file=sys.stderr, flush=True)
+        speed = f"{env_id}: {float(f'{1000 * answer.step_seconds:.2g}'):g} ms a step"
+        if answer.timed_steps < STEPS:
+            speed += f" (only {answer.timed_steps} steps were timed: it is slow)"
+        print(speed, file=sys.stderr, flush=True)
         answers[env_id] = answer
         for algorithm in args.algos:
             if algorithm != "ppo" and not answer.bounded:
@@ -230,14 +233,6 @@ def time_left(batches, jobs, elsewhere=False):
         text += f", {hours_of(clock)} hours on the clock with {runs} at a time"
     if elsewhere:
         text += "; timed on this machine, others may be faster or slower"
-    return text
-
-
-def speed_of(env_id, environment):
-    """Say how fast an environment is."""
-    text = f"{env_id}: {float(f'{1000 * environment.step_seconds:.2g}'):g} ms a step"
-    if environment.timed_steps < STEPS:
-        text += f" (only {environment.timed_steps} steps were timed: it is slow)"
     return text
 
 

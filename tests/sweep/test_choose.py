@@ -493,6 +493,10 @@ def test_what_the_confirmation_can_show(tmp_path):
     ).groups()
     assert line.startswith("PPO on Pendulum-v1: 5 fresh seeds confirm a true gain of about ")
     assert float(gain) == pytest.approx(spread * float(units), rel=0.06)
+    [choice] = choose.choices(arguments(two, tmp_path))
+    for run in map(choice.runs.get, choice.state.due[:4]):  # fresh seeds change nothing about it
+        stub_run.train([run.script, *run.arguments])
+    assert lines(two) == [line]
 
 
 def test_a_second_choice_takes_the_same_fresh_seeds(tmp_path):
