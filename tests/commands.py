@@ -18,6 +18,7 @@ from types import SimpleNamespace
 from tqdm import tqdm
 
 ROOT = Path(__file__).parents[1]
+LIMIT = 120  # seconds that a command may take
 FORK = multiprocessing.get_context("forkserver")
 FORK.set_forkserver_preload(
     ["pytest", "tyro", "tqdm", "gymnasium.envs.mujoco", "torch.utils.tensorboard"]
@@ -76,6 +77,9 @@ def start(path, words, *moments, cwd=ROOT, before=nothing):
 
 def ended(process):
     """Wait for a command; return its exit code (-9 after SIGKILL), stdout and stderr."""
+    limit = threading.Timer(LIMIT, process.kill)  # what hangs is to fail, and not to hang the tests
+    limit.daemon = True
+    limit.start()
     texts = []
     for connection in (process.out, process.err):
         if connection.closed:  # a test has left it
@@ -83,8 +87,8 @@ def ended(process):
             continue
         with open(os.dup(connection.fileno()), errors="replace") as file:
             texts.append(file.read())
-    process.join(120)
-    assert process.exitcode is not None
+    process.join()
+    limit.cancel()
     return SimpleNamespace(code=process.exitcode, out=texts[0], err=texts[1])
 
 
