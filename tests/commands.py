@@ -4,12 +4,14 @@ What takes `python script.py` seconds takes these a moment. They run the file as
 be told to die, or to be sent a signal, at a chosen moment.
 """
 
+import contextlib
 import functools
 import itertools
 import multiprocessing
 import os
 import pkgutil
 import runpy
+import signal
 import sys
 import threading
 from pathlib import Path
@@ -75,9 +77,16 @@ def start(path, words, *moments, cwd=ROOT, before=nothing):
     return process
 
 
+def kill(process):
+    """Kill a command; where it has a process group, with all processes of that."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.kill()
+
+
 def ended(process):
     """Wait for a command; return its exit code (-9 after SIGKILL), stdout and stderr."""
-    limit = threading.Timer(LIMIT, process.kill)  # what hangs is to fail, and not to hang the tests
+    limit = threading.Timer(LIMIT, kill, [process])  # what hangs is to fail, not to hang the tests
     limit.daemon = True
     limit.start()
     texts = []
