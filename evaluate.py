@@ -62,6 +62,7 @@ from noisy_wrappers import (
     BASELINE,
     Configuration,
     NotFiniteError,
+    SpaceError,
     canonical_env_id,
     outcome,
     rounded,
@@ -550,5 +551,5 @@ if __name__ == "__main__":
         sys.exit(main(tyro.cli(Args, description=__doc__)))
     except KeyboardInterrupt:
         fail("stopped; what was played is stored, but nothing with another --seed", code=130)
-    except NotFiniteError as error:  # from the environment
+    except (NotFiniteError, SpaceError) as error:  # from the environment
         fail(error, code=1)

@@ -90,6 +90,7 @@ __all__ = [
     "SpaceError",
     "canonical_env_id",
     "canonical_noises",
+    "handle_signals",
     "into_space",
     "make_flat",
     "make_noisy",
@@ -1847,9 +1848,10 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     NotFiniteError, which says whether the action was already NaN, as after a divergence. Rewards
     become floats and the two ends bools; they may be arrays of one element, but not strings.
     Observations, also in dictionaries and tuples, are copied, because an environment may write the
-    next one into the same array, and actions, because it may write into those. An observation that
-    has not the shape of its space, and a step of four values, raise SpaceError. The spaces are
-    looked up once, because an environment may make new ones, with new generators, at every access.
+    next one into the same array, and actions, because it may write into those; so are infos, which
+    may be None. An observation that has not the shape of its space, a step of four values and a
+    reset without seed and options raise SpaceError. The spaces are looked up once, because an
+    environment may make new ones, with new generators, at every access.
 
     >>> env = FiniteNumbers(gym.make("Pendulum-v1", disable_env_checker=True))
     >>> _ = env.reset(seed=0)
@@ -1876,9 +1878,10 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         try:
             observation, info = self.env.reset(seed=seed, options=options)
         except (TypeError, ValueError) as error:
-            self._refuse_old_api("reset() must return (observation, info)", error)
+            wanted = "reset(seed=..., options=...) must return (observation, info)"
+            self._refuse_old_api(wanted, error)
             raise
-        return self._checked(observation), info
+        return self._checked(observation), dict(info or {})
 
     def step(self, action: Any) -> Step:
         """Step the environment and check the observation and the reward."""
@@ -1889,34 +1892,44 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             values = "(observation, reward, terminated, truncated, info)"
             self._refuse_old_api(f"step() must return {values}", error)
             raise
-        if isinstance(reward, str):
-            self._stop("returned the reward", reward)
-        number = float(reward.item() if isinstance(reward, np.ndarray) else reward)
+        number = math.nan
+        if not isinstance(reward, str):
+            with contextlib.suppress(TypeError, ValueError):  # of None, or of several numbers
+                number = float(reward.item() if isinstance(reward, np.ndarray) else reward)
         if not math.isfinite(number):
-            self._blame("returned the reward", number, action)
-        return self._checked(observation, action), number, bool(terminated), bool(truncated), info
+            self._blame("returned the reward", reward, action)
+        observation, info = self._checked(observation, action), dict(info or {})
+        return observation, number, bool(terminated), bool(truncated), info
+
+    def close(self) -> None:
+        """Close the environment; a warning says if it cannot be, but what it has done stays done."""
+        try:
+            self.env.close()
+        except Exception as error:
+            gym.logger.warn(f"closing the environment failed: {error!r}")
 
     def _checked(self, observation: Any, action: Any = None) -> Any:
         """Return a copy of an observation."""
         parts = {}
         for path, box in self._boxes.items():
             part = np.array(functools.reduce(operator.getitem, path, observation))
-            if not np.isfinite(part).all():
-                self._blame(f"returned the observation{_subscript(path)}", part, action)
             if part.shape != box.shape:
                 raise SpaceError(
                     f"step {self._steps} of an episode: the environment returned an "
                     f"observation{_subscript(path)} of shape {part.shape}, and its "
                     f"observation_space has shape {box.shape}"
                 )
+            if not np.isfinite(part).all():
+                self._blame(f"returned the observation{_subscript(path)}", part, action)
             parts[path] = part
         return _replaced(observation, parts) if parts else observation
 
     def _refuse_old_api(self, wanted: str, error: Exception) -> None:
-        """Raise SpaceError if a wrapper, and not the environment's own code, could not unpack."""
+        """Raise SpaceError if a wrapper, not the environment's own code, could not call or unpack."""
         *_, (frame, _) = traceback.walk_tb(error.__traceback__)
         place = frame.f_globals.get("__name__", "")
-        if "unpack" in str(error) and place.startswith(("gymnasium.wrappers.", __name__)):
+        is_old = re.search("unpack|unexpected keyword", str(error))
+        if is_old and place.startswith(("gymnasium.wrappers.", __name__)):
             at = f"step {self._steps} of an episode"
             raise SpaceError(f"{at}: the environment's {wanted}: {error}") from error
 
@@ -2125,6 +2138,14 @@ def note_versions(config: dict[str, Any], matmul_precision: str) -> list[str]:
     return changes
 
 
+def handle_signals(handler: Callable[[int, Any], None]) -> None:
+    """Let a handler have SIGTERM, SIGINT and SIGHUP, but a SIGHUP that is ignored, as by nohup."""
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        ignored = number == signal.SIGHUP and signal.getsignal(number) == signal.SIG_IGN
+        if not ignored:
+            signal.signal(number, handler)
+
+
 def reset_worker_signals() -> None:
     """Undo a script's signal handlers in a worker process that an environment forked.
 
@@ -2162,7 +2183,9 @@ class EnvState:
 
     def _generators(self) -> list[Any]:
         environment, actions = self.env.unwrapped.np_random, self.env.action_space.np_random
-        return [environment, actions, *self.generators]
+        # of Python's own or of PyTorch's generators, the environment may be the only owner
+        known = isinstance(environment, np.random.Generator | np.random.RandomState)
+        return [*[environment] * known, actions, *self.generators]
 
     def _returns(self) -> deque[float]:
         recorded = self.env.has_wrapper_attr("return_queue")

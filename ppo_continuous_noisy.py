@@ -515,11 +515,12 @@ def prepare_compiler():
 
 def start_again(error):
     """If compiling failed, start again with a new cache for the compiler, and then without it."""
-    if type(error).__module__.startswith(("torch._dynamo", "torch._inductor")):
+    compiling = type(error).__module__.startswith(("torch._dynamo", "torch._inductor"))
+    if compiling and "--no-compile" not in sys.argv:  # else it is of the environment
         reason = str(getattr(error, "inner_exception", error)).strip()
         say(f"not compiled, starting again: {reason.partition(chr(10))[0]}")
         cache = f"torchinductor_{os.getpid()}_"  # os.execv keeps the process number
-        options = ["--no-compile"] if cache in os.environ["TORCHINDUCTOR_CACHE_DIR"] else []
+        options = ["--no-compile"] if cache in os.environ.get("TORCHINDUCTOR_CACHE_DIR", "") else []
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = tempfile.mkdtemp(prefix=cache)
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:], *options])
 
@@ -774,16 +775,14 @@ if __name__ == "__main__":
         with contextlib.suppress(OSError):  # nobody may be left to read it; print is not safe here
             os.write(1, told)
 
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        under_nohup = number == signal.SIGHUP and signal.getsignal(number) == signal.SIG_IGN
-        if not under_nohup:
-            signal.signal(number, stop_run)
+    noisy.handle_signals(stop_run)
     os.register_at_fork(after_in_child=noisy.reset_worker_signals)
     sys.path.append(os.getcwd())  # for what the module of --env-id module:Name-v0 imports
     finished = False
     try:
         with fail_on((noisy.NotFiniteError, noisy.SpaceError), "training stopped", code=1):
-            finished = train(read_args(), stop=lambda: bool(signals))
+            # again whenever an episode ends, because the environment may take the signals over
+            finished = train(read_args(), lambda: noisy.handle_signals(stop_run) or bool(signals))
     except Exception as error:
         if not signals:  # the environment's processes may have got the signal, too
             start_again(error)
