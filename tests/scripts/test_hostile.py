@@ -24,7 +24,7 @@ from test_scripts import SCRIPTS, arguments, assert_one_line, evaluations, flags
 
 import evaluate
 import ppo_continuous_noisy as ppo
-from noisy_wrappers import NotFiniteError, SpaceError
+from noisy_wrappers import NotFiniteError, SpaceError, make_noisy
 
 ROOT = Path(__file__).parents[2]
 HOSTILE = {"env_id": "hostile_envs:Hostile-v0", "noise": (), "noise_rate": ()}
@@ -273,13 +273,13 @@ def test_evaluate_plays_the_same_again_and_closes(algorithm, tmp_path, log, caps
         (run_dir / "robustness.csv").unlink()
     assert rows[0] == rows[1]
     assert_closed(log(), number=2 + 2 * 2)
-    with ppo.make_env(ALONE["env_id"]) as env:
+    with make_noisy(ppo.make_env(ALONE["env_id"]), [], []) as env:
         policy = lambda observation: np.float32([0.5])  # noqa: E731
         *_, second = evaluate.play_episodes(env, policy, 2, seed=5)
         assert evaluate.play_episodes(env, policy, 1, seed=6) == [second]
     (run_dir / "policy.pt").write_bytes(b"damaged")
     assert evaluate.main(evaluate.Args(runs=(run_dir,), episodes=2)) == 2
-    assert_closed(log(), number=7)
+    assert_closed(log(), number=8)
 
 
 # WHAT THE ENVIRONMENT RETURNS, AND WHAT IT IS GIVEN
