@@ -41,7 +41,8 @@ $(BIN)/python:
 # pip shows its own progress on a terminal; elsewhere one line tells each package.
 INSTALL = if [ -t 1 ]; then $(BIN)/python -m pip install --requirement $<; else \
 	$(BIN)/python -m pip install --progress-bar off --requirement $< \
-	| sed -nu -e 's/^Collecting \([^ ]*\).*/installing \1/p' -e '/^Successfully/p'; fi
+	| sed -nu -e 's/^Collecting \([^ ]*\).*/fetching \1/p' -e 's/^Installing c.*/installing them/p' \
+	-e '/^Successfully/p'; fi
 
 $(BIN)/.size: | $(BIN)/python
 	@$(BIN)/python -c "import torch" 2>/dev/null || { \

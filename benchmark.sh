@@ -28,12 +28,12 @@ Grid options replace a preset's values
              your own environment, from my_envs.py in the current folder
   --seeds 1-5 7
   --noises "RandomNormalNoisyReward(1.0)" "RandomEarlyTermination(50)+RandomMixupObservation(0.5)"
-             noises joined by + act together
+             noises joined by + are combined
   --noise-rates 0.05 1.0 1.0:0.0
              each noise is run at each rate; 1.0:0.0 falls linearly during training
   --noises "RandomNormalNoisyReward(1.0)@0.1+RandomEarlyTermination(50)@0.2"
              a rate for each noise; --noise-rates does not apply here
-  --combine  with custom: also run every pair of the noises together
+  --combine  with custom: also run every pair of the noises, combined
   --total-timesteps 1e6
   --runs-dir runs
              folder of the runs, relative to the current folder (choose: runs/choose, demo:

@@ -27,7 +27,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import traceback
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
@@ -40,7 +39,7 @@ from gymnasium.wrappers import RecordVideo
 from tabulate import tabulate
 from tqdm import tqdm
 
-from analysis.errors import fail, in_words, take_over_terminal
+from analysis.errors import fail, in_words, take_over_terminal, with_place
 from analysis.folders import (
     PHASES,
     DamageError,
@@ -63,9 +62,8 @@ from noisy_wrappers import (
     BASELINE,
     Configuration,
     NotFiniteError,
+    SpaceError,
     canonical_env_id,
-    make_noisy,
-    noise_slug,
     outcome,
     rounded,
     seed_globals,
@@ -151,11 +149,8 @@ def find_runs(paths):
 
 
 def read_conditions(args):
-    """Return the clean condition and every noise at every rate, each once.
-
-    That is {(noise, noise rate) as in robustness.csv: (noises, noise rates)}.
-    """
-    conditions = {BASELINE.columns: BASELINE.texts}
+    """Return the configurations to test under: without noise, and every noise at every rate."""
+    conditions = {BASELINE: None}  # a dictionary keeps each once, in order; a rate of 0 is clean
     for noise, rate in itertools.product(args.noises, args.noise_rates):
         try:
             configuration = Configuration.read(split_noises(noise), [rate])
@@ -163,8 +158,8 @@ def read_conditions(args):
             fail(error)
         if any(start != end for start, end in configuration.rates):
             fail(f"--noise-rates {rate}: policies are tested at constant rates")
-        conditions.setdefault(configuration.columns, configuration.texts)  # a rate of 0 is clean
-    return conditions
+        conditions[configuration] = None
+    return list(conditions)
 
 
 @contextmanager
@@ -251,8 +246,8 @@ def check_runs(runs, conditions, bad, storing):
     for run in runs:
         try:
             with load(run) as (env, _):
-                for noises, rates in conditions.values():
-                    make_noisy(env, noises, rates)
+                for condition in conditions:
+                    condition.wrap(env)
             stored[run] = read_stored(run) if storing else {}
         except (UnusableError, ValueError) as error:
             bad[run.folder] = str(error)
@@ -271,39 +266,34 @@ def tell(bad):
         print(f"error: {first}{more}: {reason}", file=sys.stderr)
 
 
-def with_place(error):
-    """Return an exception as one line that says where it was raised."""
-    place = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{in_words(error)} ({place.filename}, line {place.lineno})"
-
-
-def play(run, noises, rates, args):
+def play(run, condition, args):
     """Play episodes; return what play_episodes does."""
     with load(run) as (env, policy):
-        return play_episodes(make_noisy(env, noises, rates), policy, args.episodes, args.seed)
+        return play_episodes(condition.wrap(env), policy, args.episodes, args.seed)
 
 
-def draw(run, noises, rates, args):
+def draw(run, condition, args):
     """Play an episode in a window or into a video: its result, or in words why it cannot."""
     try:
         if args.video:
-            return record(run, noises, rates, args)
+            return record(run, condition, args)
         with load(run, "human") as (env, policy):
-            [result] = play_episodes(make_noisy(env, noises, rates), policy, 1, args.seed)
+            [result] = play_episodes(condition.wrap(env), policy, 1, args.seed)
             return result
     except Exception as error:  # of any library that draws, or of the environment
         return with_place(error)
 
 
-def record(run, noises, rates, args):
+def record(run, condition, args):
     """Play one episode into a video; return its result."""
     place = f"__{slug(run.elsewhere)}" if run.elsewhere else ""
-    name = f"{run.folder.name}__{noise_slug(noises, rates) or 'clean'}{place}.mp4"
+    name = f"{run.folder.name}__{condition.slug or 'clean'}{place}.mp4"
     with tempfile.TemporaryDirectory(dir=args.video, prefix=".") as temporary:
         folder = Path(temporary, "video")  # a new one: RecordVideo warns of one that exists
         with load(run, "rgb_array") as (env, policy):
-            env = make_noisy(env, noises, rates)
-            video = RecordVideo(env, str(folder), episode_trigger=lambda episode: True)
+            video = RecordVideo(
+                condition.wrap(env), str(folder), episode_trigger=lambda episode: True
+            )
             try:
                 [result] = play_episodes(video, policy, 1, args.seed)
             finally:
@@ -333,7 +323,7 @@ def play_episodes(env, policy, number, seed):
 
 
 def play_all(play, tasks, args):
-    """Yield the results of play(run, noises, rates, args) for all tasks, in their order."""
+    """Yield the results of play(run, condition, args) for all tasks, in their order."""
     with tqdm(tasks, unit="condition", disable=None) as bar:
         if args.jobs == 1 or args.render:
             for task in bar:
@@ -418,16 +408,16 @@ def names_of(runs):
 
 def print_table(runs, conditions, stored, episodes):
     """Print mean and sample standard deviation over seeds: one table for each noise of the test."""
-    trained = {}
+    keys, trained = [condition.columns for condition in conditions], {}
     for run, name in zip(runs, names_of(runs), strict=True):
         noise = run.configuration.noise or "no noise"
         where = where_tested(run.environment, run.elsewhere)
         config = (where, name, noise, run.configuration.noise_rate)
         at_hand = {key[:2]: value for key, value in stored[run].items() if key[2] == run.elsewhere}
         trained.setdefault(config, []).append(at_hand)
-    noises = dict.fromkeys(noise for noise, _ in conditions if noise)
+    noises = dict.fromkeys(noise for noise, _ in keys if noise)
     for tested_with in noises or [""]:
-        columns = [key for key in conditions if key[0] in ("", tested_with)]
+        columns = [key for key in keys if key[0] in ("", tested_with)]
         headers = ["environment", "algorithm", "trained with", "at rate", "seeds"]
         headers += [f"at {rate}" if noise else "clean" for noise, rate in columns]
         rows = [
@@ -440,10 +430,7 @@ def print_table(runs, conditions, stored, episodes):
 
 
 def mean_return(seeds, key, episodes):
-    """Spell the mean return under a condition, and its standard deviation if there are seeds.
-
-    Behind it is the rate of success, where the environment tells it.
-    """
+    """Return the text of a cell: the mean return, its standard deviation, the rate of success."""
     played = [seed[key][:episodes] for seed in seeds]
     means = [np.mean([result[0] for result in results]) for results in played]
     solved = ""
@@ -478,21 +465,12 @@ def draw_without_display():
     )
 
 
-def make_folder(folder):
-    """Make the folder of the videos."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        fail(f"--video: cannot write to {folder}: {error}")
-
-
 def show(runs, conditions, args):
     """Play an episode of each condition in a window or into a video; return whether one failed."""
-    tasks = [(run, *condition) for run in runs for condition in conditions.values()]
+    tasks = list(itertools.product(runs, conditions))
     failures = []
-    for (run, *condition), result in zip(tasks, play_all(draw, tasks, args), strict=True):
-        name = f"{run.folder.name}, {noise_slug(*condition) or 'clean'}"
+    for (run, condition), result in zip(tasks, play_all(draw, tasks, args), strict=True):
+        name = f"{run.folder.name}, {condition.slug or 'clean'}"
         if isinstance(result, str):
             failures.append(f"{name}: {result}")
             continue
@@ -544,33 +522,34 @@ def main(args):
     if not runs:
         fail(f"there is no finished run in {', '.join(map(str, args.runs))}")
     if args.video:
-        make_folder(args.video)
+        try:
+            args.video.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=args.video).close()
+        except OSError as error:
+            fail(f"--video: cannot write to {args.video}: {error}")
     if args.video or args.render:
         return show(runs, conditions, args) or bool(bad)
     if not storing:
         print(f"--seed {args.seed} is not the default: everything is played, nothing is stored")
-    todo = []
-    for run, key in itertools.product(runs, conditions):
-        if len(stored[run].get((*key, run.elsewhere), [])) < args.episodes:
-            todo.append((run, key))
-    tasks = [(run, *conditions[key]) for run, key in todo]
-    for (run, key), results in zip(todo, play_all(play, tasks, args), strict=True):
-        stored[run][*key, run.elsewhere] = results
+    tasks = [
+        (run, condition)
+        for run, condition in itertools.product(runs, conditions)
+        if len(stored[run].get((*condition.columns, run.elsewhere), [])) < args.episodes
+    ]
+    for (run, condition), results in zip(tasks, play_all(play, tasks, args), strict=True):
+        key = *condition.columns, run.elsewhere
+        stored[run][key] = results
         if storing:
-            store(run, (*key, run.elsewhere), results)
+            store(run, key, results)
     print_table(runs, conditions, stored, args.episodes)
     return bool(bad)
 
 
 if __name__ == "__main__":
     take_over_terminal()
-    for word in sys.argv[1:]:
-        if word.partition("=")[0] in ("--noise", "--noise-rate"):
-            flag = word.partition("=")[0]
-            fail(f"{flag} is {flag}s here: every noise is tested at every rate")
     try:
         sys.exit(main(tyro.cli(Args, description=__doc__)))
     except KeyboardInterrupt:
         fail("stopped; what was played is stored, but nothing with another --seed", code=130)
-    except NotFiniteError as error:  # from the environment
+    except (NotFiniteError, SpaceError) as error:  # from the environment
         fail(error, code=1)

@@ -1,10 +1,10 @@
 """Gymnasium wrappers that perturb observations, rewards, episode ends and actions at random.
 
 Nine implement section 3 of Khraishi and Okhrati, "Simple Noisy Environment Augmentation for
-Reinforcement Learning"; RandomNormalNoisyAction is our own. Every wrapper is
-``Wrapper(env, noise_rate, <its parameters>)``: with probability p = ``noise_rate`` a step (or an
-episode) is perturbed, otherwise the data of the environment pass through untouched. Wrappers
-combine by nesting, or with :func:`make_noisy`.
+Reinforcement Learning"; RandomNormalNoisyAction, RandomActionDelay and RandomDynamics are our own.
+Every wrapper is ``Wrapper(env, noise_rate, <its parameters>)``: with probability p = ``noise_rate``
+a step (or an episode) is perturbed, otherwise the data of the environment pass through untouched.
+Wrappers combine by nesting, or with :func:`make_noisy`.
 
 A rate that changes during training is written "start:end": ``"1.0:0.0"`` goes linearly from 1 to 0.
 Call :func:`set_progress` to say how much of the training is done; the next ``reset()`` sets the
@@ -29,6 +29,7 @@ import functools
 import hashlib
 import importlib
 import importlib.machinery
+import importlib.metadata
 import inspect
 import math
 import numbers
@@ -40,6 +41,7 @@ import signal
 import subprocess
 import sys
 import traceback
+import warnings
 import zlib
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -88,6 +90,7 @@ __all__ = [
     "SpaceError",
     "canonical_env_id",
     "canonical_noises",
+    "handle_signals",
     "into_space",
     "make_flat",
     "make_noisy",
@@ -98,10 +101,11 @@ __all__ = [
     "outcome",
     "parse_noise",
     "rate_order",
+    "reason",
     "refusals",
+    "remarks",
     "reset_worker_signals",
     "rounded",
-    "run_folder",
     "run_name",
     "seed_globals",
     "seeded_globals",
@@ -172,7 +176,7 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.schedule = _schedule(noise_rate)
         self._training_progress = 0.0
         self._noise_rate = self.schedule[0]
-        RecordConstructorArgs.__init__(self, noise_rate=_spelled(self.schedule), **parameters)
+        RecordConstructorArgs.__init__(self, noise_rate=_as_written(self.schedule), **parameters)
         self.parameters = parameters
         self.opportunities = 0
         self.times_applied = 0
@@ -383,12 +387,12 @@ class ObservationNoise(NoiseWrapper):
             parts[path] = _cast(part.reshape(box.shape), box.dtype)
         return _replaced(observation, parts)
 
-    def _widen(self, reach: Callable[[NDArray[Any]], Sequence[Any]]) -> None:
-        """Extend the observation space to what ``reach`` says noise makes of its bounds."""
+    def _widen(self, ends_of: Callable[[NDArray[Any]], Sequence[Any]]) -> None:
+        """Extend the observation space to what ``ends_of`` says noise makes of its bounds."""
         widened = {}
         for path, box in self._boxes.items():
             with np.errstate(over="ignore", invalid="ignore"):
-                ends = [*reach(box.low.astype(np.float64)), *reach(box.high.astype(np.float64))]
+                ends = [*ends_of(box.low.astype(np.float64)), *ends_of(box.high.astype(np.float64))]
                 reached = np.stack([np.broadcast_to(end, box.shape) for end in ends])
                 reached[np.isnan(reached)] = 0.0  # 0 * inf is 0 here
                 low = np.minimum(box.low, _cast(reached.min(axis=0), box.dtype))
@@ -846,7 +850,7 @@ class RandomEarlyTermination(NoiseWrapper):
             only = self.low == limit and not self.truncate
             effect = "only turns truncated into terminated there" if only else "never acts"
             most = f"episodes have at most {limit} steps"
-            gym.logger.warn(f"RandomEarlyTermination({self.low}) {effect}: {most}", stacklevel=3)
+            warnings.warn(f"RandomEarlyTermination({self.low}) {effect}: {most}", stacklevel=3)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and decide when the episode ends."""
@@ -1089,17 +1093,22 @@ def _read_noise(text: str) -> Noise:
     try:
         inspect.signature(wrapper).bind(None, 1.0, *args, **kwargs)
     except TypeError as error:
-        raise _bad_noise(text, str(error), module) from None
+        raise _bad_noise(text, str(error)) from None
     try:
         recorded = wrapper(_ProbeEnv(), 1.0, *args, **kwargs).parameters
     except ValueError as error:
-        raise _bad_noise(text, str(error), module) from None
-    used = [p for p in _parameters(wrapper) if recorded[p.name] != p.default]
+        raise _bad_noise(text, str(error)) from None
+    parameters = _parameters(wrapper)
+    for p in parameters:
+        if p.name not in recorded:
+            call = f"super().__init__(env, noise_rate, {p.name}={p.name})"
+            raise _bad_noise(text, f"its constructor must pass {p.name} on: {call}")
+    used = [p for p in parameters if recorded[p.name] != p.default]
     return Noise(
         wrapper,
         tuple(recorded[p.name] for p in used if p.kind is not p.KEYWORD_ONLY),
         tuple((p.name, recorded[p.name]) for p in used if p.kind is p.KEYWORD_ONLY),
-        module,
+        "" if wrapper is WRAPPERS.get(name) else module,
     )
 
 
@@ -1125,17 +1134,20 @@ def _import_wrapper(module: str, name: str, text: str) -> type[NoiseWrapper]:
     _import_module(module, f"bad noise {text!r}")
     wrapper = getattr(sys.modules[module], name, None)
     if not isinstance(wrapper, type):
-        raise _bad_noise(text, f"{module} has no class {name}", module)
+        raise _bad_noise(text, f"{module} has no class {name}")
     if not issubclass(wrapper, NoiseWrapper):
-        raise _bad_noise(text, f"{name} must be a subclass of noisy_wrappers.NoiseWrapper", module)
+        raise _bad_noise(text, f"{name} must be a subclass of noisy_wrappers.NoiseWrapper")
+    kind, kinds = getattr(wrapper, "kind", None), ("observation", "reward", "action", "dynamics")
+    if kind not in kinds:
+        raise _bad_noise(text, f"{name}.kind must be one of {', '.join(kinds)}, not {kind!r}")
     return wrapper
 
 
 _EXPECTED = "expected Name(number, ..., keyword=value)"
 
 
-def _bad_noise(text: str, reason: str, module: str = "") -> ValueError:
-    if module:
+def _bad_noise(text: str, reason: str) -> ValueError:
+    if ":" in str(text).partition("(")[0]:  # the user's own, which is none of the list
         return ValueError(f"bad noise {text!r}: {reason}")
     return ValueError("\n  ".join([f"bad noise {text!r}: {reason}; valid are", *signatures()]))
 
@@ -1199,7 +1211,7 @@ class Configuration:
     @property
     def texts(self) -> tuple[list[str], list[float | str]]:
         """The noises and the rates as config.json holds them and the scripts read them."""
-        return list(self.noises), [_spelled(rate) for rate in self.rates]
+        return list(self.noises), [_as_written(rate) for rate in self.rates]
 
     @property
     def columns(self) -> tuple[str, str]:
@@ -1215,11 +1227,11 @@ class Configuration:
     @property
     def noise_rate(self) -> str:
         """The rates as tables and the paper have them: "0.05"; the baseline's is "0.00"."""
-        spelled = []
+        written = []
         for rate in self.rates or [(0.0, 0.0)]:
             start, end = (f"{r:.2f}" if round(r, 2) == r else f"{r:g}" for r in rate)
-            spelled.append(start if rate[0] == rate[1] else f"{start} to {end}")
-        return " + ".join(spelled)
+            written.append(start if rate[0] == rate[1] else f"{start} to {end}")
+        return " + ".join(written)
 
     @property
     def is_baseline(self) -> bool:
@@ -1517,24 +1529,6 @@ def run_name(
     return first + end
 
 
-def run_folder(
-    runs_dir: str | Path,
-    env_id: str,
-    exp_name: str,
-    noises: Sequence[str],
-    rates: Sequence[float | str],
-    seed: int,
-) -> Path:
-    """Return a run's folder: :func:`run_name` in runs_dir, or the folder that version 0.1 made."""
-    configuration = Configuration.read(noises, rates)
-    pairs = zip(configuration.noises, configuration.rates, strict=True)
-    slug = "+".join(f"{_words(noise)}_p{_rate_word(rate)}" for noise, rate in pairs) or "baseline"
-    old_name = f"{safe_name(env_id)}__{safe_name(exp_name)}__{slug}__{seed}"
-    if len(old_name) <= 240 and Path(runs_dir, old_name).is_dir():
-        return Path(runs_dir, old_name)
-    return Path(runs_dir, run_name(env_id, exp_name, noises, rates, seed))
-
-
 def _words(noise: str) -> str:
     """Return a noise as a part of a file's name; different noises have different ones."""
     plain = noise.replace("=(", "=").replace("', '", "-").replace("'", "")  # keys=a-b
@@ -1545,7 +1539,7 @@ def _words(noise: str) -> str:
 
 
 def _rate_word(rate: tuple[float, float]) -> str:
-    return str(_spelled(rate)).replace(":", "to")
+    return str(_as_written(rate)).replace(":", "to")
 
 
 def safe_name(text: str) -> str:
@@ -1670,7 +1664,8 @@ class _ProbeEnv(gym.Env[Any, Any]):
 
 def _parameters(wrapper: type[NoiseWrapper]) -> list[inspect.Parameter]:
     """Return a wrapper's own parameters, those after self, env and noise_rate."""
-    return list(inspect.signature(wrapper.__init__).parameters.values())[3:]
+    parameters = inspect.signature(wrapper.__init__).parameters.values()
+    return [p for p in parameters if p.kind is not p.VAR_KEYWORD][3:]
 
 
 def _number(name: str, value: float, low: float = -math.inf, high: float = math.inf) -> float:
@@ -1778,7 +1773,7 @@ def _schedule(noise_rate: float | str) -> tuple[float, float]:
         ) from None
 
 
-def _spelled(schedule: tuple[float, float]) -> float | str:
+def _as_written(schedule: tuple[float, float]) -> float | str:
     """Return a schedule as it is written: one number, or "start:end" where they differ."""
     start, end = schedule
     return start if start == end else f"{start}:{end}"
@@ -1854,9 +1849,10 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     NotFiniteError, which says whether the action was already NaN, as after a divergence. Rewards
     become floats and the two ends bools; they may be arrays of one element, but not strings.
     Observations, also in dictionaries and tuples, are copied, because an environment may write the
-    next one into the same array, and actions, because it may write into those. An observation that
-    has not the shape of its space, and a step of four values, raise SpaceError. The spaces are
-    looked up once, because an environment may make new ones, with new generators, at every access.
+    next one into the same array, and actions, because it may write into those; so are infos, which
+    may be None. An observation that has not the shape of its space, a step of four values and a
+    reset without seed and options raise SpaceError. The spaces are looked up once, because an
+    environment may make new ones, with new generators, at every access.
 
     >>> env = FiniteNumbers(gym.make("Pendulum-v1", disable_env_checker=True))
     >>> _ = env.reset(seed=0)
@@ -1883,9 +1879,10 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         try:
             observation, info = self.env.reset(seed=seed, options=options)
         except (TypeError, ValueError) as error:
-            self._refuse_old_api("reset() must return (observation, info)", error)
+            wanted = "reset(seed=..., options=...) must return (observation, info)"
+            self._refuse_old_api(wanted, error)
             raise
-        return self._checked(observation), info
+        return self._checked(observation), dict(info or {})
 
     def step(self, action: Any) -> Step:
         """Step the environment and check the observation and the reward."""
@@ -1896,34 +1893,44 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             values = "(observation, reward, terminated, truncated, info)"
             self._refuse_old_api(f"step() must return {values}", error)
             raise
-        if isinstance(reward, str):
-            self._stop("returned the reward", reward)
-        number = float(reward.item() if isinstance(reward, np.ndarray) else reward)
+        number = math.nan
+        if not isinstance(reward, str):
+            with contextlib.suppress(TypeError, ValueError):  # of None, or of several numbers
+                number = float(reward.item() if isinstance(reward, np.ndarray) else reward)
         if not math.isfinite(number):
-            self._blame("returned the reward", number, action)
-        return self._checked(observation, action), number, bool(terminated), bool(truncated), info
+            self._blame("returned the reward", reward, action)
+        observation, info = self._checked(observation, action), dict(info or {})
+        return observation, number, bool(terminated), bool(truncated), info
+
+    def close(self) -> None:
+        """Close the environment; warn if that fails, because what was trained in it is valid."""
+        try:
+            self.env.close()
+        except Exception as error:
+            gym.logger.warn(f"closing the environment failed: {error!r}")
 
     def _checked(self, observation: Any, action: Any = None) -> Any:
         """Return a copy of an observation."""
         parts = {}
         for path, box in self._boxes.items():
             part = np.array(functools.reduce(operator.getitem, path, observation))
-            if not np.isfinite(part).all():
-                self._blame(f"returned the observation{_subscript(path)}", part, action)
             if part.shape != box.shape:
                 raise SpaceError(
                     f"step {self._steps} of an episode: the environment returned an "
                     f"observation{_subscript(path)} of shape {part.shape}, and its "
                     f"observation_space has shape {box.shape}"
                 )
+            if not np.isfinite(part).all():
+                self._blame(f"returned the observation{_subscript(path)}", part, action)
             parts[path] = part
         return _replaced(observation, parts) if parts else observation
 
     def _refuse_old_api(self, wanted: str, error: Exception) -> None:
-        """Raise SpaceError if a wrapper, and not the environment's own code, could not unpack."""
+        """Raise SpaceError if a wrapper, not the environment's code, failed to call or unpack."""
         *_, (frame, _) = traceback.walk_tb(error.__traceback__)
         place = frame.f_globals.get("__name__", "")
-        if "unpack" in str(error) and place.startswith(("gymnasium.wrappers.", __name__)):
+        is_old = re.search("unpack|unexpected keyword", str(error))
+        if is_old and place.startswith(("gymnasium.core", "gymnasium.wrappers.", __name__)):
             at = f"step {self._steps} of an episode"
             raise SpaceError(f"{at}: the environment's {wanted}: {error}") from error
 
@@ -1988,6 +1995,17 @@ def into_space(action: NDArray[Any], space: gym.spaces.Box) -> NDArray[Any]:
     return action.astype(space.dtype).clip(space.low, space.high)
 
 
+def remarks(env_id: str, env: Env, step_limit: int) -> list[str]:
+    """Return what is worth knowing before training in a :func:`make_flat` environment."""
+    found = []
+    if not isinstance(env.unwrapped.observation_space, gym.spaces.Box):
+        found.append(f"{env_id}: observations are flattened to {env.observation_space}")
+    registered = gym.spec(env_id.rpartition(":")[2]).max_episode_steps
+    if registered is None and env.spec and env.spec.max_episode_steps == step_limit:
+        found.append(f"{env_id} declares no time limit, so --max-episode-steps is {step_limit:,}")
+    return found
+
+
 def canonical_env_id(env_id: str) -> str:
     """Return the id of the environment that ``gymnasium.make(env_id)`` makes, with its version.
 
@@ -2024,14 +2042,28 @@ def refusals(env_id: str) -> tuple[type[Exception], ...]:
     """Return the errors that ``make_flat(gymnasium.make(env_id))`` raises on purpose.
 
     They are Gymnasium's and this module's. Of Gymnasium's own environments a missing dependency is
-    an ImportError, and those of Gymnasium-Robotics fail an assertion where MuJoCo is too new. Any
-    other error comes from the environment's code.
+    an ImportError, and some of Gymnasium-Robotics fail an assertion where MuJoCo is too new. Any
+    other error comes from the environment's code. :func:`reason` puts them into words.
     """
     spec = gym.registry.get(env_id.rpartition(":")[2])
     maker: Any = spec.entry_point if spec else ""  # "package.module:Class" or a function
     package = getattr(maker, "__module__", str(maker)).partition(".")[0]
     more = {"gymnasium": (ImportError,), "gymnasium_robotics": (AssertionError,)}
     return (gym.error.Error, SpaceError, *more.get(package, ()))
+
+
+def reason(error: BaseException) -> str:
+    r"""Return what an error says, as one line.
+
+    >>> reason(ValueError("low must not\nexceed high")), reason(KeyError())
+    ('low must not exceed high', 'KeyError')
+    """
+    text = " ".join(str(error).split())
+    if not text and isinstance(error, AssertionError) and "gymnasium_robotics" in sys.modules:
+        packages = ("gymnasium-robotics", "mujoco")
+        now = " and ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)
+        text = f'{now} do not work together here; try pip install "mujoco<3.12" (docs/training.md)'
+    return text or type(error).__name__
 
 
 def seed_globals(seed: int) -> None:
@@ -2118,6 +2150,14 @@ def note_versions(config: dict[str, Any], matmul_precision: str) -> list[str]:
     return changes
 
 
+def handle_signals(handler: Callable[[int, Any], None]) -> None:
+    """Let a handler have SIGTERM, SIGINT and SIGHUP, but a SIGHUP that is ignored, as by nohup."""
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        ignored = number == signal.SIGHUP and signal.getsignal(number) == signal.SIG_IGN
+        if not ignored:
+            signal.signal(number, handler)
+
+
 def reset_worker_signals() -> None:
     """Undo a script's signal handlers in a worker process that an environment forked.
 
@@ -2154,8 +2194,10 @@ class EnvState:
         self.generators = generators
 
     def _generators(self) -> list[Any]:
-        environment, actions = self.env.unwrapped.np_random, self.env.action_space.np_random
-        return [environment, actions, *self.generators]
+        found = [self.env.unwrapped.np_random, self.env.action_space.np_random, *self.generators]
+        # an environment may have put a generator of another library there, or a module
+        of_numpy = np.random.Generator | np.random.RandomState
+        return [generator for generator in found if isinstance(generator, of_numpy)]
 
     def _returns(self) -> deque[float]:
         recorded = self.env.has_wrapper_attr("return_queue")

@@ -20,6 +20,7 @@ import signal
 import sys
 import tempfile
 import time
+import warnings
 import zipfile
 from collections import deque
 from dataclasses import asdict, dataclass, replace
@@ -41,7 +42,7 @@ from tqdm import tqdm
 
 import noisy_wrappers as noisy
 
-TEST_SEED = 1_000_000  # of the first test episode; the same in every run and evaluation
+TEST_SEED = 1_000_000  # of the first test episode; the same in every test of every run
 STEP_LIMIT = 10_000  # of an episode, where neither the environment nor the user sets one
 EVAL_FREQUENCY = 50_000  # default of --eval-frequency; at most a tenth of the run
 
@@ -396,8 +397,7 @@ def fail_on(errors, message, code=2):
     except errors as error:
         hidden = isinstance(error.__context__, OSError)  # by torch.save: the disk is full, say
         error = error.__context__ if hidden else error
-        reason = " ".join(str(error).split()) or f"{type(error).__name__}, see docs/training.md"
-        fail(f"{message}: {reason}", code)
+        fail(f"{message}: {noisy.reason(error)}", code)
     except Exception as error:  # of the environment, say: its traceback is what the user needs
         error.add_note(f"({message})")
         raise
@@ -453,12 +453,11 @@ def make_envs(args):
     limit = {"max_episode_steps": args.max_episode_steps}
     noisy.seed_globals(args.seed)
     with make_env(env_id, **limit) as test_env, make_env(env_id, **limit) as env:
-        with fail_on(ValueError, f"--noise in {env_id}"):
+        caught = warnings.catch_warnings(record=True)
+        with fail_on(ValueError, f"--noise in {env_id}"), caught as notes:
             env = noisy.make_noisy(env, noise, noise_rate)
-        if not isinstance(env.unwrapped.observation_space, gym.spaces.Box):
-            say(f"{env_id}: observations are flattened to {test_env.observation_space}")
-        if not (args.max_episode_steps or gym.spec(env_id.rpartition(":")[2]).max_episode_steps):
-            say(f"{env_id} declares no time limit, so --max-episode-steps is {STEP_LIMIT:,}")
+        for text in [note.message for note in notes] + noisy.remarks(env_id, test_env, STEP_LIMIT):
+            say(text)
         yield replace(args, env_id=env_id, noise=noise, noise_rate=noise_rate), env, test_env
 
 
@@ -510,11 +509,12 @@ def prepare_compiler():
 
 def start_again(error):
     """If compiling failed, start again with a new cache for the compiler, and then without it."""
-    if type(error).__module__.startswith(("torch._dynamo", "torch._inductor")):
+    compiling = type(error).__module__.startswith(("torch._dynamo", "torch._inductor"))
+    if compiling and "--no-compile" not in sys.argv:  # else it is of the environment
         reason = str(getattr(error, "inner_exception", error)).strip()
         say(f"not compiled, starting again: {reason.partition(chr(10))[0]}")
         cache = f"torchinductor_{os.getpid()}_"  # os.execv keeps the process number
-        options = ["--no-compile"] if cache in os.environ["TORCHINDUCTOR_CACHE_DIR"] else []
+        options = ["--no-compile"] if cache in os.environ.get("TORCHINDUCTOR_CACHE_DIR", "") else []
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = tempfile.mkdtemp(prefix=cache)
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:], *options])
 
@@ -528,7 +528,7 @@ class Run:
     def __init__(self, args, algorithm, precision, env):
         """Open the folder; fail if another process uses it, or if it holds a different run."""
         configuration = (args.env_id, args.exp_name, args.noise, args.noise_rate, args.seed)
-        self.folder = noisy.run_folder(args.runs_dir, *configuration)
+        self.folder = Path(args.runs_dir, noisy.run_name(*configuration))
         self.args, self.start = args, time.monotonic() - 1e-6  # not 0 s ago: clocks may stand still
         self.noise, self.returns = noisy.noise_wrappers(env), env.get_wrapper_attr("return_queue")
         self.outcomes = deque(maxlen=100)  # of the last training episodes
@@ -769,16 +769,14 @@ if __name__ == "__main__":
         with contextlib.suppress(OSError):  # nobody may be left to read it; print is not safe here
             os.write(1, told)
 
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        under_nohup = number == signal.SIGHUP and signal.getsignal(number) == signal.SIG_IGN
-        if not under_nohup:
-            signal.signal(number, stop_run)
+    noisy.handle_signals(stop_run)
     os.register_at_fork(after_in_child=noisy.reset_worker_signals)
     sys.path.append(os.getcwd())  # for what the module of --env-id module:Name-v0 imports
     finished = False
     try:
         with fail_on((noisy.NotFiniteError, noisy.SpaceError), "training stopped", code=1):
-            finished = train(read_args(), stop=lambda: bool(signals))
+            # again whenever an episode ends, because the environment may take the signals over
+            finished = train(read_args(), lambda: noisy.handle_signals(stop_run) or bool(signals))
     except Exception as error:
         if not signals:  # the environment's processes may have got the signal, too
             start_again(error)

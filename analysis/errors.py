@@ -3,8 +3,17 @@
 import os
 import re
 import sys
+import traceback
+from pathlib import Path
+
+from noisy_wrappers import reason
 
 CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")  # all but tab and the ends of lines
+
+PROJECT = Path(__file__).resolve().parents[1]
+# These call what users write, and are not the place of its errors
+PROGRAMS = {PROJECT / name for name in ("evaluate.py", "noisy_wrappers.py", "sweep/environment.py")}
+PROGRAMS |= {PROJECT / f"{name}_continuous_noisy.py" for name in ("sac", "td3", "ppo")}
 
 
 def fail(message, code=2):
@@ -17,6 +26,19 @@ def in_words(error):
     """Return an exception as one line: its type, and its text if it has one."""
     text = " ".join(str(error).split())
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def with_place(error, plain=()):
+    """Return an exception as one line; of any type but `plain`, with the place that raised it.
+
+    That is the last place in the code of a user, if there is one.
+    """
+    if isinstance(error, plain):
+        return reason(error)
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if "site-packages" not in frame.filename]
+    place = frames[-1] if Path(own[-1].filename).resolve() in PROGRAMS else own[-1]
+    return f"{in_words(error)} ({place.filename}, line {place.lineno})"
 
 
 class Terminal:

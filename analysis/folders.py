@@ -54,10 +54,9 @@ def runs_of(runs_dir):
 
 def flat_choice(runs_dir):
     """Say how to sort the runs of a choice that an earlier version left side by side."""
-    patterns = ["*_s1[0-9][0-9][0-9]_*", "*__1[0-9][0-9][0-9]"]  # its fresh seeds; older names
-    fresh = [pattern for pattern in patterns if any(runs_dir.glob(pattern))]
+    fresh = "*_s1[0-9][0-9][0-9]_*"  # the seeds of its confirmation
     steps = [f"cd {shlex.quote(str(runs_dir))}", f"mkdir {SEARCH} {CONFIRMATION}"]
-    steps += [f"mv {' '.join(fresh)} {CONFIRMATION}/"] if fresh else []
+    steps += [f"mv {fresh} {CONFIRMATION}/"] if any(runs_dir.glob(fresh)) else []
     steps += [f"mv *__*__* {SEARCH}/"]
     return (
         f"{runs_dir} holds the runs of a choice side by side, as earlier versions left them. They "

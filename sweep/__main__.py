@@ -24,13 +24,14 @@ import sys
 import tempfile
 import time
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from analysis.errors import take_over_terminal
 from analysis.folders import STOPPED, Log, is_locked, read_log
 from sweep.environment import cost
-from sweep.grid import check_extra, check_rollouts, command_line, grid, result, runs_in
+from sweep.grid import check_rollouts, command_line, grid, result, runs_in
 from sweep.options import check_arguments, parse_args
 
 YOUNG = 120  # seconds: a run writes a line at least every ten, except in a test or in compiling
@@ -53,7 +54,7 @@ class Progress(NamedTuple):
     log: Log
 
 
-def judge(run, over):
+def progress_of(run, over):
     """Return a run's progress; where its sweep is over, no young log means that it is running."""
     log = read_log(run.folder)
     done, damage = result(run)
@@ -88,8 +89,8 @@ def summary(runs, progresses):
     speeds = {}
     for run, progress in zip(runs, progresses, strict=True):
         count[progress.state] += 1
-        if progress.log.steps_per_second:  # from the most particular to the most general
-            for key in (run.kind, run.kind[0], None):
+        if progress.log.steps_per_second:
+            for key in (run.kind, None):
                 speeds.setdefault(key, []).append(progress.log.steps_per_second)
     if not count[PROBABLY]:
         del count[PROBABLY]
@@ -99,11 +100,11 @@ def summary(runs, progresses):
     if running and speed:
         seconds = 0
         for run, progress in zip(runs, progresses, strict=True):
-            expected = speed.get(run.kind) or speed.get(run.kind[0]) or speed[None]
-            seconds += remaining(run, progress) / expected
+            seconds += remaining(run, progress) / speed.get(run.kind, speed[None])
         now = sum(progress.log.steps_per_second for progress in running)
         left = timedelta(seconds=round(seconds / len(running)))
-        text += f"; about {left} left, {now:,.0f} steps/s"  # a narrow terminal cuts the end off
+        text += f"; about {left} left"
+        text += f", {now:,.0f} steps/s" * bool(now)  # a narrow terminal cuts the end off
     return text
 
 
@@ -111,18 +112,14 @@ def show_slowest(runs, progresses):
     """Print those of the running runs that will take longest."""
     left = []
     for run, progress in zip(runs, progresses, strict=True):
-        if progress.state in (RUNNING, PROBABLY) and progress.log.steps_per_second:
-            seconds = remaining(run, progress) / progress.log.steps_per_second
-            left.append((seconds, run, progress.log))
-    if not left:
-        return
-    left.sort(key=lambda item: item[0], reverse=True)
-    print("slowest of those running (time left, steps per second, step):")
-    rows = []
-    for seconds, run, log in left[:5]:
-        time_left = str(timedelta(seconds=round(seconds)))
-        rows.append((time_left, f"{log.steps_per_second}/s", str(log.step), str(run.folder)))
-    table(rows)
+        speed = progress.log.steps_per_second
+        if progress.state in (RUNNING, PROBABLY) and speed:
+            shown = f"{speed}/s", str(progress.log.step), str(run.folder)
+            left.append((remaining(run, progress) / speed, *shown))
+    if left:
+        print("slowest of those running (time left, steps per second, step):")
+        slowest = sorted(left, reverse=True)[:5]
+        table([(str(timedelta(seconds=round(seconds))), *shown) for seconds, *shown in slowest])
 
 
 def table(rows):
@@ -136,7 +133,10 @@ def table(rows):
 
 
 def show_list(sweep, with_cost=False):
-    """Print the runs for benchmark.sh: folder, state and command; and what a batch will take."""
+    """Print the runs for benchmark.sh: folder, state and command; on stderr how many there are.
+
+    with_cost: also what they will take. A choice says it of each of its batches.
+    """
     states = []
     for run in sweep.runs:
         done, damage = result(run)
@@ -145,8 +145,6 @@ def show_list(sweep, with_cost=False):
             print(f"warning: {damage}", file=sys.stderr)
     if "todo" in states:
         check_rollouts(sweep.runs)
-        if sweep.args.extra:
-            check_extra(sweep.runs)
     for run, state in zip(sweep.runs, states, strict=True):
         folder = f"{run.folder.parent}/{run.folder.name}"  # with a slash, for --runs-dir . too
         print(folder, state, command_line(run), sep="\t")
@@ -156,18 +154,12 @@ def show_list(sweep, with_cost=False):
 
         plan = choose.plan(sweep.choices, sweep.args)
     elif with_cost and "todo" in states:
-        runs = {state: [] for state in ("done", "damaged", "todo")}
-        for run, state in zip(sweep.runs, states, strict=True):
-            runs[state].append(run)
-        plan[0] += "; " + cost(sweep.args, runs["done"], runs["todo"])
+        todo = [run for run, state in zip(sweep.runs, states, strict=True) if state == "todo"]
+        done = [run for run, state in zip(sweep.runs, states, strict=True) if state == "done"]
+        plan[0] += "; " + cost(sweep.args, done, todo)
     for line in plan:
         print(line, file=sys.stderr)
     return 0
-
-
-def show_dry_run(sweep):
-    """Print the same, with what a sweep costs."""
-    return show_list(sweep, with_cost=True)
 
 
 def watch(sweep):
@@ -183,7 +175,7 @@ def watch(sweep):
     while os.getppid() == parent:
         if time.monotonic() - shown >= pause:
             shown = time.monotonic()
-            line = summary(sweep.runs, [judge(run, over=False) for run in sweep.runs])
+            line = summary(sweep.runs, [progress_of(run, over=False) for run in sweep.runs])
             if terminal:
                 width = shutil.get_terminal_size().columns - 1
                 line = f"\r{line[:width].ljust(width)}"
@@ -231,7 +223,7 @@ def show_report(sweep):
 
 def show_progress(sweep, title, over):
     """Print the summary and the runs that are not on their way; return the progress of all."""
-    progresses = [judge(run, over) for run in sweep.runs]
+    progresses = [progress_of(run, over) for run in sweep.runs]
     print(f"{sweep.args.runs_dir}: {summary(sweep.runs, progresses)}")
     everything = title == "not finished"
     named = [p for p in progresses if p.state == "failed" or (everything and p.reason)]
@@ -254,7 +246,7 @@ def check_disk(folder):
 
 VIEWS = {
     "list": show_list,
-    "dry-run": show_dry_run,
+    "dry-run": partial(show_list, with_cost=True),
     "status": show_status,
     "stopped": show_stopped,
     "report": show_report,
@@ -276,16 +268,13 @@ def main(view, caller, argv):
 
             ask = view in ("list", "dry-run")
             choices = choose.choices(args, ask, keep=view == "list")
-            runs = choose.runs_of(choices)
+            runs = choose.planned_runs(choices)
         else:
             runs = grid(args)
     return VIEWS[view](Sweep(args, runs, choices))
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] in ([], ["-h"], ["--help"]):
-        print(__doc__)
-        sys.exit()
     names = {"encoding": sys.getfilesystemencoding(), "errors": sys.getfilesystemencodeerrors()}
     if sys.argv[1] in ("list", "dry-run"):  # folders as they are: bash starts their runs
         sys.stdout.reconfigure(**names)

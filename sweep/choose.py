@@ -13,15 +13,22 @@ import sys
 from statistics import fmean
 from typing import NamedTuple
 
-from analysis.errors import fail
-from analysis.folders import CONFIRMATION, SEARCH, flat_choice, read_config
+from analysis.errors import fail, in_words
+from analysis.folders import CONFIRMATION, SEARCH, flat_choice
 from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED, SUCCESS, read_run
 from analysis.statistics import detectable_shift, holm
 from analysis.verdicts import POINTS, what_all_runs_do
 from noisy_wrappers import BASELINE, Configuration, rounded
 from sweep import halving
 from sweep.environment import ask_all, remember, remembered, run_seconds, time_left, wall_time
-from sweep.grid import PlannedRun, cell, cells, make_run, of_the_paper, result
+from sweep.grid import (
+    PlannedRun,
+    configuration_of,
+    configurations,
+    make_run,
+    of_the_paper,
+    result,
+)
 
 
 class Choice(NamedTuple):
@@ -30,6 +37,7 @@ class Choice(NamedTuple):
     name: str  # "PPO on Hopper-v5"
     algorithm: str
     env_id: str
+    noises: int  # that it began with
     schedule: list[tuple[int, int]]  # of its search
     confirm: int  # fresh seeds of the confirmation
     state: halving.State
@@ -37,7 +45,7 @@ class Choice(NamedTuple):
     returns: dict[tuple[Configuration, int], float]  # of those that are finished
     spread: float  # standard deviation over seeds of the search's last tests; NaN if unknown
     run_seconds: float | None  # about what a run takes, if anything tells
-    metric: str = "return"  # or "success rate": then `returns` has rates of success in percent
+    metric: str  # "return", or "success rate": then `returns` has rates of success in percent
 
 
 def choices(args, ask=False, keep=False):
@@ -68,11 +76,11 @@ def choices(args, ask=False, keep=False):
 
 def leave_out(args, env_id, unfit):
     """Say which noises cannot act in an environment; exit if the user has named them."""
-    reasons = {}
+    noises_of = {}
     for noise, reason in unfit.items():
         reason = reason.removeprefix(noise.partition("(")[0]).strip()  # of several noises, often
-        reasons.setdefault(reason, []).append(noise)
-    told = "; ".join(f"{', '.join(noises)} ({reason})" for reason, noises in reasons.items())
+        noises_of.setdefault(reason, []).append(noise)
+    told = "; ".join(f"{', '.join(noises)} ({reason})" for reason, noises in noises_of.items())
     if told and args.noises and not of_the_paper(args):
         fail(f"--noises: these cannot act in {env_id}: {told}")
     if told:
@@ -92,36 +100,27 @@ def follow(args, algorithm, env_id, environment):
     last_seed = sum(seeds for _, seeds in schedule)
     if last_seed >= FIRST_CONFIRMATION_SEED:
         fail(f"--budget {budget} is too large: the best noises would run with {last_seed} seeds")
-    runs, returns, last_tests, different = {}, {}, {}, set()
     metric = args.metric.replace("_", " ")
-    while True:
-        state = halving.advance(noises, budget, args.confirm, returns)
-        phase = SEARCH if len(state.rounds) < len(schedule) else CONFIRMATION
-        finished = {}
-        for noise, seed in state.due:
-            run = make_run(args, algorithm, env_id, noise, seed, phase)
-            check_place(run)
-            if result(run)[0]:
-                run, row = with_row(run)
-                tests = tests_of(run, row, metric) if row else ()
-                different |= set(tests)
-                if row and phase == CONFIRMATION:
-                    finished[noise, seed] = tests[-1]
-                elif row:
-                    finished[noise, seed] = halving.score(row["steps"], tests)
-                    last_tests.setdefault(noise, []).append(tests[-1])
-            runs[noise, seed] = run
-        if not finished:
-            break
-        returns |= finished
-    check_frequencies(runs[key] for key in returns)
-    if len(different) == 1 and (state.rounds or not state.due):
+    state, runs, tests, returns = walk(args, algorithm, env_id, noises, budget, metric)
+    folders = {steps: runs[key].folder for key, (steps, _) in tests.items()}
+    if len(folders) > 1:  # then their scores do not compare
+        one, other, *_ = folders.values()
         fail(
-            f"{algorithm.upper()} on {env_id}: {what_all_runs_do(*different, metric)} in "
+            f"{one} and {other} were not tested at the same steps: choose another --runs-dir, or "
+            "move the runs of one kind away"
+        )
+    results = set().union(*(values for _, values in tests.values()))
+    if len(results) == 1 and (state.rounds or not state.due):
+        fail(
+            f"{algorithm.upper()} on {env_id}: {what_all_runs_do(*results, metric)} in "
             f"{args.total_timesteps:,} steps (runs: {len(returns)}), so further runs would say "
             "nothing about noise; change --total-timesteps, or leave this out",
             code=1,
         )
+    last_tests = {}  # of the search
+    for (noise, seed), (_, values) in tests.items():
+        if seed < FIRST_CONFIRMATION_SEED:
+            last_tests.setdefault(noise, []).append(values[-1])
     taken = [taken for taken in map(wall_time, map(runs.get, returns)) if taken]
     seconds = fmean(taken) if taken else None
     if environment and not taken:
@@ -130,6 +129,7 @@ def follow(args, algorithm, env_id, environment):
         name=f"{algorithm.upper()} on {env_id}",
         algorithm=algorithm,
         env_id=env_id,
+        noises=len(noises),
         schedule=schedule,
         confirm=args.confirm,
         state=state,
@@ -141,22 +141,44 @@ def follow(args, algorithm, env_id, environment):
     )
 
 
-def runs_of(found):
-    """Return the runs of all choices together, the first seed of everything first."""
-    runs = []
-    for choice in found:
-        runs += [(seed, run) for (_, seed), run in choice.runs.items()]
+def walk(args, algorithm, env_id, noises, budget, metric):
+    """Go from batch to batch as long as runs are finished.
+
+    Returns the state; the runs that were due; the steps and the results of the tests of those that
+    are finished; and their scores. All but the state are {(configuration, seed): ...}.
+    """
+    rounds = len(halving.schedule(len(noises), budget))
+    runs, tests, returns = {}, {}, {}
+    while True:
+        state = halving.advance(noises, budget, args.confirm, returns)
+        phase = SEARCH if len(state.rounds) < rounds else CONFIRMATION
+        known = len(returns)
+        for noise, seed in state.due:
+            run, row = read(make_run(args, algorithm, env_id, noise, seed, phase))
+            runs[noise, seed] = run
+            if row:
+                steps, values = row["steps"], tests_of(run, row, metric)
+                tests[noise, seed] = tuple(steps), values
+                score = halving.score(steps, values) if phase == SEARCH else values[-1]
+                returns[noise, seed] = score
+        if len(returns) == known:
+            return state, runs, tests, returns
+
+
+def planned_runs(found):
+    """Return the runs of all choices, the first seed of everything first."""
+    runs = [(seed, run) for choice in found for (_, seed), run in choice.runs.items()]
     return [run for _, run in sorted(runs, key=lambda pair: pair[0])]
 
 
 def candidates(args, algorithm, env_id, unfit=()):
     """Return the noises to choose from, each once, but for those that cannot act there."""
-    noises = dict.fromkeys(cells(args, algorithm, env_id))
+    noises = dict.fromkeys(configurations(args, algorithm, env_id))
     noises.pop(BASELINE, None)  # at rate 0 a noise is none
     for pairs in args.exclude:
         if any(rate is None for _, rate in pairs):
             fail('--exclude needs a rate with each noise, as in "NOISE@0.1"')
-        excluded = cell(pairs)
+        excluded = configuration_of(pairs)
         if excluded not in noises:
             fail(f"--exclude: {excluded} is not among the noises")
         del noises[excluded]
@@ -166,15 +188,13 @@ def candidates(args, algorithm, env_id, unfit=()):
     return noises
 
 
-def check_place(run):
-    """Exit if the runs of an earlier version are side by side, not in the folders of the phases."""
-    phase = run.folder.parent
-    if not phase.exists() and (phase.parent / run.folder.name).exists():
-        fail(f"{flat_choice(phase.parent)} (or choose another --runs-dir, if it is another sweep)")
-
-
-def with_row(run):
-    """Return a finished run and its data; or the run with what is damaged in it, and None."""
+def read(run):
+    """Return a run, with what is damaged in it, and its data, None if it has not finished."""
+    runs_dir, phase = run.folder.parents[1], run.folder.parent
+    if not phase.exists() and (runs_dir / run.folder.name).exists():
+        fail(f"{flat_choice(runs_dir)} (or choose another --runs-dir, if it is another sweep)")
+    if not result(run)[0]:
+        return run, None
     row = read_run(run.folder)
     if row["status"] == "finished":
         return run, row
@@ -191,21 +211,6 @@ def tests_of(run, row, metric):
     return row["success_rates"]
 
 
-def check_frequencies(runs):
-    """Exit if finished runs were not all tested equally often: their scores do not compare."""
-    found = {}
-    for run in runs:
-        made_with = read_config(run.folder)["args"]
-        if "eval_frequency" in made_with:
-            found.setdefault(made_with["eval_frequency"], run.folder)
-    if len(found) > 1:
-        (every, one), (other, another), *_ = found.items()
-        fail(
-            f"{one} was tested every {every} steps and {another} every {other}: choose another "
-            f"--runs-dir, or move the runs of one kind away"
-        )
-
-
 # ---------------------------------------------------------------------------------------- in words
 
 
@@ -220,14 +225,13 @@ def plan(found, args):
     if not any(choice.returns for choice in found):
         lines = [*map(question, found), *lines]
     lines.append(total(found, args))
-    lines += filter(None, (reach(choice, len(found)) for choice in found))
+    lines += filter(None, (detectable_gain(choice, len(found)) for choice in found))
     return [*dict.fromkeys(lines), f"runs, logs and the verdict are stored in {args.runs_dir}"]
 
 
 def question(choice):
     """Say what a choice will decide."""
-    noises = choice.schedule[0][0] if choice.schedule else 1
-    which = f"the best of {noises} noises" if noises > 1 else "the noise"
+    which = f"the best of {choice.noises} noises" if choice.noises > 1 else "the noise"
     return (
         f"{choice.name}: is {which} better than no noise? "
         f"{choice.confirm} fresh seeds of each will decide"
@@ -260,7 +264,7 @@ def left(choice):
     return [len(choice.state.due), *numbers[len(choice.state.rounds) + 1 :]]
 
 
-def reach(choice, verdicts):
+def detectable_gain(choice, verdicts):
     """Say what gain the confirmation can show, or nothing once runs are done without a spread."""
     gain = detectable_shift(choice.confirm, choice.confirm, halving.LEVEL / verdicts)
     seeds = f"{choice.confirm} fresh seeds confirm a true gain of"
@@ -285,7 +289,7 @@ def describe(choice):
     seeds = f"seeds {state.seeds[0]} to {state.seeds[-1]}" if len(state.seeds) > 1 else "seed 1"
     due = f"{seeds}; runs to do: {len(state.due)}"
     if number <= rounds:
-        noises = f"{len(state.noises)} of {choice.schedule[0][0]} noises"
+        noises = f"{len(state.noises)} of {choice.noises} noises"
         return f"{choice.name}, round {number} of {rounds}: {noises}, {due}"
     [winner] = state.noises
     return f"{choice.name}, confirmation: {winner} against no noise, {due}"
@@ -297,7 +301,7 @@ def standing(found, args):
     When all choices are finished, these are the verdicts.
     """
     if not any(choice.state.due for choice in found):
-        yield from verdicts(found, judged(found))
+        yield from sentences(judged(found))
         return
     for choice in found:
         yield describe(choice)
@@ -311,34 +315,17 @@ def standing(found, args):
 
 def report(found, path):
     """Print the verdicts, and write choice.csv; or, where runs are left, what to do about them."""
-    finished = rows(found)
-    if finished:
-        write_choice(path, finished)
-    print(*conclusion(found), sep="\n")
-
-
-def conclusion(found):
-    """Yield the verdicts, one line for each choice.
-
-    While runs of a choice are left, there is none: then say what to do about them.
-    """
     if any(choice.state.due for choice in found):
-        for choice in found:
-            yield obstacle(choice) if choice.state.due else describe(choice)
+        lines = [obstacle(choice) if choice.state.due else describe(choice) for choice in found]
     else:
-        yield from verdicts(found, judged(found))
-
-
-def rows(found):
-    """Return the rows of choice.csv; there are none while runs of a choice are left."""
-    if any(choice.state.due for choice in found):
-        return []
-    result = []
-    for choice, (comparison, p) in zip(found, judged(found), strict=True):
-        names = choice.algorithm.upper(), choice.env_id
-        helped = halving.helps(comparison, p)
-        result += halving.rows(*names, choice.state, choice.returns, helped)
-    return result
+        judgements, records = judged(found), []
+        for choice, comparison, p in judgements:
+            names = choice.algorithm.upper(), choice.env_id
+            helped = halving.helps(comparison, p)
+            records += halving.records(*names, choice.state, choice.returns, helped)
+        write_choice(path, records)
+        lines = sentences(judgements)
+    print(*lines, sep="\n")
 
 
 def unit(choice):
@@ -347,7 +334,7 @@ def unit(choice):
 
 
 def judged(found):
-    """Return each finished choice's comparison, and its p corrected for all of them."""
+    """Return finished choices, each with its comparison and the p corrected for all of them."""
     comparisons = []
     for choice in found:
         [winner] = choice.state.noises
@@ -356,15 +343,15 @@ def judged(found):
             comparison = comparison._replace(difference_percent=math.nan)  # never percent of a rate
         comparisons.append(comparison)
     corrected = holm([comparison.p for comparison in comparisons])
-    return list(zip(comparisons, corrected, strict=True))
+    return list(zip(found, comparisons, corrected, strict=True))
 
 
-def verdicts(found, judgements):
-    """Yield what came out, one line for each choice."""
-    for choice, (comparison, p) in zip(found, judgements, strict=True):
-        noises = choice.schedule[0][0] if choice.schedule else 1
+def sentences(judgements):
+    """Yield the verdicts, a sentence for each choice."""
+    for choice, comparison, p in judgements:
         [winner] = choice.state.noises
-        yield halving.sentence(choice.name, winner, noises, comparison, p, len(found), unit(choice))
+        found = choice.name, winner, choice.noises, comparison, p
+        yield halving.sentence(*found, len(judgements), unit(choice))
 
 
 def obstacle(choice):
@@ -379,26 +366,27 @@ def obstacle(choice):
     return text
 
 
-def write_choice(path, rows):
+def write_choice(path, new):
     """Write choice.csv whole or not at all; it keeps what other commands have chosen."""
     try:
         with open(path.with_name(".choice.lock"), "w", encoding="utf-8") as lock:
             fcntl.lockf(lock, fcntl.LOCK_EX)  # until it is closed: commands may end side by side
-            replace_choice(path, rows)
+            replace_choice(path, new)
     except (OSError, KeyError, ValueError) as error:
-        fail(f"cannot write {path} ({type(error).__name__}: {error})")
+        fail(f"cannot write {path} ({in_words(error)})")
 
 
-def replace_choice(path, rows):
-    """Replace the lines of what was chosen now, and keep the others."""
-    ours = {(row["algorithm"], row["environment"]) for row in rows}
+def replace_choice(path, new):
+    """Replace the records of what was chosen now, and keep the others."""
+    chosen_now = {(record["algorithm"], record["environment"]) for record in new}
+    old = []
     if path.exists():
         with open(path, newline="", encoding="utf-8") as file:
             old = list(csv.DictReader(file))
-        rows = [r for r in old if (r["algorithm"], r["environment"]) not in ours] + rows
+    others = [r for r in old if (r["algorithm"], r["environment"]) not in chosen_now]
     temporary = path.with_suffix(".tmp")
     with open(temporary, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, CHOICE_COLUMNS, lineterminator="\n")
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows(others + new)
     os.replace(temporary, path)

@@ -11,7 +11,6 @@ import math
 import re
 import sys
 import time
-import traceback
 import warnings
 from pathlib import Path
 from statistics import fmean
@@ -21,7 +20,7 @@ import gymnasium as gym
 import numpy as np
 
 import noisy_wrappers as noisy
-from analysis.errors import fail
+from analysis.errors import fail, with_place
 from analysis.folders import read_json
 from sweep.grid import PROJECT, script_of, script_options
 
@@ -76,7 +75,8 @@ def ask(env_id, configurations=(), max_episode_steps=None, clock=time.perf_count
                 unfit={noise.noise: reason for noise, reason in reasons.items() if reason},
             )
     except Exception as error:
-        raise Refused(in_a_line(error, env_id)) from error
+        plain = *noisy.refusals(env_id), noisy.NotFiniteError
+        raise Refused(with_place(error, plain)) from error
 
 
 def time_steps(env, time_limit, deadline, clock):
@@ -115,7 +115,7 @@ def why_unfit(env, configuration, time_limit, deadline):
         with warnings.catch_warnings(action="ignore"):  # of what is said below
             noisy_env = configuration.wrap(env)
     except ValueError as error:
-        return " ".join(str(error).split())
+        return noisy.reason(error)
     for wrapper in noisy.noise_wrappers(noisy_env).values():
         if isinstance(wrapper, noisy.RandomEarlyTermination) and (wrapper.low or 0) > time_limit:
             return f"an episode has at most {time_limit} steps"
@@ -127,20 +127,8 @@ def why_unfit(env, configuration, time_limit, deadline):
                 if terminated or truncated:
                     break
     except Exception as error:  # the environment's own, where noise has led it
-        return in_a_line(error)
+        return with_place(error, (gym.error.Error, noisy.NotFiniteError))
     return ""
-
-
-def in_a_line(error, env_id=""):
-    """Say what an error says; if it is not Gymnasium's or ours, also where it was raised."""
-    reason = " ".join(str(error).split())
-    if isinstance(error, (*noisy.refusals(env_id), noisy.NotFiniteError)):
-        return reason
-    frames = traceback.extract_tb(error.__traceback__)
-    own = [frame for frame in frames if "site-packages" not in frame.filename]
-    ours = Path(own[-1].filename).name in ("environment.py", "noisy_wrappers.py")
-    last = frames[-1] if ours else own[-1]
-    return f"{type(error).__name__}: {reason} ({last.filename}, line {last.lineno})"
 
 
 def ask_all(args, configurations):
@@ -157,7 +145,10 @@ def ask_all(args, configurations):
         except Refused as error:  # others may be wrong, too
             reasons.append(f"no algorithm can be trained in {env_id}: {error}")
             continue
-        print(speed_of(env_id, answer), file=sys.stderr, flush=True)
+        speed = f"{env_id}: {float(f'{1000 * answer.step_seconds:.2g}'):g} ms a step"
+        if answer.timed_steps < STEPS:
+            speed += f" (only {answer.timed_steps} steps were timed: it is slow)"
+        print(speed, file=sys.stderr, flush=True)
         answers[env_id] = answer
         for algorithm in args.algos:
             if algorithm != "ppo" and not answer.bounded:
@@ -225,7 +216,7 @@ def wall_time(run):
 
 
 def hours_of(seconds):
-    """Spell a time in hours: 1,330 or 4.9 or 0.076."""
+    """Return a time in hours as text: 1,330 or 4.9 or 0.076."""
     hours = seconds / 3600
     return f"{hours:,.0f}" if hours >= 100 else f"{hours:.1f}" if hours >= 0.1 else f"{hours:.2g}"
 
@@ -242,14 +233,6 @@ def time_left(batches, jobs, elsewhere=False):
         text += f", {hours_of(clock)} hours on the clock with {runs} at a time"
     if elsewhere:
         text += "; timed on this machine, others may be faster or slower"
-    return text
-
-
-def speed_of(env_id, environment):
-    """Say how fast an environment is."""
-    text = f"{env_id}: {float(f'{1000 * environment.step_seconds:.2g}'):g} ms a step"
-    if environment.timed_steps < STEPS:
-        text += f" (only {environment.timed_steps} steps were timed: it is slow)"
     return text
 
 

@@ -11,13 +11,12 @@ import itertools
 import os
 import re
 import shlex
-import subprocess
 from pathlib import Path
 from typing import NamedTuple
 
 from analysis.errors import fail
 from analysis.folders import PHASES, DamageError, read_config, read_result, runs_of
-from noisy_wrappers import BASELINE, MAY_DIFFER_IN_A_RUN, Configuration, run_folder
+from noisy_wrappers import BASELINE, MAY_DIFFER_IN_A_RUN, Configuration, run_name
 
 PROJECT = Path(__file__).resolve().parent.parent
 SEEDS = {"sac": range(1, 6), "td3": range(1, 6), "ppo": range(1, 11)}  # the paper's
@@ -59,7 +58,13 @@ ABLATION = [(f"RandomUniformScaleReward({2 - b:.1f}, {b})", 0.05) for b in (1.1,
 ABLATION += [
     (f"RandomUniformNoisyObservation(-{b}, {b})", 1.0) for b in (0.0001, 0.001, 0.01, 0.1, 1.0)
 ]
-PRESETS = {  # the grid options that a preset sets; its noises are in preset_pairs
+PAIRS = {  # presets, and their noises with rates
+    "demo": [("RandomNormalNoisyObservation(1.0)", 1.0)],  # harms with any five seeds
+    "paper": list(itertools.product(NOISES, RATES)),
+    "choose": list(itertools.product(CHOOSE_NOISES, CHOOSE_RATES)),
+    "ablation": ABLATION,
+}
+PRESETS = {  # the grid options that a preset sets
     "demo": {
         "algos": ["ppo"],
         "envs": ["InvertedPendulum-v5"],
@@ -107,25 +112,29 @@ def script_of(algorithm):
 
 @functools.cache
 def defaults(script):
-    """Return {option: default} of a script, from its text: importing it takes seconds.
+    """Return {option: (type, default)} of a script, from its text: importing it takes seconds.
 
-    Options that the grid gives are left out.
+    The type is as it is written there. Options that the grid gives are left out.
     """
     nodes = ast.parse((PROJECT / script).read_text("utf-8")).body
     [args] = [node for node in nodes if isinstance(node, ast.ClassDef) and node.name == "Args"]
-    fields = [field for field in args.body if isinstance(field, ast.AnnAssign)]
-    texts = {field.target.id.replace("_", "-"): field.value for field in fields}
-    return {name: ast.literal_eval(texts[name]) for name in texts if name not in GIVEN_BY_THE_GRID}
+    fields = {node.target.id.replace("_", "-"): node for node in args.body[1:]}
+    return {
+        name: (ast.unparse(field.annotation), ast.literal_eval(field.value))
+        for name, field in fields.items()
+        if name not in GIVEN_BY_THE_GRID
+    }
 
 
 @functools.cache
 def script_options(script, words):
     """Return {option: value} of a script that is started with these words after the "--".
 
-    Exits with one line about a word that is out of place. Whether a value is a good one, the
-    script itself says: check_extra.
+    Exits with one line about a word that the script would refuse: a typing error is not worth
+    9,100 failed runs.
     """
-    options = dict(defaults(script))
+    known = defaults(script)
+    options = {name: default for name, (_, default) in known.items()}
     words = iter(words)
     for word in words:
         if not word.startswith("--"):
@@ -145,18 +154,23 @@ def script_options(script, words):
         text = text if equals else next(words, "--")
         if not text or text.startswith("--"):
             fail(f"--{name} needs a value")
-        options[name] = option_value(text)
+        options[name] = option_value(name, text, known[name][0])
     return options
 
 
-def option_value(text):
-    """Read an option's value as a script does; here a number is a number, whole or not."""
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            pass
-    return None if text == "None" else text
+def option_value(name, text, annotation):
+    """Read an option's value as the script does; annotation: its type, such as "int | None"."""
+    if "None" in annotation and text == "None":
+        return None
+    if annotation.startswith("Literal"):
+        choices = ast.literal_eval(annotation.removeprefix("Literal"))
+        if text not in choices:
+            fail(f"--{name} must be one of {', '.join(choices)}, not {text!r}")
+        return text
+    try:
+        return (float if "float" in annotation else int)(text)
+    except ValueError:
+        fail(f"--{name} takes a {'whole ' * ('int' in annotation)}number, not {text!r}")
 
 
 # ----------------------------------------------------------------------------------------- the runs
@@ -164,18 +178,10 @@ def option_value(text):
 
 def preset_pairs(preset, algorithm, env_id):
     """Return a preset's (noise, rate) pairs for one algorithm and environment."""
-    if preset == "demo":
-        return [("RandomNormalNoisyObservation(1.0)", 1.0)]  # harms with any five seeds
-    if preset == "paper":
-        return list(itertools.product(NOISES, RATES))
-    if preset == "choose":
-        return list(itertools.product(CHOOSE_NOISES, CHOOSE_RATES))
-    if preset == "ablation":
-        return ABLATION
-    if preset == "best":
-        pair = best_pairs().get((algorithm, env_id.rpartition("-v")[0]))
-        return [pair] if pair else fail(f"the paper has no best noise for {algorithm} on {env_id}")
-    return []
+    if preset != "best":
+        return PAIRS.get(preset, [])
+    pair = best_pairs().get((algorithm, env_id.rpartition("-v")[0]))
+    return [pair] if pair else fail(f"the paper has no best noise for {algorithm} on {env_id}")
 
 
 @functools.cache
@@ -184,8 +190,8 @@ def best_pairs():
     pairs = {}
     with open(PROJECT / "results/paper/best.csv", newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
-            cell = row["algorithm"].lower(), row["environment"].rpartition("-v")[0]
-            pairs[cell] = row["noise_as_run"], float(row["noise_rate"])
+            case = row["algorithm"].lower(), row["environment"].rpartition("-v")[0]
+            pairs[case] = row["noise_as_run"], float(row["noise_rate"])
     return pairs
 
 
@@ -194,8 +200,8 @@ def of_the_paper(args):
     return args.noises == [[("paper", None)]]
 
 
-def cells(args, algorithm, env_id):
-    """Return the configuration of every noisy cell of the grid, in the order given."""
+def configurations(args, algorithm, env_id):
+    """Return the configurations with noise of a grid, in the order given."""
     given = [] if of_the_paper(args) else args.noises
     pairs = preset_pairs("paper" if of_the_paper(args) else args.preset, algorithm, env_id)
     entries, rates = [[pair] for pair in pairs], []
@@ -213,11 +219,11 @@ def cells(args, algorithm, env_id):
     found = []
     for pairs in entries:
         for common in rates if pairs in crossed else [None]:
-            found.append(cell(pairs, common))
+            found.append(configuration_of(pairs, common))
     return found
 
 
-def cell(pairs, common=None):
+def configuration_of(pairs, common=None):
     """Return a configuration; `common` is the rate of the noises without one of their own."""
     try:
         return Configuration.read(
@@ -239,36 +245,29 @@ def make_run(args, algorithm, env_id, configuration, seed, phase=""):
     arguments += ["--total-timesteps", str(args.total_timesteps)]
     arguments += ["--runs-dir", runs_dir, *args.extra]
     exp_name, kind = script.removesuffix(".py"), (algorithm, env_id)
-    folder = run_folder(runs_dir, env_id, exp_name, noises, rates, seed)
+    folder = Path(runs_dir, run_name(env_id, exp_name, noises, rates, seed))
     options = script_options(script, tuple(args.extra))
     return PlannedRun(folder, kind, args.total_timesteps, script, arguments, options)
 
 
 def grid(args):
     """Return the runs, each once, the first seed of everything first."""
-    seeds_of = {}
-    for algorithm in args.algos:
-        seeds_of[algorithm] = set(itertools.chain(*(args.seeds or [SEEDS[algorithm]])))
     runs = {}
-    for seed in sorted(set().union(*seeds_of.values())):
-        for algorithm, env_id in itertools.product(seeds_of, args.envs):
-            if seed not in seeds_of[algorithm]:
-                continue
-            for configuration in [BASELINE, *cells(args, algorithm, env_id)]:
-                run = make_run(args, algorithm, env_id, configuration, seed)
-                runs.setdefault(run.folder, run)
-    return list(runs.values())
+    for algorithm, env_id in itertools.product(args.algos, args.envs):
+        noisy = configurations(args, algorithm, env_id)
+        seeds = set(itertools.chain(*(args.seeds or [SEEDS[algorithm]])))
+        for seed, configuration in itertools.product(sorted(seeds), [BASELINE, *noisy]):
+            run = make_run(args, algorithm, env_id, configuration, seed)
+            runs.setdefault(run.folder, (seed, run))
+    return [run for _, run in sorted(runs.values(), key=lambda pair: pair[0])]
 
 
 def runs_in(folder):
     """Return the runs that a folder or its logs tell of, for a status that names no grid."""
     folder = Path(folder)
-    places = [folder, *(folder / phase for phase in PHASES)]
     folders = set(runs_of(folder))
-    for place in places:
-        for log in place.glob("logs/*__*.log"):
-            if not any((other / log.stem).exists() for other in places if other != place):
-                folders.add(place / log.stem)
+    for place in (folder, *(folder / phase for phase in PHASES)):
+        folders |= {place / log.stem for log in place.glob("logs/*__*.log")}
     if not folders:
         fail(f"no runs in {folder}; name their folder with --runs-dir")
     runs = []
@@ -342,26 +341,3 @@ def check_rollouts(runs):
                 f"--total-timesteps must be at least {rollout} for PPO (its --num-steps), not "
                 f"{run.total_timesteps}"
             )
-
-
-def check_extra(runs):
-    """Let each script read one command: a typing error is not worth 9,100 failed runs."""
-    read = "import sys, tyro; from {} import Args; sys.argv[0] = '{}'; tyro.cli(Args)"
-    for run in {run.script: run for run in runs}.values():
-        code = read.format(run.script.removesuffix(".py"), run.script)
-        command = [os.environ.get("PYTHON", "python"), "-c", code, *run.arguments]
-        answer = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace")
-        if answer.returncode:
-            fail(f"{run.script}: {script_error(answer.stderr)}")
-
-
-def script_error(text):
-    """Return what a script says about a bad argument: tyro draws a box around it."""
-    told = []
-    for line in text.splitlines():
-        line = line.strip("\u2502 ")
-        if line.startswith("\u2500"):  # below this rule stands where to find help
-            break
-        if not line.startswith("\u256d"):
-            told.append(line)
-    return " ".join(told) or "cannot be started"

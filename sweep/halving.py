@@ -174,7 +174,7 @@ def sentence(name, winner, noises, comparison, p_corrected, verdicts, unit=""):
     return f"{start}: {evidence}{end}"
 
 
-def rows(algorithm, environment, state, returns, helped):
+def records(algorithm, environment, state, returns, helped):
     """Return the lines of choice.csv for one finished choice, as dicts; see CHOICE_COLUMNS."""
     lines = []
 

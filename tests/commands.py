@@ -4,12 +4,14 @@ What takes `python script.py` seconds takes these a moment. They run the file as
 be told to die, or to be sent a signal, at a chosen moment.
 """
 
+import contextlib
 import functools
 import itertools
 import multiprocessing
 import os
 import pkgutil
 import runpy
+import signal
 import sys
 import threading
 from pathlib import Path
@@ -18,6 +20,7 @@ from types import SimpleNamespace
 from tqdm import tqdm
 
 ROOT = Path(__file__).parents[1]
+LIMIT = 120  # seconds that a command may take
 FORK = multiprocessing.get_context("forkserver")
 FORK.set_forkserver_preload(
     ["pytest", "tyro", "tqdm", "gymnasium.envs.mujoco", "torch.utils.tensorboard"]
@@ -74,8 +77,18 @@ def start(path, words, *moments, cwd=ROOT, before=nothing):
     return process
 
 
+def kill(process):
+    """Kill a command; where it has a process group, with all processes of that."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.kill()
+
+
 def ended(process):
     """Wait for a command; return its exit code (-9 after SIGKILL), stdout and stderr."""
+    limit = threading.Timer(LIMIT, kill, [process])  # what hangs is to fail, not to hang the tests
+    limit.daemon = True
+    limit.start()
     texts = []
     for connection in (process.out, process.err):
         if connection.closed:  # a test has left it
@@ -83,8 +96,8 @@ def ended(process):
             continue
         with open(os.dup(connection.fileno()), errors="replace") as file:
             texts.append(file.read())
-    process.join(120)
-    assert process.exitcode is not None
+    process.join()
+    limit.cancel()
     return SimpleNamespace(code=process.exitcode, out=texts[0], err=texts[1])
 
 

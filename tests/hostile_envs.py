@@ -1,17 +1,19 @@
 """Somebody else's environment, `hostile_envs:Hostile-v0`: right by the API, and all unusual.
 
 It has worker processes, makes a new action space at every access and asserts that actions are in
-it, ends episodes with arrays, draws global random numbers, writes
-into the actions it gets, declares no time limit and writes a file
-when it is closed: HOSTILE_LOG names it.
+it, ends episodes with arrays, draws global random numbers and has no others, writes into the
+actions it gets, returns the same info at every step, declares no time limit and writes a file when
+it is closed: HOSTILE_LOG names it.
 """
 
 import multiprocessing
 import os
 import random
+import signal
 
 import gymnasium as gym
 import numpy as np
+import torch
 from gymnasium.spaces import Box
 
 LOW, HIGH = -0.2, 1.3  # tanh(x) * 0.75 + 0.55 rounds to a number below LOW
@@ -33,10 +35,12 @@ def work(connection):
 
 class Hostile(gym.Env):
     observation_space = Box(-np.inf, np.inf, (2,), np.float64)
+    info = {}
 
     def __init__(self, workers=2, dtype=np.float32, length=8):
         self.dtype, self.length = dtype, length
-        self.offset = random.random() + np.random.random()
+        self.np_random = random  # which has no state_dict, nor a bit_generator
+        self.offset = random.random() + np.random.random() + torch.rand(()).item()
         fork = multiprocessing.get_context("fork")
         self.connections, self.processes = [], []
         for _ in range(workers):
@@ -58,9 +62,9 @@ class Hostile(gym.Env):
         assert {connection.recv() for connection in self.connections} <= {number + 1}
 
     def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
         self.steps = 0
-        return np.array([self.offset + random.random(), np.random.random()]), {}
+        numbers = self.np_random.random(), np.random.random() + torch.rand(()).item()
+        return np.array(numbers) + self.offset, self.info
 
     def step(self, action):
         assert self.action_space.contains(action), f"{action!r} is not in {self.action_space}"
@@ -70,7 +74,7 @@ class Hostile(gym.Env):
         reward = np.array([float(action[0]) * observation[0]])
         action[:] = HIGH  # it is its own array, the environment thinks
         terminated, truncated = np.array([self.steps == self.length]), np.bool_(False)
-        return observation, reward, terminated, truncated, {}
+        return observation, reward, terminated, truncated, self.info
 
     def close(self):
         for process in self.processes:
@@ -109,6 +113,53 @@ class ResetOfOldAPI(Hostile):
         return np.append(super().reset(**kwargs)[0], 0.0)
 
 
+class ResetOfNothing(Hostile):
+    """Knows neither seeds nor options."""
+
+    def reset(self):
+        return super().reset()
+
+
+class OtherReward(Hostile):
+    """Returns what is no number, or several."""
+
+    def __init__(self, reward):
+        super().__init__(workers=0)
+        self.reward = reward
+
+    def step(self, action):
+        observation, _, *others = super().step(action)
+        return observation, self.reward, *others
+
+
+class NoInfo(Hostile):
+    """Returns None as info."""
+
+    info = None
+
+
+class BadClose(Hostile):
+    """Cannot be closed."""
+
+    def close(self):
+        raise OSError("no window")
+
+
+class OwnSignals(Hostile):
+    """Takes the signals over, as robots' middleware does."""
+
+    def __init__(self):
+        super().__init__(workers=0)
+        signal.signal(signal.SIGTERM, lambda number, frame: None)
+
+
+class OwnCompiler(Hostile):
+    """Compiles something itself, which fails."""
+
+    def step(self, action):
+        raise torch._dynamo.exc.Unsupported("a graph of its own")
+
+
 class OtherShape(Hostile):
     """Returns a column."""
 
@@ -117,9 +168,17 @@ class OtherShape(Hostile):
         return observation.reshape(2, 1), *others
 
 
-for entry_point in (Hostile, Refused, Broken, OfOldAPI, ResetOfOldAPI, OtherShape):
-    gym.register(f"{entry_point.__name__}-v0", entry_point)
-gym.register("HostileAlone-v0", Hostile, kwargs={"workers": 0})
-gym.register("HostileHalf-v0", Hostile, kwargs={"workers": 0, "dtype": np.float16})
-gym.register("HostileDouble-v0", Hostile, kwargs={"workers": 0, "dtype": np.float64})
-gym.register("HostileLong-v0", Hostile, kwargs={"length": 10**9})
+def register(entry_point, name="", **kwargs):
+    gym.register(f"{name or entry_point.__name__}-v0", entry_point, kwargs=kwargs)
+
+
+for entry_point in (Hostile, Refused, Broken, OfOldAPI, ResetOfOldAPI, ResetOfNothing, OtherShape):
+    register(entry_point)
+for entry_point in (NoInfo, BadClose, OwnCompiler):
+    register(entry_point, workers=0)
+register(OwnSignals)
+register(Hostile, "HostileAlone", workers=0)
+register(Hostile, "HostileHalf", workers=0, dtype=np.float16)
+register(Hostile, "HostileDouble", workers=0, dtype=np.float64)
+register(OtherReward, "NoReward", reward=None)
+register(OtherReward, "TwoRewards", reward=np.ones(2))

@@ -20,7 +20,7 @@ from pathlib import Path
 from statistics import fmean
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
-from noisy_wrappers import run_folder  # noqa: E402
+from noisy_wrappers import run_name  # noqa: E402
 
 EPISODES = 10  # the scripts' default
 STEPS, SECONDS = 4000, 0.04
@@ -84,7 +84,7 @@ def train(argv):
     args.noise_rate = [rate if ":" in rate else float(rate) for rate in args.noise_rate]
     exp_name = args.script.removesuffix(".py")
     configuration = (args.env_id, exp_name, args.noise, args.noise_rate, args.seed)
-    folder = run_folder(args.runs_dir, *configuration)
+    folder = Path(args.runs_dir, run_name(*configuration))
     folder.mkdir(parents=True, exist_ok=True)
     lock = open(folder / ".lock", "w")  # noqa: SIM115
     fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # as the scripts do

@@ -12,9 +12,7 @@ its defaults, but neither tests its policy nor saves. Whenever it logs losses to
 program starts once, reports three times to warm up, and then runs in blocks of --seconds, of which
 --pairs are measured. A speed is the median of its blocks.
 
-    core %       the share of the core that the process got; below 97 the machine was busy
-    memory MB    the most that the process held; --stored 1000000 fills the replay buffer first
-
+"core %" is the share of the core that the process got; below 97 the machine was busy.
 With --clock cpu only time on the core counts, which depends less on other processes.
 --against-... runs other programs and ours in turn, one block each. "ours / its" is the median of
 the ratios of neighbouring blocks; "from" and "to" are the 95 % interval of this median (with fewer
@@ -24,16 +22,14 @@ it logs nothing, and in PPO it normalizes neither observations nor rewards.
 --jobs N compares N runs side by side, on a core each, with one alone.
 --estimate compares the speed with the one that `benchmark.sh --dry-run` counts on; the exit status
 is 1 if it is wrong by more than 1.5 times.
---checkpoint measures one checkpoint, after --stored steps (at least one rollout). SAC and TD3 keep
-all of them in the replay buffer.
 """
 
 import argparse
 import contextlib
+import itertools
 import json
 import math
 import os
-import resource
 import runpy
 import shutil
 import signal
@@ -46,6 +42,7 @@ from statistics import median
 
 PROJECT = Path(__file__).resolve().parent.parent
 ALGOS = ("sac", "td3", "ppo")
+LEARNING_STARTS = 1000  # random steps of SAC and TD3, fewer than by default: they are not measured
 ROLLOUT = 2048  # the steps of PPO's rollout, the default of all programs here
 LARGEST_ERROR = 1.5  # of an estimated speed: LEARNING in sweep/environment.py
 TOTAL_TIMESTEPS = 2_000_000  # more than any program takes before it is ended
@@ -78,13 +75,12 @@ class Marks:
         """Report that the program has reached a step, and wait."""
         self.wall += time.perf_counter() - self.resumed[0]
         self.cpu += time.process_time() - self.resumed[1]
-        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        print("mark", json.dumps([step, self.wall, self.cpu, memory]), flush=True)
+        print("mark", json.dumps([step, self.wall, self.cpu]), flush=True)
         self.wait()
 
 
-def child_script(script, marked_tag, *flags):
-    """Run a script as the command line does, with a mark at every step that logs such a tag."""
+def child_script(script, *flags):
+    """Run a script as the command line does, with a mark at every step that logs losses."""
     from torch.utils.tensorboard import SummaryWriter
 
     marks, last_step = Marks(), 0
@@ -92,22 +88,17 @@ def child_script(script, marked_tag, *flags):
 
     def watched(self, tag, scalar_value, global_step=None, *args, **kwargs):
         nonlocal last_step
-        if tag.startswith(marked_tag) and global_step != last_step:
+        if tag.startswith("losses/") and global_step != last_step:
             last_step = global_step
             marks.mark(global_step)
         add_scalar(self, tag, scalar_value, global_step, *args, **kwargs)
 
     SummaryWriter.add_scalar = watched
     sys.argv = [script, *flags]
-    try:
-        runpy.run_path(script, run_name="__main__")
-    except SystemExit as end:
-        if end.code == 128 + signal.SIGTERM:  # asked to stop, it has saved a checkpoint
-            marks.mark(last_step)
-        raise
+    runpy.run_path(script, run_name="__main__")
 
 
-def child_sbx(algo, env_id, learning_starts):
+def child_sbx(algo, env_id):
     """Run SBX with our sizes; those of batches and buffer, and activations, are its defaults."""
     import gymnasium
     import numpy as np
@@ -125,7 +116,7 @@ def child_sbx(algo, env_id, learning_starts):
     width = 64 if algo == "ppo" else 256
     options = {"policy_kwargs": {"net_arch": [width, width]}, "learning_rate": 3e-4, "seed": 1}
     if algo != "ppo":
-        options["learning_starts"] = int(learning_starts)
+        options["learning_starts"] = LEARNING_STARTS
     if algo == "sac":
         options["qf_learning_rate"] = 1e-3
     if algo == "td3":
@@ -152,7 +143,7 @@ class Program(contextlib.AbstractContextManager):
 
     def __init__(self, name, core, *arguments, python=sys.executable):
         self.name, self.speeds, self.shares = name, [], []
-        self.step = self.wall = self.cpu = self.memory = 0
+        self.step = self.wall = self.cpu = 0
         self.folder = tempfile.TemporaryDirectory()
         command = [str(word) for word in (python, __file__, core, *arguments)]
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
@@ -172,7 +163,7 @@ class Program(contextlib.AbstractContextManager):
         for line in self.process.stdout:
             word, _, value = line.partition(" ")
             if word == "mark":
-                self.step, self.wall, self.cpu, self.memory = json.loads(value)
+                self.step, self.wall, self.cpu = json.loads(value)
                 return
             printed += [word for word in line.split() if word.strip("─│╭╮╰╯")]  # without boxes
         code = 2 if self.process.wait() == 2 else 1  # 2: bad arguments
@@ -205,19 +196,19 @@ def measure(options, *programs):
         program.shares.append((program.cpu - cpu) / (program.wall - wall))
 
 
-def flags(algo, env_id, options):
+def flags(algo, env_id):
     """Return the flags that our scripts and CleanRL's share."""
     shared = ["--env-id", env_id, "--total-timesteps", TOTAL_TIMESTEPS]
-    return shared if algo == "ppo" else [*shared, "--learning-starts", options.stored]
+    return shared if algo == "ppo" else [*shared, "--learning-starts", LEARNING_STARTS]
 
 
-def ours(algo, env_id, options, name="ours", folder=None, job=0, tag="losses/"):
+def ours(algo, env_id, options, name="ours", folder=None, job=0):
     """Start one of this project's scripts, without tests and checkpoints."""
     core = options.cores[job % len(options.cores)]
     script = (folder or PROJECT).resolve() / f"{algo}_continuous_noisy.py"
     never_save = ["--eval-frequency", 0, "--checkpoint-frequency", TOTAL_TIMESTEPS]
-    arguments = [*flags(algo, env_id, options), *never_save, *options.flags]
-    return Program(name, core, "_script", script, tag, *arguments)
+    arguments = [*flags(algo, env_id), *never_save, *options.flags]
+    return Program(name, core, "_script", script, *arguments)
 
 
 def ours_and_others(algo, env_id, options):
@@ -228,12 +219,12 @@ def ours_and_others(algo, env_id, options):
         yield ours(algo, env_id, options, "checkout", options.against_checkout)
     if options.against_cleanrl:
         script = options.against_cleanrl.resolve() / "cleanrl" / f"{algo}_continuous_action.py"
-        arguments = [script, "losses/", *flags(algo, env_id.replace("-v5", "-v4"), options)]
+        arguments = [script, *flags(algo, env_id.replace("-v5", "-v4"))]
         python = options.cleanrl_python
         yield Program("CleanRL", core, "_script", *arguments, "--no-cuda", python=python)
     if options.against_sbx:
         python = options.against_sbx
-        yield Program("SBX", core, "_sbx", algo, env_id, options.stored, python=python)
+        yield Program("SBX", core, "_sbx", algo, env_id, python=python)
 
 
 def interval_of_median(values):
@@ -261,20 +252,17 @@ def compare(algo, env_id, options):
             "program": program.name,
             "steps/s": median(program.speeds),
             "core %": 100 * median(program.shares),
-            "memory MB": program.memory,
             "ours / its": median(ratios),
             "from": low,
             "to": high,
-            "speeds": program.speeds,
-            "ratios": ratios,
         }
         rows.append(row)
     return rows
 
 
 def side_by_side(algo, env_id, options):
-    """Run one alone and several together, alternately."""
-    programs, alone, together = [], [], []
+    """Run one alone and several at once, alternately."""
+    programs, alone, at_once = [], [], []
     with contextlib.ExitStack() as stack:
         for job in range(options.jobs):
             programs.append(stack.enter_context(ours(algo, env_id, options, job=job)))
@@ -283,33 +271,10 @@ def side_by_side(algo, env_id, options):
             measure(options, programs[0])
             alone.append(programs[0].speeds[-1])
             measure(options, *programs)
-            together.append(sum(program.speeds[-1] for program in programs))
-    efficiencies = [b / (a * options.jobs) for a, b in zip(alone, together, strict=True)]
-    row = {
-        "alone": median(alone),
-        f"{options.jobs} jobs": median(together),
-        "efficiency": median(efficiencies),
-        "efficiencies": efficiencies,
-    }
-    return [row]
-
-
-def checkpoint(algo, env_id, options):
-    """Let a run save a checkpoint when an episode has ended and its return is logged."""
-    with ours(algo, env_id, options, tag="charts/episodic_return") as program:
-        while program.step <= max(options.stored, ROLLOUT):
-            advance(program)
-        memory, wall = program.memory, program.wall
-        program.process.terminate()
-        advance(program)
-        [file] = Path(program.folder.name).glob("runs/*/checkpoint.pt")
-        row = {
-            "step": program.step,
-            "MB": file.stat().st_size / 2**20,
-            "seconds": program.wall - wall,
-            "extra memory MB": program.memory - memory,
-        }
-    return [row]
+            at_once.append(sum(program.speeds[-1] for program in programs))
+    efficiencies = [b / (a * options.jobs) for a, b in zip(alone, at_once, strict=True)]
+    speeds = {"alone": median(alone), f"{options.jobs} jobs": median(at_once)}
+    return [speeds | {"efficiency": median(efficiencies)}]
 
 
 def estimate(algo, env_id, options):
@@ -326,14 +291,6 @@ def estimate(algo, env_id, options):
     seconds = learning_seconds(algo, environment) + environment.step_seconds
     speed = median(program.speeds)
     return [{"steps/s": speed, "estimated": 1 / seconds, "real / estimated": speed * seconds}]
-
-
-def table(rows):
-    """Return the rows as text; the lists in them are for --json only."""
-    from tabulate import tabulate  # here, since the children's interpreters may not have it
-
-    shown = [{k: v for k, v in row.items() if not isinstance(v, list)} for row in rows]
-    return tabulate(shown, headers="keys", floatfmt=".4g")
 
 
 def interpreter(name):
@@ -355,7 +312,6 @@ def parse(argv):
     add("--envs", nargs="+", default=["HalfCheetah-v5", "Humanoid-v5"], metavar="ENV_ID")
     add("--pairs", type=int, default=20, help="blocks of each program (default: 20)")
     add("--seconds", type=float, default=2.0, help="shortest length of a block (default: 2)")
-    add("--stored", type=int, default=1000, help="random steps before learning (default: 1000)")
     add("--clock", choices=("wall", "cpu"), default="wall")
     add("--against-cleanrl", type=Path, metavar="PATH", help="a checkout of CleanRL")
     add("--cleanrl-python", type=interpreter, metavar="PYTHON", help="with CleanRL's requirements")
@@ -363,21 +319,17 @@ def parse(argv):
     add("--against-checkout", type=Path, metavar="PATH", help="another version of this project")
     add("--jobs", type=int, metavar="N", help="compare N runs side by side with one")
     add("--estimate", action="store_true", help="check what benchmark.sh --dry-run counts on")
-    add("--checkpoint", action="store_true", help="size and time of checkpoints")
-    add("--json", type=Path, metavar="FILE", help="write all figures, block by block, to a file")
     end = argv.index("--") if "--" in argv else len(argv)
     options = parser.parse_args(argv[:end])
     options.flags = argv[end + 1 :]
     options.cores = sorted(os.sched_getaffinity(0), reverse=True)
 
-    for name, low in (("pairs", 1), ("seconds", 0.1), ("stored", 1), ("jobs", 2)):
+    for name, low in (("pairs", 1), ("seconds", 0.1), ("jobs", 2)):
         value = getattr(options, name)
         if value is not None and not value >= low:
             fail(f"--{name} must be at least {low}, not {value}")
     if bool(options.against_cleanrl) != bool(options.cleanrl_python):
-        fail("--against-cleanrl and --cleanrl-python go together")
-    if options.json and not options.json.parent.is_dir():
-        fail(f"--json: there is no folder {options.json.parent}")
+        fail("--against-cleanrl and --cleanrl-python need each other")
     files = {"cleanrl": "cleanrl/sac_continuous_action.py", "checkout": "sac_continuous_noisy.py"}
     for name, file in files.items():
         folder = getattr(options, f"against_{name}")
@@ -388,30 +340,23 @@ def parse(argv):
 
 def main(argv):
     """Measure and print."""
+    from tabulate import tabulate  # here, since the children's interpreters may not have it
+
     options = parse(argv)
-    modes, figures = [], {}
-    if options.jobs:
-        modes.append(side_by_side)
-    if options.checkpoint:
-        modes.append(checkpoint)
-    if options.estimate:
-        modes.append(estimate)
-    if not modes or options.against_cleanrl or options.against_sbx or options.against_checkout:
-        modes.append(compare)
+    against_others = options.against_cleanrl or options.against_sbx or options.against_checkout
+    modes = [side_by_side] if options.jobs else []
+    modes += [compare] if against_others or not (options.jobs or options.estimate) else []
+    modes += [estimate] if options.estimate else []
     for mode in modes:
         rows = []
-        for algo in options.algos:
-            for env_id in options.envs:
-                print(f"{mode.__name__} {algo} {env_id}", file=sys.stderr)
-                for row in mode(algo, env_id, options):
-                    rows.append({"script": algo, "env_id": env_id, **row})
-        print(table(rows), flush=True)
-        figures[mode.__name__] = rows
-    if options.json:
-        options.json.write_text(json.dumps(figures, indent=2) + "\n")
-    ratios = [row["real / estimated"] for row in figures.get("estimate", [])]
-    if any(not 1 / LARGEST_ERROR <= ratio <= LARGEST_ERROR for ratio in ratios):
-        fail(f"an estimated speed is wrong by more than {LARGEST_ERROR} times", code=1)
+        for algo, env_id in itertools.product(options.algos, options.envs):
+            print(f"{mode.__name__} {algo} {env_id}", file=sys.stderr)
+            case = {"script": algo, "env_id": env_id}
+            rows += [case | row for row in mode(algo, env_id, options)]
+        print(tabulate(rows, headers="keys", floatfmt=".4g"), flush=True)
+        ratios = [row.get("real / estimated", 1) for row in rows]
+        if not all(1 / LARGEST_ERROR <= ratio <= LARGEST_ERROR for ratio in ratios):
+            fail(f"an estimated speed is wrong by more than {LARGEST_ERROR} times", code=1)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from math import ceil
 from pathlib import Path
 
 import numpy as np
+from tabulate import tabulate
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from analysis.statistics import random_partitions, tails, welch_t  # noqa: E402
@@ -94,8 +95,7 @@ def simulate(noises, sizes, confirm, gain, draw=normal, spread=1.0, trials=TRIAL
 
 def print_table(*rows):
     """Print a table in Markdown, the first row being its head."""
-    head, *body = (f"| {' | '.join(map(str, row))} |" for row in rows)
-    print(head, "|" + len(rows[0]) * "---|", *body, "", sep="\n", flush=True)
+    print(tabulate(rows, "firstrow", "pipe", disable_numparse=True), end="\n\n", flush=True)
 
 
 def power(noises, sizes, confirm, draw=normal):

@@ -16,13 +16,14 @@ import signal
 import sys
 import traceback
 from itertools import product
+from pathlib import Path
 from unittest import mock
 
 import numpy as np
 from gymnasium.wrappers import NormalizeObservation
 
 import ppo_continuous_noisy as ppo
-from noisy_wrappers import run_folder
+from noisy_wrappers import run_name
 
 # The statistics that normalize the observations of a test: those of training, frozen; the test
 # environment's own, accumulated over all tests of a run; its own, begun anew in each test.
@@ -107,9 +108,8 @@ class SixWays:
 
 def folder_of(args):
     """Return the folder of a run."""
-    return run_folder(
-        args.runs_dir, args.env_id, args.exp_name, args.noise, args.noise_rate, args.seed
-    )
+    run = (args.env_id, args.exp_name, args.noise, args.noise_rate, args.seed)
+    return Path(args.runs_dir, run_name(*run))
 
 
 def is_finished(args):

@@ -3,7 +3,7 @@
 The other tables are of finished studies, see results/tables/README.md.
 """
 
-from results.study import baselines, claims, pooled
+from results.study import baselines, claims, physics, pooled
 from results.study.compare import comparisons
 from results.study.returns import RESULTS, read_returns
 
@@ -13,7 +13,8 @@ SETS = ("ppo_hopper", "sac_200k", "td3_200k", "ppo_walker2d")  # of plans.md, as
 def tables():
     """Return {name: frame}."""
     sets = {name: read_returns(name) for name in SETS}
-    found = {name: comparisons(runs) for name, runs in sets.items() if len(runs)}
+    sets = {name: runs for name, runs in sets.items() if len(runs) and runs["seed"].nunique() > 1}
+    found = {name: comparisons(runs) for name, runs in sets.items()}
     return found | {
         "all_runs_batches": pooled.batches(),
         "all_runs_best_noises": pooled.best_noises(),
@@ -23,6 +24,7 @@ def tables():
         "pusher_steps": pooled.pusher_steps(),
         "sac_headline": pooled.sac_headline(),
         "claims": claims.table(),
+        **physics.tables(),
     }
 
 
@@ -34,3 +36,5 @@ def as_csv(table):
 if __name__ == "__main__":
     for name, table in tables().items():
         (RESULTS / f"tables/{name}.csv").write_text(as_csv(table), encoding="utf-8")
+    if len(tests := physics.read_tests()):
+        physics.draw(tests, RESULTS / "figures/physics.svg")

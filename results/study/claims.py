@@ -11,8 +11,8 @@ from results.study.compare import (
     compare,
     comparisons,
     holm,
+    judge_claim,
     mann_whitney_p,
-    verdict,
 )
 from results.study.returns import ENVIRONMENTS, RESULTS, read_returns, select
 
@@ -34,7 +34,7 @@ def row(claim, page, paper, ours, tests, runs, claimed=1, of=all, after=False):
     """Return a row of the table; page is the name of a link in README.md.
 
     paper: percent, or a text; ours: (change, low, high) in percent, or a text; tests, claimed and
-    of: see compare.verdict. after: whether it was asked after the runs; a star says so.
+    of: see compare.judge_claim. after: whether it was asked after the runs; a star says so.
     """
     inside = "–"
     if not isinstance(ours, str):
@@ -49,7 +49,7 @@ def row(claim, page, paper, ours, tests, runs, claimed=1, of=all, after=False):
         "the paper": paper,
         "ours [95 %]": ours,
         "covered": inside,
-        "verdict": verdict(tests, claimed, of),
+        "verdict": judge_claim(tests, claimed, of),
         "runs": f"[{runs}][{page}]",
     }
 

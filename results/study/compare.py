@@ -122,7 +122,7 @@ def in_words(effect, p):
     return "helps" if effect > 0 else "harms"
 
 
-def verdict(tests, claimed=1, of=all):
+def judge_claim(tests, claimed=1, of=all):
     """Judge a claim by its tests: a list of (effect, corrected p), one for each case.
 
     A case with p <= 0.05 confirms or contradicts by its sign; claimed, 1 or -1, is that of the

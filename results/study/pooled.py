@@ -6,6 +6,7 @@ once. The test is that of the first page, Mann-Whitney's.
 
 import pandas as pd
 
+from noisy_wrappers import run_name
 from results.study.compare import average_change, compare, holm, mann_whitney_p
 from results.study.returns import (
     DATA,
@@ -102,12 +103,12 @@ def pusher_steps():
     """Return when the mean of PPO on Pusher is at the last mean without noise, by seeds."""
     rows = []
     for low, high in ((1, 10), (11, 30), (1, 30)):
-        means = {}
-        for noise in ("baseline", "RandomEarlyTermination_50_p1.0"):
-            stem = f"Pusher-v5__ppo_continuous_noisy__{noise}__"
-            paths = [DATA / "runs" / f"{stem}{seed}" for seed in range(low, high + 1)]
-            means[noise] = pd.DataFrame(map(read_curve, paths)).mean()
-        without, noisy = means.values()
+        means = []
+        for noises, rates in (([], []), (["RandomEarlyTermination(50)"], [1.0])):
+            run = ("Pusher-v5", "ppo_continuous_noisy", noises, rates)
+            paths = [DATA / "runs" / run_name(*run, seed) for seed in range(low, high + 1)]
+            means.append(pd.DataFrame(map(read_curve, paths)).mean())
+        without, noisy = means
         last = without.iloc[-1]
         row = {"seeds": f"{low} to {high}", "last mean without noise": round(last, 1)}
         row |= {"steps without": first(without, last), "steps with": first(noisy, last)}

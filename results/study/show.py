@@ -46,6 +46,15 @@ COLUMNS = {
         "p (Welch)": "{p:.2f}",
         "the paper": "{paper_percent:+z.0f} %",
     },
+    "physics_questions.csv": {
+        "question": "{question}",
+        "environments": "{environments}",
+        "seeds": "{seeds}",
+        "change [95 %]": "{change_percent:+z.0f} % [{low_percent:.0f}, {high_percent:.0f}]",
+        "p": "{p:.2g}",
+        "Holm": "{holm:.2g}",
+        "verdict": "{verdict}",
+    },
 }
 
 
@@ -65,7 +74,7 @@ def table(name, **where):
         columns = {t: form for t, form in COMPARISON.items() if fields(form) <= rows[0].keys()}
     lines = [list(row.values()) for row in rows]
     if columns:
-        lines = [[spell(form, row) for form in columns.values()] for row in rows]
+        lines = [[formatted(form, row) for form in columns.values()] for row in rows]
     titles = list(columns or rows[0])
     lines = [f"| {' | '.join(cell or '–' for cell in line)} |" for line in [titles, *lines]]
     print(lines[0], "|---" * len(titles) + "|", *lines[1:], sep="\n")
@@ -76,7 +85,7 @@ def fields(form):
     return {field for _, field, _, _ in Formatter().parse(form) if field}
 
 
-def spell(form, row):
+def formatted(form, row):
     """Return a cell by its format, empty where a value is."""
     values = {field: number(row[field]) for field in fields(form)}
     return "" if "" in values.values() else form.format(**values)

@@ -89,25 +89,24 @@ def test_the_phases_are_folders_and_high_seeds_are_seeds(tmp_path):
 
 def test_the_flat_folder_of_an_earlier_version_is_refused_with_the_commands(tmp_path, capsys):
     """After them, the tables are those of a choice that was never flat."""
-    for style in ("p1.0_s{}_A__Hopper-v5__ppo", "Hopper-v5__ppo__A_p1.0__{}"):
-        root = tmp_path / style[0] / "my runs"
-        write_choice(root)
-        expected = run(tmp_path / style[0], "my runs")
-        for phase in ("search", "confirmation"):
-            for i, folder in enumerate(sorted((root / phase).iterdir())):
-                seed = json.loads((folder / "config.json").read_text())["args"]["seed"]
-                folder.rename(root / (style.format(seed).replace("A", f"A{phase[0]}{i}")))
-            (root / phase).rmdir()
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as error:
-            run(tmp_path / style[0], "my runs")
-        printed = capsys.readouterr().err
-        assert error.value.code == 2 and printed.count("\n") == 1 and printed.count("mv ") == 2
-        command = printed.partition("now: ")[2]
-        subprocess.run(command, shell=True, check=True, executable="/bin/bash")
-        for name, table in run(tmp_path / style[0], "my runs", "again").items():
-            if name != "missing":
-                pd.testing.assert_frame_equal(table, expected[name])
+    root = tmp_path / "my runs"
+    write_choice(root)
+    expected = run(tmp_path, "my runs")
+    for phase in ("search", "confirmation"):
+        for i, folder in enumerate(sorted((root / phase).iterdir())):
+            seed = json.loads((folder / "config.json").read_text())["args"]["seed"]
+            folder.rename(root / f"p1.0_s{seed}_A{phase[0]}{i}__Hopper-v5__ppo")
+        (root / phase).rmdir()
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as error:
+        run(tmp_path, "my runs")
+    printed = capsys.readouterr().err
+    assert error.value.code == 2 and printed.count("\n") == 1 and printed.count("mv ") == 2
+    command = printed.partition("now: ")[2]
+    subprocess.run(command, shell=True, check=True, executable="/bin/bash")
+    for name, table in run(tmp_path, "my runs", "again").items():
+        if name != "missing":
+            pd.testing.assert_frame_equal(table, expected[name])
 
 
 def test_other_sweeps_in_the_folder_of_a_choice_stay_as_they_are(tmp_path):

@@ -23,7 +23,7 @@ import ppo_continuous_noisy as ppo
 import sac_continuous_noisy as sac
 import td3_continuous_noisy as td3
 from evaluate import Args, main
-from noisy_wrappers import Configuration, rounded
+from noisy_wrappers import BASELINE, Configuration, rounded
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = {"SAC": sac, "TD3": td3, "PPO": ppo}
@@ -92,7 +92,7 @@ def run(*options, cwd=None, **environment):
 def test_clean_returns_are_those_of_the_last_evaluation(runs, algorithm):
     run_dir = one(runs, algorithm)
     [finished], _ = evaluate.find_runs([run_dir])
-    played = evaluate.play(finished, [], [], Args((run_dir,), episodes=10, seed=1_000_000))
+    played = evaluate.play(finished, BASELINE, Args((run_dir,), episodes=10, seed=1_000_000))
     with open(run_dir / "eval.csv", newline="") as file:
         last = list(csv.DictReader(file))[-10:]
     rows = [(float(row["episodic_return"]), int(row["episodic_length"])) for row in last]
@@ -163,8 +163,8 @@ def test_what_is_stored_is_not_played_again(runs, monkeypatch, capsys):
     monkeypatch.setattr(evaluate, "play", None)
     main(args)
     assert capsys.readouterr().out == table
-    spelled = Args((runs,), (" RandomNormalNoisyObservation(.1)",), (1, 0.5, 0.50, 0.0), episodes=2)
-    main(spelled)
+    again = Args((runs,), (" RandomNormalNoisyObservation(.1)",), (1, 0.5, 0.50, 0.0), episodes=2)
+    main(again)
     assert files(runs) == before
     means = {}
     for run_dir in runs.iterdir():
@@ -205,7 +205,7 @@ def test_another_seed_plays_everything_and_stores_nothing(runs, capsys):
     [finished], _ = evaluate.find_runs([run_dir])
     means = []
     for rate in (0, 0.5, 1.0):
-        played = evaluate.play(finished, [OBSERVATION], [rate], args)
+        played = evaluate.play(finished, Configuration.read([OBSERVATION], [rate]), args)
         means.append(rounded(np.mean(played, axis=0)[0]))
     assert table[-1].split()[-3:] == means
     assert means[0] != default.split()[-2]
@@ -305,9 +305,9 @@ def test_a_full_disk_leaves_the_previous_file(runs, monkeypatch, capsys):
 def test_the_table_of_known_returns(capsys):
     def a_run(noise, rate):
         config = Configuration.parse(noise, rate)
-        return evaluate.FinishedRun(Path(str(len(cells))), "PPO", "", "E", config, {})
+        return evaluate.FinishedRun(Path(str(len(seen))), "PPO", "", "E", config, {})
 
-    cells = {}
+    seen = {}
     for noise, rate, clean, noisy in [
         ("", "0.00", [10, 30], [1, 2]),  # means 20 and 1.5
         ("A(1)", "0.50", [5, 5], [7, 8]),
@@ -315,13 +315,17 @@ def test_the_table_of_known_returns(capsys):
         ("", "0.00", [10, 90], [-5, 0]),  # means 50 and -2.5
     ]:
         # A third episode is stored and not asked for; the second number is the length.
-        cells[a_run(noise, rate)] = {
+        seen[a_run(noise, rate)] = {
             ("", "0.0", ""): [(value, 1) for value in (*clean, 1000)],
             ("A(1) + B(2)", "0.1 + 0.1", ""): [(value, 1) for value in (*noisy, 1000)],
             ("C(3)", "0.5", ""): [(-value, 1) for value in (*noisy, 1000)],
         }
-    conditions = [("", "0.0"), ("A(1) + B(2)", "0.1 + 0.1"), ("C(3)", "0.5")]
-    evaluate.print_table(list(cells), conditions, cells, episodes=2)
+    conditions = [
+        BASELINE,
+        Configuration.parse("A(1) + B(2)", "0.1 + 0.1"),
+        Configuration.parse("C(3)", "0.5"),
+    ]
+    evaluate.print_table(list(seen), conditions, seen, episodes=2)
     lines = [re.split(r" {2,}", line.strip()) for line in capsys.readouterr().out.splitlines()]
     # sd of (20, 30, 50): sqrt((13.33^2 + 3.33^2 + 16.67^2) / 2); of (1.5, 3.5, -2.5) about 0.833
     assert lines[1] == ["Mean return, tested with A(1) + B(2)"]
@@ -333,7 +337,7 @@ def test_the_table_of_known_returns(capsys):
     assert lines[7] == ["Mean return, tested with C(3)"]
     assert lines[8][-2:] == ["clean", "at 0.5"]
     assert lines[10][-2:] == ["33 ± 15", "-0.8 ± 3.1"]
-    evaluate.print_table(list(cells), conditions[:1], cells, episodes=2)
+    evaluate.print_table(list(seen), conditions[:1], seen, episodes=2)
     alone = capsys.readouterr().out
     assert "tested with" not in alone and alone.splitlines()[0].endswith("clean")
 
@@ -351,36 +355,6 @@ def test_trainings_with_other_settings_are_other_rows_of_the_table(runs, capsys)
         ("PPO", "1"),
         ("TD3", "1"),
     ]
-
-
-@pytest.mark.slow
-def test_all_of_a_folder_with_logs_and_an_analysis(runs, capsys):
-    (runs / "logs").mkdir()
-    (runs / "results").mkdir()
-    (runs / "results" / "report.html").touch()
-    (runs / "choice.csv").touch()
-    options = ["--noises", OBSERVATION, "--noise-rates", "0.5", "1.0", "--episodes", "3"]
-    result = commands.run(evaluate.__file__, [*sorted(runs.iterdir()), *options])
-    assert (result.code, result.err) == (0, "")
-    table = [re.split(r" {2,}", line) for line in result.out.splitlines()]
-    assert [row[1:5] for row in table[4:]] == [
-        ["PPO", "no noise", "0.00", "2"],
-        ["TD3", "no noise", "0.00", "1"],
-        ["SAC", "RandomNormalNoisyReward(0.1)", "0.50", "1"],
-    ]
-    means = []
-    for seed in (1, 2):
-        rows = stored(runs / f"baseline_s{seed}__InvertedPendulum-v5__ppo_continuous_noisy")
-        assert len(rows) == 9
-        means.append(
-            np.mean([float(r["episodic_return"]) for r in rows if r["noise_rate"] == "0.5"])
-        )
-    spread = np.std(means, ddof=1)
-    assert table[4][6] == f"{rounded(np.mean(means), spread)} ± {rounded(spread, spread)}"
-    before = files(runs)
-    main(Args((runs,), (OBSERVATION,), (0.5, 1.0), episodes=3))  # the folder stands for its runs
-    assert capsys.readouterr().out == result.out
-    assert files(runs) == before
 
 
 def test_a_folder_stands_for_its_finished_runs(runs, capsys):
@@ -531,8 +505,6 @@ BAD_RUNS = {
     "policy.pt is not a policy for InvertedPendulum-v5": lambda run_dir: (
         run_dir / "policy.pt"
     ).write_bytes(b"x"),
-    "config.json: args is None": lambda run_dir: (run_dir / "config.json").write_text("{}"),
-    "config.json: algorithm is 'DQN'": lambda run_dir: edit_config(run_dir, algorithm="DQN"),
     "delete that file": lambda run_dir: (run_dir / "robustness.csv").write_text("a,b\n1,2\n"),
     "there is no environment 'Nothing-v0'": lambda run_dir: other_environment(
         run_dir, "Nothing-v0"
@@ -653,14 +625,6 @@ def test_bad_arguments(runs, capsys, options, message):
     refused(Args(**({"runs": (runs,)} | options)), message, runs, capsys)
 
 
-@pytest.mark.parametrize("flag", ["--noise", "--noise-rate"])
-def test_the_flags_of_earlier_versions_name_the_new_ones(flag):
-    command = [sys.executable, str(ROOT / "evaluate.py"), "runs", f"{flag}=1"]
-    result = subprocess.run(command, capture_output=True, text=True)
-    assert (result.returncode, result.stdout) == (2, "")
-    assert result.stderr == f"error: {flag} is {flag}s here: every noise is tested at every rate\n"
-
-
 def test_another_environment(runs, capsys):
     """Its tests stand beside those at home, are not played again, and never mix with them."""
     run_dir = one(runs, "PPO")
@@ -694,12 +658,3 @@ def refused(args, message, runs, capsys):
     assert all(line.startswith("  Random") for line in others)  # the list of the wrappers
     assert bool(others) == ("unknown name" in message)
     assert files(runs) == before
-
-
-@pytest.mark.slow
-def test_help_has_a_sentence_for_every_argument():
-    result = commands.run(evaluate.__file__, ["--help"])
-    assert result.code == 0
-    assert "python evaluate.py runs --video videos" in result.out
-    for name in ("--noise-rate", "--episodes", "--seed", "--jobs", "--render", "--video"):
-        assert name in result.out

@@ -6,11 +6,13 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from test_analyze import SCALE, run, write_run
 
 import analyze
-from analysis.errors import Terminal
+import evaluate
+from analysis.errors import Terminal, with_place
 
 NAME = "naïve |<b>$x$ \u00b1"  # of an experiment
 
@@ -31,6 +33,18 @@ def test_a_reader_that_leaves_stops_nothing():
         for _ in range(10_000):
             print("more than a pipe holds", file=terminal)
         terminal.flush()
+
+
+@pytest.mark.parametrize(
+    ("caller", "place"),
+    [("/my/env.py", r"\(/my/env\.py, line 2"), (evaluate.__file__, "linalg.py")],
+)
+def test_an_error_is_placed_in_the_code_of_a_user(caller, place):
+    """Where nothing of a user's is on the way, in the package that raised it."""
+    with pytest.raises(np.linalg.LinAlgError) as raised:
+        exec(compile("import numpy\nnumpy.linalg.inv(numpy.zeros((2, 2)))", caller, "exec"))
+    assert re.match(f"LinAlgError: Singular matrix .*{place}", with_place(raised.value))
+    assert with_place(raised.value, ValueError) == "Singular matrix"
 
 
 def test_names_are_escaped_in_markdown(tmp_path):

@@ -39,7 +39,7 @@ def test_a_table_is_shown_as_it_is(tmp_path, monkeypatch, capsys):
     assert out == "| b |\n|---|\n| 2 |\n"
 
 
-def test_a_comparison_is_spelled(tmp_path, monkeypatch, capsys):
+def test_a_comparison_has_formats(tmp_path, monkeypatch, capsys):
     text = "n,mean,sd,n_without,mean_without,sd_without,p\n3,1234.56,2,4,-9,1,0.0123\n,,,,,,0.5\n"
     out = shown(text, tmp_path, monkeypatch, capsys).splitlines()
     assert out[0] == "| n | with noise | without | p |"
@@ -48,4 +48,4 @@ def test_a_comparison_is_spelled(tmp_path, monkeypatch, capsys):
 
 
 def test_no_minus_zero():
-    assert show.spell("{a:+z.0f}", {"a": "-0.2"}) == "+0"
+    assert show.formatted("{a:+z.0f}", {"a": "-0.2"}) == "+0"

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from results.study import __main__, baselines, claims, compare, returns
+from results.study import __main__, baselines, claims, compare, physics, returns
 
 NOISE = "RandomNormalNoisyReward(1.0)"
 RESULT = {"train_return_mean_last_100": 0.0}
@@ -24,6 +24,7 @@ def write_run(folder, test, noise="", rate=1.0, seed=1, env_id="Hopper-v5"):
     (path / "result.json").write_text(json.dumps(RESULT | {"final_return_mean": test}))
     rows = f"10,0,-1\n10,1,1\n20,0,{test - 1}\n20,1,{test + 1}\n"
     (path / "eval.csv").write_text("step,episode,episodic_return\n" + rows)
+    return path
 
 
 @pytest.fixture
@@ -51,7 +52,7 @@ def data(tmp_path, monkeypatch):
     ],
 )
 def test_verdicts_have_known_answers(tests, claimed, of, expected):
-    assert compare.verdict(tests, claimed, of) == expected
+    assert compare.judge_claim(tests, claimed, of) == expected
 
 
 @pytest.mark.parametrize(
@@ -142,6 +143,55 @@ def test_reading_runs(data):
     assert list(returns.select(once, "PPO", "Hopper")) == [4, 5]
     assert list(returns.select(once, "PPO", "Hopper", NOISE, "0.01")) == [3]
     assert list(returns.read_returns("a", step=10)["test"]) == [0, 0]
+
+
+def write_physics(folder, env_id, training, seed, final, changed):
+    """Write a run of set D: two episodes of a test, whose mean is `changed` under other physics."""
+    path = write_run(folder, final, training, seed=seed, env_id=env_id)
+    rows = ["noise,noise_rate,episode,episodic_return,episodic_length"]
+    for test, noise in physics.NOISES.items():
+        mean = changed + test - 1 if test in physics.CHANGED else final
+        for episode, offset in enumerate((-1, 1)):
+            rows.append(f'"{noise}",{1.0 if noise else 0.0},{episode},{mean + offset},9')
+        rows.append(f'"{noise}",0.5,0,1e9,9')  # another rate: not in the plan
+    (path / "robustness.csv").write_text("\n".join(rows) + "\n")
+    return path
+
+
+def test_physics(data, tmp_path):
+    """With dynamics in training, 10 less in the clean environment and 50 more in a changed one."""
+    assert physics.tables() == {}
+    gains = {"": (0, 0), physics.DYNAMICS: (-10, 50)} | dict.fromkeys(physics.CHEAP, (0, 40))
+    gains[physics.CHEAP[1]] = 0, 60
+    for env_id, level in {"Hopper-v5": 100, "Pusher-v5": -100}.items():
+        for seed in range(1, 6):
+            for training, (clean, changed) in gains.items():
+                values = level + seed + clean, level + seed + changed
+                path = write_physics(data / "physics", env_id, training, seed, *values)
+        (path / "robustness.csv").unlink()  # of the last training and seed: no whole seed
+    tests = physics.read_tests()
+    assert list(tests.index) == [(e, s) for e in ("Hopper", "Pusher") for s in range(1, 5)]
+
+    shown = physics.by_training(tests).set_index(["environment", "trained with"])
+    assert shown["clean"]["Hopper", "no noise"] == "102.5 ± 1.3" and set(shown["n"]) == {4}
+    assert shown["factor 0.7"]["Pusher", physics.DYNAMICS] == "-47.8 ± 1.3"
+    assert shown["changed physics"]["Pusher", physics.DYNAMICS] == "-47.5 ± 1.3"
+    assert shown["delay 2"]["Hopper", physics.DYNAMICS] == "92.5 ± 1.3"
+
+    clean, gain, more = physics.questions(tests).to_dict("records")
+    without = 102.5, 97.5  # |mean return| without noise
+    assert clean["change_percent"] == pytest.approx(np.mean([-1000 / mean for mean in without]))
+    assert gain["change_percent"] == pytest.approx(np.mean([5000 / mean for mean in without]))
+    assert more["change_percent"] == pytest.approx(0)
+    assert clean["p"] == pytest.approx(2 / 70**2, abs=2e-4) and more["p"] > 0.9
+    assert clean["holm"] == pytest.approx(3 * clean["p"])
+    assert [row["verdict"] for row in (clean, gain, more)] == ["harms", "helps", "undecided"]
+
+    physics.draw(tests, tmp_path / "a.svg")
+    physics.draw(tests, tmp_path / "b.svg")
+    drawn = (tmp_path / "a.svg").read_bytes()
+    assert drawn == (tmp_path / "b.svg").read_bytes()
+    assert b"Hopper" in drawn and b"Pusher" in drawn and b"no noise" in drawn
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ from test_scripts import SCRIPTS, arguments, assert_one_line, evaluations, flags
 
 import evaluate
 import ppo_continuous_noisy as ppo
-from noisy_wrappers import SpaceError
+from noisy_wrappers import NotFiniteError, SpaceError, make_noisy
 
 ROOT = Path(__file__).parents[2]
 HOSTILE = {"env_id": "hostile_envs:Hostile-v0", "noise": (), "noise_rate": ()}
@@ -153,6 +153,16 @@ def test_a_signal_to_the_script_ends_the_episode_and_then_all_processes(
 
 @pytest.mark.slow
 @one_script
+def test_a_signal_that_the_environment_took_over_stops_the_run(algorithm, tmp_path):
+    moment = ("hostile_envs.Hostile.ask", 50, send(signal.SIGTERM, False))
+    process = start(algorithm, tmp_path, moment, env_id="hostile_envs:OwnSignals-v0")
+    result = commands.ended(process)
+    assert (result.code, result.err) == (143, "")
+    assert list(tmp_path.glob("*/checkpoint.pt"))
+
+
+@pytest.mark.slow
+@one_script
 def test_a_signal_to_the_group_ends_all_processes_without_a_traceback(
     algorithm, tmp_path, log, capsys
 ):
@@ -263,9 +273,13 @@ def test_evaluate_plays_the_same_again_and_closes(algorithm, tmp_path, log, caps
         (run_dir / "robustness.csv").unlink()
     assert rows[0] == rows[1]
     assert_closed(log(), number=2 + 2 * 2)
+    with make_noisy(ppo.make_env(ALONE["env_id"]), [], []) as env:
+        policy = lambda observation: np.float32([0.5])  # noqa: E731
+        *_, second = evaluate.play_episodes(env, policy, 2, seed=5)
+        assert evaluate.play_episodes(env, policy, 1, seed=6) == [second]
     (run_dir / "policy.pt").write_bytes(b"damaged")
     assert evaluate.main(evaluate.Args(runs=(run_dir,), episodes=2)) == 2
-    assert_closed(log(), number=7)
+    assert_closed(log(), number=8)
 
 
 # WHAT THE ENVIRONMENT RETURNS, AND WHAT IT IS GIVEN
@@ -301,7 +315,8 @@ def test_a_run_with_other_floats(algorithm, name, tmp_path):
     ("name", "message"),
     [
         ("OfOldAPI", "step 1 of an episode: the environment's step() must return (observation, "),
-        ("ResetOfOldAPI", "step 0 of an episode: the environment's reset() must return (observat"),
+        ("ResetOfOldAPI", "step 0 of an episode: the environment's reset(seed=..., options=...) m"),
+        ("ResetOfNothing", "step 0 of an episode: the environment's reset(seed=..., options=...) "),
         ("OtherShape", "step 1 of an episode: the environment returned an observation of shape ("),
     ],
 )
@@ -309,7 +324,7 @@ def test_a_run_with_other_floats(algorithm, name, tmp_path):
 def test_what_is_not_the_api_is_one_line(algorithm, name, message, tmp_path, log):
     with pytest.raises(SpaceError, match=f"^{re.escape(message)}") as error:
         run(algorithm, tmp_path / "runs", env_id=f"hostile_envs:{name}-v0")
-    assert "expected " in str(error.value) or "(2, 1), and its obs" in str(error.value)
+    assert re.search(r"expected |\(2, 1\), and its obs|argument 'seed'", str(error.value))
     assert_closed(log())
 
 
@@ -319,6 +334,40 @@ def test_what_is_not_the_api_is_no_traceback(algorithm, tmp_path, log):
     result = commands.ended(start(algorithm, tmp_path, env_id="hostile_envs:OtherShape-v0"))
     assert result.code == 1
     assert_one_line(result.err, "training stopped: step 1 of an episode: the environment returned")
+    run_dir = run(algorithm, tmp_path / "runs", **ALONE)
+    words = [run_dir, "--env-id", "hostile_envs:OtherShape-v0"]
+    before = functools.partial(on_its_own, os.environ["HOSTILE_LOG"])
+    result = commands.run(ROOT / "evaluate.py", words, before=before)
+    assert result.code == 1
+    assert_one_line(result.err, "step 1 of an episode: the environment returned an observation of")
+
+
+@pytest.mark.parametrize("name, reward", [("NoReward", "None"), ("TwoRewards", "[1.0, 1.0]")])
+@one_script
+def test_what_is_no_reward_is_one_line(algorithm, name, reward, tmp_path):
+    message = f"step 1 of an episode: the environment returned the reward {reward}"
+    with pytest.raises(NotFiniteError, match=f"^{re.escape(message)}$"):
+        run(algorithm, tmp_path, env_id=f"hostile_envs:{name}-v0")
+
+
+@one_script
+def test_an_info_may_be_none(algorithm, tmp_path):
+    run(algorithm, tmp_path, env_id="hostile_envs:NoInfo-v0")
+
+
+@one_script
+def test_what_cannot_be_closed_has_been_trained_in(algorithm, tmp_path):
+    with pytest.warns(UserWarning, match=r"closing the environment failed: OSError\('no window'\)"):
+        run_dir = run(algorithm, tmp_path, env_id="hostile_envs:BadClose-v0")
+    assert (run_dir / "result.json").exists()
+
+
+@pytest.mark.slow
+@one_script
+def test_what_the_environment_compiles_is_no_reason_to_start_again(algorithm, tmp_path):
+    result = commands.ended(start(algorithm, tmp_path, env_id="hostile_envs:OwnCompiler-v0"))
+    assert result.code == 1 and "Unsupported: a graph of its own" in result.err
+    assert "starting again" not in result.out
 
 
 # NO TIME LIMIT

@@ -353,17 +353,6 @@ def test_the_default_frequency_of_a_long_run_is_that_of_the_paper(algorithm):
     assert (50_000 if algorithm == "PPO" else 10_000) == SCRIPTS[algorithm].EVAL_FREQUENCY
 
 
-@one_script
-def test_a_folder_of_version_0_1_is_known(algorithm, tmp_path, capsys):
-    folder = run(algorithm, tmp_path)
-    exp_name = SCRIPTS[algorithm].Args.exp_name
-    old = folder.rename(tmp_path / f"toy_envs--Tiny-v0__{exp_name}__baseline__1")
-    capsys.readouterr()
-    run(algorithm, tmp_path)
-    assert capsys.readouterr().out.startswith(f"{old} is finished: mean test return ")
-    assert list(tmp_path.iterdir()) == [old]
-
-
 @pytest.mark.parametrize("content", ["", "{}", "[]", '{"final_return_mean": 1'])
 @one_script
 def test_a_result_that_cannot_be_read_is_no_result(algorithm, content, tmp_path, capsys):
@@ -611,9 +600,13 @@ def test_rewards_of_shape_1_are_numbers(algorithm, tmp_path):
 @one_script
 def test_a_time_limit_of_ones_own(algorithm, tmp_path, capsys):
     limit = {"env_id": "toy_envs:Endless-v0", "max_episode_steps": 5}
-    run_dir = run(algorithm, tmp_path, **limit)
+    run_dir = run(
+        algorithm, tmp_path, **limit, noise=("RandomEarlyTermination(6)",), noise_rate=(1,)
+    )
     assert {row[2:] for row in evaluations(run_dir)} == {(5.0, 5)}
-    assert "time limit" not in capsys.readouterr().out
+    said = capsys.readouterr()
+    note = "RandomEarlyTermination(6) never acts: episodes have at most 5 steps"
+    assert said.out.splitlines()[0] == note and "time limit" not in said.out and not said.err
     assert json.loads((run_dir / "config.json").read_text())["args"]["max_episode_steps"] == 5
     run(algorithm, tmp_path / "none", env_id="toy_envs:NoLimit-v0")
     assert capsys.readouterr().out.count("toy_envs:NoLimit-v0 declares no time limit") == 1

@@ -1,6 +1,8 @@
 """The choice of a noise, with training replaced by returns that are known."""
 
+import contextlib
 import csv
+import io
 import math
 import multiprocessing
 import os
@@ -23,7 +25,7 @@ from sweep.halving import (
     compare,
     fewest_seeds,
     helps,
-    rows,
+    records,
     schedule,
     score,
     sentence,
@@ -121,7 +123,7 @@ def test_every_choice_takes_the_announced_number_of_runs(count):
 
 def test_a_planted_noise_is_found_and_confirmed():
     rng = np.random.default_rng(0)
-    for _ in range(50):
+    for _ in range(10):
         effects = np.zeros(90)
         best = rng.integers(90)
         effects[best] = 1.5  # five standard deviations of a seed
@@ -129,17 +131,6 @@ def test_a_planted_noise_is_found_and_confirmed():
         assert state.noises == [named(90)[best]]
         comparison = compare(state.noises[0], state.seeds, returns)
         assert helps(comparison, comparison.p)
-
-
-@pytest.mark.slow
-def test_useless_noises_are_rarely_taken_for_better():
-    rng = np.random.default_rng(0)
-    claims = 0
-    for _ in range(400):
-        state, returns = play(named(90), 270, draw(rng, np.zeros(90)))
-        comparison = compare(state.noises[0], state.seeds, returns)
-        claims += helps(comparison, comparison.p)
-    assert 1 <= claims <= 18  # 2.5 % of 400 are 10; 4.5 % are 18
 
 
 def test_the_choice_is_as_good_as_a_grid_of_ten_seeds():
@@ -153,7 +144,7 @@ def test_the_choice_is_as_good_as_a_grid_of_ten_seeds():
     assert effects[numbers, chosen].mean() >= effects[numbers, grid].mean()
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 10, 90])
+@pytest.mark.parametrize("count", [1, 3, 90])
 def test_the_simulation_searches_by_the_rule(count):
     rng = np.random.default_rng(count)
     tables = [draw(rng, rng.normal(0, 0.3, count)) for _ in range(40)]
@@ -187,8 +178,7 @@ def test_the_default_finds_and_confirms_what_docs_say(noises):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("draw", ["normal", "high_peak", "failing"])
-@pytest.mark.parametrize("spread", [1, 0.5, 2])
+@pytest.mark.parametrize(("draw", "spread"), [("normal", 1), ("high_peak", 0.5), ("failing", 2)])
 def test_useless_noises_are_claimed_to_help_in_at_most_four_percent(draw, spread):
     """Also where they change the spread of the returns."""
     draw = getattr(simulate_choose, draw)
@@ -197,13 +187,11 @@ def test_useless_noises_are_claimed_to_help_in_at_most_four_percent(draw, spread
     assert abs(draw(np.random.default_rng(0), 10**6).mean()) < 0.005
 
 
-@pytest.mark.parametrize("noises", [1, 4, 10])
-def test_few_noises_are_chosen_no_worse_than_with_equal_rounds_and_ten_fresh_seeds(noises):
-    before = simulate_choose.equal_shares(noises, 3 * noises)
+def test_few_noises_are_chosen_no_worse_than_with_equal_rounds_and_ten_fresh_seeds():
+    now, before = schedule(4, 12), simulate_choose.equal_shares(4, 12)
     for gain in (1.0, 1.5, 2.0):
-        _, old, _ = simulate_choose.simulate(noises, before, 10, gain, trials=4000)
-        now = schedule(noises, 3 * noises)
-        assert simulate_choose.simulate(noises, now, 25, gain, trials=4000)[1] > old
+        _, old, _ = simulate_choose.simulate(4, before, 10, gain, trials=4000)
+        assert simulate_choose.simulate(4, now, 25, gain, trials=4000)[1] > old
 
 
 def test_a_run_scores_the_mean_of_its_tests_in_the_last_15_percent():
@@ -275,7 +263,6 @@ def test_verdicts_in_words():
     ("baseline", "expected"),
     [
         ([8.0, 9.0, 11.0, 12.0], "+3.5 (+35 %), p = 0.057 (smallest possible: 0.029); with 4"),
-        ([0.0, 0.0, 0.0, 0.0], "beats no noise: 4 fresh seeds, +13.50, p = 0.029 (smallest"),
         ([-1e-6, 0.0, 1e-6, 0.0], "beats no noise: 4 fresh seeds, +13.50, p = 0.029 (smallest"),
         ([-12.0, -13.0, -14.0, -15.0], "+27.0 (+200 %), p = 0.029"),
     ],
@@ -290,10 +277,10 @@ def test_a_comparison_by_hand(baseline, expected):
     assert expected in sentence("PPO on X", noise, 2, found, found.p, 1)
 
 
-def test_rows_of_choice_csv():
+def test_records_of_choice_csv():
     table = np.arange(4.0)[:, None] + np.zeros(SEARCH_SEEDS + CONFIRM)
     state, returns = play(named(3), 3, table)
-    lines = rows("PPO", "X", state, returns, helped=False)
+    lines = records("PPO", "X", state, returns, helped=False)
     assert [list(line) for line in lines] == [CHOICE_COLUMNS] * len(lines)
     search = "PPO X search"
     assert [" ".join(str(value) for value in line.values()) for line in lines] == [
@@ -318,10 +305,10 @@ def arguments(text, tmp_path):
 
 
 def conclude(args, folder):
-    """What `report` does with a choice that is over: write choice.csv, and say the verdicts."""
-    found = choose.choices(args)
-    choose.write_choice(folder / "choice.csv", choose.rows(found))
-    return list(choose.conclusion(found))
+    """What `report` does with a choice: write choice.csv, and say the verdicts, line by line."""
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        choose.report(choose.choices(args), folder / "choice.csv")
+    return out.getvalue().splitlines()
 
 
 def batches(args):
@@ -504,6 +491,10 @@ def test_what_the_confirmation_can_show(tmp_path):
     ).groups()
     assert line.startswith("PPO on Pendulum-v1: 5 fresh seeds confirm a true gain of about ")
     assert float(gain) == pytest.approx(spread * float(units), rel=0.06)
+    [choice] = choose.choices(arguments(two, tmp_path))
+    for run in map(choice.runs.get, choice.state.due[:4]):  # fresh seeds change nothing about it
+        stub_run.train([run.script, *run.arguments])
+    assert lines(two) == [line]
 
 
 def test_a_second_choice_takes_the_same_fresh_seeds(tmp_path):
@@ -589,4 +580,4 @@ def test_status_says_who_survives(tmp_path, monkeypatch):
     [verdict] = choose.standing(finished, args)
     assert verdict.startswith("PPO on Pendulum-v1: ") and "4 fresh seeds" in verdict
     assert not (tmp_path / "choice.csv").exists()  # the status only looks
-    assert [verdict] == list(choose.conclusion(finished))
+    assert [verdict] == conclude(args, tmp_path)

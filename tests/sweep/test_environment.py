@@ -3,8 +3,10 @@
 import contextlib
 import json
 import re
+import shlex
 
 import pytest
+import stub_run
 import toy_envs
 from views import view
 
@@ -198,7 +200,7 @@ def test_runs_at_a_time(executor, jobs, hosts, expected, monkeypatch):
 
 def test_a_plan_says_what_it_will_decide(tmp_path):
     shown = choose("Slow", "--runs-dir", tmp_path)
-    speed, left_out, question, first, total, reach, place = shown.err.splitlines()
+    speed, left_out, question, first, total, gain, place = shown.err.splitlines()
     assert "RandomDynamics" in left_out
     milliseconds = float(re.fullmatch(r"toy_envs:Slow-v0: ([\d.]+) ms a step", speed)[1])
     assert question.startswith("PPO on toy_envs:Slow-v0: is the best of 18 noises better than no ")
@@ -208,7 +210,7 @@ def test_a_plan_says_what_it_will_decide(tmp_path):
     # with 20 tests of ten episodes of 100 steps, and learning
     assert hours == pytest.approx(99 * (1.02e6 * milliseconds / 1000 + 114) / 3600, rel=0.06)
     assert clock == pytest.approx(hours / 2, rel=0.02)
-    assert reach.startswith("25 fresh seeds confirm a true gain of 0.8 standard deviations")
+    assert gain.startswith("25 fresh seeds confirm a true gain of 0.8 standard deviations")
     assert place == f"runs, logs and the verdict are stored in {tmp_path}"
 
 
@@ -247,6 +249,17 @@ def test_a_status_makes_no_environment(tmp_path, monkeypatch):
     monkeypatch.setattr(environment, "ask", None)
     shown = choose("Tiny", *words, view_name="status").out
     assert "8 of 8 noises" in shown and "core-hours are left" in shown
+
+
+def test_a_choice_that_has_begun_is_not_asked_again(tmp_path, monkeypatch):
+    words = ["--runs-dir", tmp_path, "--noises", f"{SCALE}@1", "--confirm", "4"]
+    words += ["--total-timesteps", "4000"]
+    command = choose("Tiny", *words).out.splitlines()[0].split("\t")[2]
+    stub_run.train(shlex.split(command[command.index("ppo_") :]))  # it says that it took 36 seconds
+    monkeypatch.setattr(environment, "ask", None)
+    shown = choose("Tiny", *words)
+    assert shown.code == 0
+    assert "1 are done, about 0.07 core-hours are left" in shown.err
 
 
 def test_what_cannot_be_read_is_asked_again(tmp_path):

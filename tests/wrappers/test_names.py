@@ -13,8 +13,8 @@ from noisy_wrappers import (
     WRAPPERS,
     canonical_env_id,
     canonical_noises,
+    reason,
     refusals,
-    run_folder,
     run_name,
 )
 from sweep.grid import NOISES as NOISES_OF_THE_PAPER
@@ -48,18 +48,6 @@ def test_31_characters_of_a_name_tell_rate_seed_and_kind(noise, seed):
     assert (rate, shown_seed) == ("p0.01", f"s{seed}")
     [kind] = [kind for kind in kinds if text.startswith(kind) or kind.startswith(text)]
     assert noise.startswith(f"Random{kind}(")
-
-
-def test_a_folder_of_version_0_1_is_found(tmp_path):
-    run = ("ALE/Pong-v5", "x", [A, C], ["1:0", 0.5], 3)
-    new = tmp_path / "p0.5+1.0to0.0_s3_EarlyTermination_9+NormalNoisyReward_1.0__ALE-Pong-v5__x"
-    assert run_folder(tmp_path, *run) == new
-    name = "ALE-Pong-v5__x__RandomEarlyTermination_9_p0.5+RandomNormalNoisyReward_1.0_p1.0to0.0__3"
-    (tmp_path / name).mkdir()
-    assert run_folder(tmp_path, *run) == tmp_path / name
-    (tmp_path / "Hopper-v5__x__baseline__1").mkdir()
-    found = run_folder(str(tmp_path), "Hopper-v5", "x", [], [], 1)
-    assert found == tmp_path / "Hopper-v5__x__baseline__1"
 
 
 def test_long_run_names_fit_into_a_file_system():
@@ -169,3 +157,15 @@ def test_an_assertion_is_a_refusal_only_of_a_package_that_asserts_its_versions()
     gym.register("Own-v0", "my_envs:Env")
     assert AssertionError in refusals("Asserting-v0")
     assert not {AssertionError, ImportError} & set(refusals("my_envs:Own-v0"))
+
+
+def test_an_assertion_without_words_is_told_with_versions(monkeypatch):
+    assert reason(AssertionError()) == "AssertionError"
+    monkeypatch.setitem(sys.modules, "gymnasium_robotics", sys)
+    monkeypatch.setattr(
+        "importlib.metadata.version", {"gymnasium-robotics": "1.4", "mujoco": "3.15"}.get
+    )
+    told = reason(AssertionError())
+    assert told.startswith("gymnasium-robotics 1.4 and mujoco 3.15 do not work together")
+    assert 'pip install "mujoco<3.12"' in told and "\n" not in told
+    assert reason(AssertionError("its own words")) == "its own words"

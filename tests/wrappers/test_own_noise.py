@@ -86,9 +86,19 @@ def test_it_is_a_wrapper_like_the_others(folder):
         (
             "my_noises:Strict(1)",
             "class Strict(NoiseWrapper):\n"
+            "    kind = 'action'\n"
             "    def __init__(self, env, noise_rate, x):\n"
             "        raise ValueError('x is bad')",
             "x is bad",
+        ),
+        ("my_noises:StickyAction(longest)", "", "expected Name(number, ..., keyword=value)"),
+        ("my_noises:Vague(1)", "class Vague(NoiseWrapper): pass", "Vague.kind must be one of"),
+        (
+            "my_noises:Forgetful(1)",
+            "class Forgetful(StickyAction):\n"
+            "    def __init__(self, env, noise_rate, x):\n"
+            "        super().__init__(env, noise_rate, longest=x)",
+            "must pass x on: super().__init__(env, noise_rate, x=x)",
         ),
     ],
 )
@@ -133,6 +143,18 @@ def test_a_sweep_and_a_test_from_the_folder_of_the_noise(folder):
     rows = list(csv.DictReader((noisy.parent / "robustness.csv").open()))
     assert {row["noise"] for row in rows} == {"", TEXT}
     assert np.isfinite([float(row["episodic_return"]) for row in rows]).all()
+
+
+def test_a_noise_without_arguments_needs_no_constructor(folder):
+    (folder / "my_noises.py").write_text(
+        "from noisy_wrappers import *\n\n\n"
+        "class Doubled(ObservationNoise):\n"
+        "    def _perturb(self, observation):\n"
+        "        return 2 * observation\n"
+    )
+    assert str(parse_noise("my_noises:Doubled()")) == "my_noises:Doubled()"
+    # one of this project's has one name, wherever it comes from
+    assert str(parse_noise("my_noises:RandomActionDelay(1)")) == "RandomActionDelay(1)"
 
 
 def test_the_observation_and_reward_bases_are_for_everybody(folder):
