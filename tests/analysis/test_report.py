@@ -168,6 +168,26 @@ def test_an_empty_section_is_left_out(tmp_path):
     assert "None." not in page
 
 
+def test_a_single_run_has_no_empty_section(tmp_path):
+    write_run(tmp_path / "runs", [10.0])
+    run(tmp_path, drawn=True)
+    page = (tmp_path / "results/report.html").read_text()
+    sections = re.findall(r'<section id="(\w+)">', page)
+    assert sections == ["verdict", "early_performance", "summary", "how"]
+
+
+def test_the_counts_at_the_top_are_those_of_the_list(tmp_path):
+    for env in ("Hopper-v5", "Pusher-v5"):
+        for seed in range(5):
+            write_run(tmp_path / "runs", [100 + seed], env=env, seed=seed)
+            write_run(tmp_path / "runs", [130 + seed], env=env, seed=seed, noise=SCALE, rate=0.1)
+    run(tmp_path)
+    page = (tmp_path / "results/report.html").read_text()
+    top, listed = page.split("</h1>")[1].split("<ul>", 1)
+    assert "3 comparisons (1 noise in 2 environments, 1 in all environments together)" in top
+    assert "3 better" in top and listed.split("</ul>")[0].count("<li>") == 3
+
+
 def test_of_many_versions_is_said_at_the_end(tmp_path):
     for seed in (1, 2):
         write_run(tmp_path / "runs", [seed], seed=seed, versions={"mujoco": f"3.{seed}.0"})

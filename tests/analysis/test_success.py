@@ -4,6 +4,7 @@ import json
 import re
 
 import numpy as np
+import pandas as pd
 import pytest
 import tyro
 from test_analyze import SCALE, row, run, write_run
@@ -14,6 +15,7 @@ import evaluate
 import ppo_continuous_noisy as ppo
 
 ENV = "FetchReach-v4"
+PUSH, OTHER = "RandomNormalNoisyAction(0.3)", "RandomNormalNoisyObservation(0.1)"
 
 
 def write_success(root, rates, env=ENV, **config):
@@ -85,8 +87,10 @@ def test_returns_that_are_all_equal_say_nothing(tmp_path, capsys):
     assert "no environment here tells it" in capsys.readouterr().err
 
 
-def test_evaluate_stores_success(tmp_path, capsys):
-    words = ["--env-id", "toy_envs:IsSuccess-v0", "--runs-dir", str(tmp_path), "--no-compile"]
+@pytest.mark.parametrize("env_id", ["toy_envs:IsSuccess-v0", "toy_envs:Success-v0"])
+def test_evaluate_stores_success(env_id, tmp_path, capsys):
+    """And analyze.py judges by what the scripts and evaluate.py have written."""
+    words = ["--env-id", env_id, "--runs-dir", str(tmp_path), "--no-compile"]
     words += ["--total-timesteps", "24", "--num-steps", "12", "--num-minibatches", "3"]
     assert ppo.train(tyro.cli(ppo.Args, args=words))
     [run_dir] = tmp_path.iterdir()
@@ -95,7 +99,7 @@ def test_evaluate_stores_success(tmp_path, capsys):
     header, *lines = (run_dir / "robustness.csv").read_text().splitlines()
     assert header == "noise,noise_rate,episode,episodic_return,episodic_length,success"
     solved = [int(line.rpartition(",")[2]) for line in lines]
-    env, expected = ppo.make_env("toy_envs:IsSuccess-v0"), []
+    env, expected = ppo.make_env(env_id), []
     for episode in range(6):
         env.reset(seed=2_000_000 + episode)
         expected.append(int(env.unwrapped.solved))
@@ -105,3 +109,52 @@ def test_evaluate_stores_success(tmp_path, capsys):
     evaluate.main(args)
     assert (run_dir / "robustness.csv").read_bytes() == before
     assert json.loads((run_dir / "result.json").read_text())["final_success_rate"] >= 0
+    analyze.main(analyze.Args(tmp_path, metric="success_rate"))
+    table = pd.read_csv(tmp_path / "results/robustness.csv")
+    assert table["mean"].item() == pytest.approx(100 * np.mean(solved))
+
+
+def test_robustness_is_judged_by_success(tmp_path, capsys):
+    """In percentage points, never in percent of a rate, and only where the environment tells it."""
+    root = tmp_path / "runs"
+    write_success(root, [0.5] * 5)
+    write_success(root, [0.5] * 5, noise=SCALE, rate=1.0)
+    header = "noise,noise_rate,episode,episodic_return,episodic_length,success\n"
+    for noise, solved in (("", 2), (SCALE, 4)):
+        for folder in root.iterdir():
+            if (SCALE in folder.name) == bool(noise):
+                text = "".join(f",0.0,{i},-50.0,9,1\n" for i in range(5))
+                seed = int(folder.name[-1])
+                rows = [int(i < solved + (seed == 1)) for i in range(5)]
+                text += "".join(f"{PUSH},1.0,{i},-50.0,9,{told}\n" for i, told in enumerate(rows))
+                text += f"{OTHER},1.0,0,-50.0,9,\n"  # there the environment told nothing
+                (folder / "robustness.csv").write_text(header + text)
+    analyze.main(analyze.Args(root, tmp_path / "out", metric="success_rate"))
+    said = capsys.readouterr().out
+    assert f"trained with {SCALE} at rate 1.00: more robust to new noise (+40 [" in said
+    assert "] percentage points of success, p = 0.0079" in said
+    scores = pd.read_csv(tmp_path / "out/robustness_score.csv")
+    assert scores["difference"].tolist() == [40] and scores["conditions"].tolist() == [1]
+    assert scores.filter(regex="percent$").isna().all(axis=None)
+    table = pd.read_csv(tmp_path / "out/robustness.csv")
+    assert table["mean"].tolist() == [100, 44, 100, 84] and table["cvar"].isna().all()
+    page = (tmp_path / "out/report.html").read_text()
+    assert (
+        "in percentage points. A dot marks" in page and "the mean success rate under noise" in page
+    )
+
+
+def test_all_runs_may_solve_the_task(tmp_path, capsys):
+    """That is no sign that nothing was learned."""
+    for rate, told in ((1, "all runs solve the task in every test"), (0, "no run ever solves the")):
+        root = tmp_path / f"{rate}"
+        for noise in ({}, {"noise": SCALE, "rate": 1.0}):
+            write_success(root, [rate] * 3, **noise)
+        for path in root.glob("*/eval.csv"):
+            header, *lines = path.read_text().splitlines()
+            lines = [f"{line[:-1]}{rate}" for line in lines]
+            path.write_text("\n".join([header, *lines]) + "\n")
+        analyze.main(analyze.Args(root, root / "out", metric="success_rate"))
+        said = capsys.readouterr().out
+        assert f"{told}" in said and "so they say nothing about noise" in said
+        assert "learned" not in said
