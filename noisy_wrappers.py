@@ -1902,7 +1902,7 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return observation, number, bool(terminated), bool(truncated), info
 
     def close(self) -> None:
-        """Close the environment; a warning says if it cannot be, but what it has done stays done."""
+        """Close the environment; a warning says if that fails, for the work is done by then."""
         try:
             self.env.close()
         except Exception as error:
@@ -1925,11 +1925,11 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return _replaced(observation, parts) if parts else observation
 
     def _refuse_old_api(self, wanted: str, error: Exception) -> None:
-        """Raise SpaceError if a wrapper, not the environment's own code, could not call or unpack."""
+        """Raise SpaceError if it was a wrapper, not the environment's code, that failed so."""
         *_, (frame, _) = traceback.walk_tb(error.__traceback__)
         place = frame.f_globals.get("__name__", "")
         is_old = re.search("unpack|unexpected keyword", str(error))
-        if is_old and place.startswith(("gymnasium.wrappers.", __name__)):
+        if is_old and place.startswith(("gymnasium.core", "gymnasium.wrappers.", __name__)):
             at = f"step {self._steps} of an episode"
             raise SpaceError(f"{at}: the environment's {wanted}: {error}") from error
 
