@@ -103,6 +103,7 @@ __all__ = [
     "rate_order",
     "reason",
     "refusals",
+    "remarks",
     "reset_worker_signals",
     "rounded",
     "run_name",
@@ -1902,7 +1903,7 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return observation, number, bool(terminated), bool(truncated), info
 
     def close(self) -> None:
-        """Close the environment; a warning says if that fails, for the work is done by then."""
+        """Close the environment; warn if that fails, because what was trained in it is valid."""
         try:
             self.env.close()
         except Exception as error:
@@ -1925,7 +1926,7 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return _replaced(observation, parts) if parts else observation
 
     def _refuse_old_api(self, wanted: str, error: Exception) -> None:
-        """Raise SpaceError if it was a wrapper, not the environment's code, that failed so."""
+        """Raise SpaceError if a wrapper, not the environment's code, failed to call or unpack."""
         *_, (frame, _) = traceback.walk_tb(error.__traceback__)
         place = frame.f_globals.get("__name__", "")
         is_old = re.search("unpack|unexpected keyword", str(error))
@@ -1992,6 +1993,17 @@ def into_space(action: NDArray[Any], space: gym.spaces.Box) -> NDArray[Any]:
     """
     # in this order, because the cast may round a bound up
     return action.astype(space.dtype).clip(space.low, space.high)
+
+
+def remarks(env_id: str, env: Env, step_limit: int) -> list[str]:
+    """Return what is worth knowing before training in a :func:`make_flat` environment."""
+    found = []
+    if not isinstance(env.unwrapped.observation_space, gym.spaces.Box):
+        found.append(f"{env_id}: observations are flattened to {env.observation_space}")
+    registered = gym.spec(env_id.rpartition(":")[2]).max_episode_steps
+    if registered is None and env.spec and env.spec.max_episode_steps == step_limit:
+        found.append(f"{env_id} declares no time limit, so --max-episode-steps is {step_limit:,}")
+    return found
 
 
 def canonical_env_id(env_id: str) -> str:
@@ -2182,10 +2194,10 @@ class EnvState:
         self.generators = generators
 
     def _generators(self) -> list[Any]:
-        environment, actions = self.env.unwrapped.np_random, self.env.action_space.np_random
-        # of Python's own or of PyTorch's generators, the environment may be the only owner
-        known = isinstance(environment, np.random.Generator | np.random.RandomState)
-        return [*[environment] * known, actions, *self.generators]
+        found = [self.env.unwrapped.np_random, self.env.action_space.np_random, *self.generators]
+        # an environment may have put a generator of another library there, or a module
+        of_numpy = np.random.Generator | np.random.RandomState
+        return [generator for generator in found if isinstance(generator, of_numpy)]
 
     def _returns(self) -> deque[float]:
         recorded = self.env.has_wrapper_attr("return_queue")

@@ -42,7 +42,7 @@ from tqdm import tqdm
 
 import noisy_wrappers as noisy
 
-TEST_SEED = 1_000_000  # of the first test episode; the same in every run and evaluation
+TEST_SEED = 1_000_000  # of the first test episode; the same in every test of every run
 STEP_LIMIT = 10_000  # of an episode, where neither the environment nor the user sets one
 EVAL_FREQUENCY = 50_000  # default of --eval-frequency; at most a tenth of the run
 
@@ -453,17 +453,11 @@ def make_envs(args):
     limit = {"max_episode_steps": args.max_episode_steps}
     noisy.seed_globals(args.seed)
     with make_env(env_id, **limit) as test_env, make_env(env_id, **limit) as env:
-        with (
-            fail_on(ValueError, f"--noise in {env_id}"),
-            warnings.catch_warnings(record=True) as notes,
-        ):
+        caught = warnings.catch_warnings(record=True)
+        with fail_on(ValueError, f"--noise in {env_id}"), caught as notes:
             env = noisy.make_noisy(env, noise, noise_rate)
-        for note in notes:
-            say(f"note: {note.message}")
-        if not isinstance(env.unwrapped.observation_space, gym.spaces.Box):
-            say(f"{env_id}: observations are flattened to {test_env.observation_space}")
-        if not (args.max_episode_steps or gym.spec(env_id.rpartition(":")[2]).max_episode_steps):
-            say(f"{env_id} declares no time limit, so --max-episode-steps is {STEP_LIMIT:,}")
+        for text in [note.message for note in notes] + noisy.remarks(env_id, test_env, STEP_LIMIT):
+            say(text)
         yield replace(args, env_id=env_id, noise=noise, noise_rate=noise_rate), env, test_env
 
 

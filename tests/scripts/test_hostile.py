@@ -279,8 +279,7 @@ def test_evaluate_plays_the_same_again_and_closes(algorithm, tmp_path, log, caps
         (run_dir / "robustness.csv").unlink()
     assert rows[0] == rows[1]
     assert_closed(log(), number=2 + 2 * 2)
-    with ppo.make_env(ALONE["env_id"]) as env:
-        env = make_noisy(env, (), ())
+    with make_noisy(ppo.make_env(ALONE["env_id"]), [], []) as env:
         *_, second = evaluate.play_episodes(env, half, 2, seed=5)
         assert evaluate.play_episodes(env, half, 1, seed=6) == [second]
     (run_dir / "policy.pt").write_bytes(b"damaged")

@@ -605,7 +605,7 @@ def test_a_time_limit_of_ones_own(algorithm, tmp_path, capsys):
     )
     assert {row[2:] for row in evaluations(run_dir)} == {(5.0, 5)}
     said = capsys.readouterr()
-    note = "note: RandomEarlyTermination(6) never acts: episodes have at most 5 steps"
+    note = "RandomEarlyTermination(6) never acts: episodes have at most 5 steps"
     assert said.out.splitlines()[0] == note and "time limit" not in said.out and not said.err
     assert json.loads((run_dir / "config.json").read_text())["args"]["max_episode_steps"] == 5
     run(algorithm, tmp_path / "none", env_id="toy_envs:NoLimit-v0")
