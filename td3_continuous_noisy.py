@@ -523,7 +523,7 @@ class Run:
             result, _, self.checkpoint, *_ = ours = [self.folder / name for name in self.FILES]
             old = [path.with_suffix(".tmp") for path in ours]  # of a process that was killed
             if args.overwrite:
-                old += [*ours, self.folder / "robustness.csv", *self.folder.glob(self.EVENTS)]
+                old += [*ours, self.folder / "robustness.csv"]  # events: see resume()
             for path in old:
                 path.unlink(missing_ok=True)
         self.is_finished = result.exists()

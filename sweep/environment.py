@@ -59,9 +59,9 @@ def ask(env_id, configurations=(), max_episode_steps=None, clock=time.perf_count
     try:
         with contextlib.redirect_stdout(sys.stderr), contextlib.ExitStack() as stack:
             env = gym.make(env_id, disable_env_checker=True, max_episode_steps=max_episode_steps)
-            stack.callback(env.close)
             declared = env.spec.max_episode_steps
             env = noisy.make_flat(env, constant("sac_continuous_noisy.py", "STEP_LIMIT"))
+            stack.callback(env.close)
             limit = env.spec.max_episode_steps
             seconds, steps, length = time_steps(env, limit, deadline, clock)
             env.reset()  # a failure after this one is the noise's
