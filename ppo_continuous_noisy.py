@@ -610,7 +610,7 @@ class Run:
             columns = {name: getattr(self.args, name) for name in ("env_id", "exp_name", "seed")}
             columns["noise"] = " + ".join(self.args.noise) or "none"
             columns["noise_rate"] = " + ".join(map(str, self.args.noise_rate)) or "none"
-            metrics = "eval/episodic_return_mean", "eval/success_rate", "charts/episodic_return"
+            metrics = "eval/episodic_return_mean", "charts/episodic_return", "eval/success_rate"
             for summary in hparams(columns, dict.fromkeys(metrics, 0))[:2]:
                 self.writer.file_writer.add_summary(summary)
         self.first_step, self.first_time = step, time.monotonic() - 1e-6
