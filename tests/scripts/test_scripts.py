@@ -1147,7 +1147,7 @@ def test_tensorboard_knows_the_hyperparameters(tensorboard, three_runs):
     columns = [info["name"] for info in experiment["hparamInfos"]]
     assert set(columns) == {"env_id", "exp_name", "noise", "noise_rate", "seed"}
     metrics = [info["name"]["tag"] for info in experiment["metricInfos"]]
-    assert metrics == ["eval/episodic_return_mean", "eval/success_rate", "charts/episodic_return"]
+    assert metrics == ["eval/episodic_return_mean", "charts/episodic_return", "eval/success_rate"]
     for group in groups:
         noise = "RandomEarlyTermination(2, 4) + RandomNormalNoisyReward(0.5)"
         assert group["hparams"]["noise"] == noise
