@@ -766,9 +766,10 @@ def test_a_finished_run_says_so_and_changes_nothing(algorithm, alone, tmp_path):
     assert files(path) == before
 
 
+@pytest.mark.parametrize("env_id", ["toy_envs:IsSuccess-v0", "toy_envs:Success-v0"])
 @one_script
-def test_success_survives_an_interruption(algorithm, tmp_path):
-    small = {"env_id": "toy_envs:IsSuccess-v0", "noise": NOISE[3:4], "rates": RATES[3:4]}
+def test_success_survives_an_interruption(algorithm, env_id, tmp_path):
+    small = {"env_id": env_id, "noise": NOISE[3:4], "rates": RATES[3:4]}
     found = []
     for name, stops in (("whole", []), ("stopped", [LATE])):
         words = options(algorithm, tmp_path / name, **small)

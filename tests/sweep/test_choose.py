@@ -374,8 +374,8 @@ THREE = "RandomMixupObservation(0.5) | RandomDropoutObservation(0.9)"
 THREE = f"--noise-rates | 1 | --confirm | 5 | --noises | {A} | {THREE}"
 
 
-def test_a_noise_is_chosen_by_the_rate_of_success(tmp_path):
-    env_id = "toy_envs:IsSuccess-v0"
+@pytest.mark.parametrize("env_id", ["toy_envs:IsSuccess-v0", "toy_envs:Success-v0"])
+def test_a_noise_is_chosen_by_the_rate_of_success(env_id, tmp_path):
     text = f"--algos | ppo | --envs | {env_id} | --metric | success_rate | {THREE}"
     args = arguments(text, tmp_path)
     batches(args)
