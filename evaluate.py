@@ -64,6 +64,7 @@ from noisy_wrappers import (
     NotFiniteError,
     SpaceError,
     canonical_env_id,
+    module_path,
     outcome,
     rounded,
     seed_globals,
@@ -216,10 +217,7 @@ def refuse_foreign_module(run, name):
     module, colon, _ = name.partition("(")[0].rpartition(":")
     first, *rest = module.strip().split(".")
     here, project = Path.cwd(), Path(__file__).resolve().parent
-    # the import looks in this order; asking executes nothing
-    others = [entry for entry in sys.path if entry not in (str(here), str(project))]
-    path = [*([str(here)] if here != project else []), *others, str(project)]
-    spec = PathFinder.find_spec(first, path) if colon else None
+    spec = PathFinder.find_spec(first, module_path()) if colon else None  # executes nothing
     folder, runs_dir = folders_of_runs(run)
     for found in (spec.submodule_search_locations or [spec.origin]) if spec else ():
         entry = Path(found).parent.resolve()

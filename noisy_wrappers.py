@@ -94,6 +94,7 @@ __all__ = [
     "into_space",
     "make_flat",
     "make_noisy",
+    "module_path",
     "noise_slug",
     "noise_statistics",
     "noise_wrappers",
@@ -1789,14 +1790,20 @@ def _without_arrays(value: Any) -> Any:
 # ---------------------------------------------------------------------------- modules of the user's
 
 
+def module_path() -> list[str]:
+    """Return where a user's modules are looked for: the current folder first, this file's last."""
+    here, caller = str(Path(__file__).parent), os.getcwd()
+    others = [folder for folder in sys.path if folder not in (here, caller)]
+    return [*others, here] if caller == here else [caller, *others, here]
+
+
 def _import_module(module: str, problem: str) -> None:
-    """Import a module of the user's, as if this file's folder came last.
+    """Import a module of the user's, from :func:`module_path`.
 
     ``problem`` is what an error says first, as "there is no environment 'a:b'".
     """
-    here, caller, path = str(Path(__file__).parent), os.getcwd(), sys.path[:]
-    others = [folder for folder in path if folder not in (here, caller)]
-    sys.path[:] = [*others, here] if caller == here else [caller, *others, here]
+    path = sys.path[:]
+    sys.path[:] = module_path()
     top = module.partition(".")[0]
     try:
         if not all(map(str.isidentifier, module.split("."))):
