@@ -145,49 +145,45 @@ if [ $view = status ]; then
   exit
 fi
 
-# sets `lines`, all runs; and `todo`, those that are to do and were not yet tried. LC_ALL=C: folders
-# may have names that are not UTF-8
+# sets `todo`: the runs to do, but for those that were tried, a line each: folder, command.
+# LC_ALL=C: folders may have names that are not UTF-8
 list_todo() {
-  lines=$(show "${dry_run:-list}") || exit $?
-  todo=$(LC_ALL=C awk -F'\t' -v OFS='\t' '$2 == "todo" {print $1, $3}' <<<"$lines" |
-    LC_ALL=C grep -vxFf <(printf '%s\n' "$tried") || true)
-  count=$(LC_ALL=C grep -c . <<<"$todo" || true)
+  todo=$(show "${dry_run:-list}") || exit $?
+  todo=$(LC_ALL=C grep -vxFf <(printf '%s\n' "$tried") <<<"$todo" || true)
 }
 tried=''
 list_todo
-first=${lines%%$'\t'*}
+first=${todo%%$'\t'*}
 [ -z "$remote_dir" ] || [ "${first#/}" = "$first" ] ||
   fail "--remote-dir needs a --runs-dir in the project's folder, not ${first%/*}"
 # Whatever becomes of the reader of a pipe ("| head"), nothing is started
 if [ -n "$dry_run" ]; then cut -f2 <<<"$todo" || true; exit; fi
+[ -n "$todo" ] || { show report; exit; }
 
-if [ "$executor" = parallel ]; then
-  parallel --version 2>/dev/null | grep -q "GNU parallel" ||
-    fail "--executor parallel needs GNU parallel (Debian: apt-get install parallel)"
-elif [ "$executor" = slurm ]; then
-  command -v sbatch >/dev/null || fail "--executor slurm needs sbatch, on a Slurm cluster"
-fi
-export PARALLEL_SSH=${PARALLEL_SSH:-ssh -o BatchMode=yes}
-parallel_options=(--will-cite --workdir "${remote_dir:-$PWD}")
-[ -z "$sshlogin" ] || parallel_options+=(--sshlogin "$sshlogin")
+case $executor in
+  parallel)
+    parallel --version 2>/dev/null | grep -q "GNU parallel" ||
+      fail "--executor parallel needs GNU parallel (Debian: apt-get install parallel)"
+    export PARALLEL_SSH=${PARALLEL_SSH:-ssh -o BatchMode=yes}
+    parallel_options=(--will-cite --workdir "${remote_dir:-$PWD}" --sshlogin "${sshlogin:-:}")
+    [ -z "$sshlogin" ] || parallel "${parallel_options[@]}" --nonall --tag \
+      "$PYTHON" -c "'import mujoco, torch, tyro, noisy_wrappers'" "&&" test -x benchmark.sh >&2 ||
+      fail "a machine of --sshlogin cannot run the project in ${remote_dir:-$PWD} with $PYTHON" ;;
+  slurm) command -v sbatch >/dev/null || fail "--executor slurm needs sbatch, on a Slurm cluster" ;;
+esac
 command -v flock >/dev/null || fail "benchmark.sh needs flock (Debian: apt-get install util-linux)"
-if [ "$count" -eq 0 ]; then
-  show report
-  exit
-fi
 
 sweep=$HOSTNAME-$$-$(date +%Y%m%d%H%M%S)
 logs=${first%/*}/logs list=${first%/*}/logs/lines-$sweep.tsv
+trap 'rm -f "$list"' EXIT
 
 write_list() { # the runs to do, for the executor; and the folders of their logs
   local folders reason
   mapfile -t folders < <(cut -f1 <<<"$todo" | LC_ALL=C sed 's,/[^/]*$,/logs,' | LC_ALL=C sort -u)
   reason=$( (mkdir -p "${folders[@]}" && printf '%s\n' "$todo" >"$list") 2>&1) ||
     fail "--runs-dir: cannot write to $logs: ${reason##*: }"
+  locks_work "$list" || fail "--runs-dir: $(no_locks "$logs")"
 }
-trap 'rm -f "$list"' EXIT
-write_list
-locks_work "$list" || fail "--runs-dir: $(no_locks "$logs")"
 
 # Were this command killed, the executor would start run after run: the guard stops it then
 guard() { # a killed command may stay as a zombie: it is dead when the guard has another parent
@@ -239,20 +235,16 @@ run_todo() {
   tried+=$'\n'$todo
 }
 
-if [ "$executor" != slurm ]; then
-  [ -z "$sshlogin" ] || parallel "${parallel_options[@]}" --nonall --tag \
-    "$PYTHON" -c "'import mujoco, torch, tyro, noisy_wrappers'" "&&" test -x benchmark.sh >&2 ||
-    fail "a machine of --sshlogin cannot run the project in ${remote_dir:-$PWD} with $PYTHON"
-fi
 trap 'stop 130' INT
 trap 'stop 143' TERM HUP
-while [ "$count" -gt 0 ]; do
+while [ -n "$todo" ]; do
   run_todo
   if [ "$stopped" -ne 0 ]; then
     show stopped
     echo "stopped; run the same command again to resume"
     exit "$stopped"
   fi
-  if [ "${grid[0]}" = choose ]; then list_todo; else break; fi
+  [ "${grid[0]}" = choose ] || break
+  list_todo
 done
 show report

@@ -2,7 +2,7 @@
 
 benchmark.sh calls this file from the project's folder:
 
-    python -m sweep list FOLDER PRESET ...     one run per line: folder, state, command
+    python -m sweep list FOLDER PRESET ...     a line for each run to do: folder, command
     python -m sweep dry-run FOLDER PRESET ...  the same, after their cost is said on stderr
     python -m sweep status FOLDER PRESET ...   a summary, the failed runs, the slowest running ones
     python -m sweep stopped FOLDER PRESET ...  a summary and the failed runs of a stopped sweep
@@ -16,42 +16,36 @@ ended otherwise is read from its log, which benchmark.sh ends with the run's exi
 machine whose locks this one cannot see is taken for running while its log is young and has no end.
 """
 
-import argparse
 import contextlib
 import os
 import shutil
 import sys
 import tempfile
 import time
+from collections import Counter
 from datetime import timedelta
 from functools import partial
-from pathlib import Path
+from statistics import harmonic_mean
 from typing import NamedTuple
 
 from analysis.errors import take_over_terminal
 from analysis.folders import STOPPED, Log, is_locked, read_log
 from sweep.environment import cost
-from sweep.grid import check_rollouts, command_line, grid, result, runs_in
-from sweep.options import check_arguments, parse_args
+from sweep.grid import PlannedRun, command_line, grid, result, runs_in
+from sweep.options import parse_args
 
 YOUNG = 120  # seconds: a run writes a line at least every ten, except in a test or in compiling
 RUNNING, PROBABLY = "running", "probably running"
-
-
-class Sweep(NamedTuple):
-    """What a view is about."""
-
-    args: argparse.Namespace  # as options.parse_args reads them
-    runs: list  # of PlannedRun
-    choices: list  # of choose.Choice, for the preset of that name
+STATES = ("done", RUNNING, PROBABLY, "failed", "to do")
 
 
 class Progress(NamedTuple):
     """How far a run has come."""
 
-    state: str  # done, running, probably running, failed or to do
-    reason: str  # why it is not done, "" where nothing is known yet
+    run: PlannedRun
     log: Log
+    state: str  # one of STATES
+    reason: str = ""  # why it is not done, "" where nothing is known yet
 
 
 def progress_of(run, over):
@@ -59,110 +53,95 @@ def progress_of(run, over):
     log = read_log(run.folder)
     done, damage = result(run)
     if done:
-        return Progress("done", "", log)
+        return Progress(run, log, "done")
     if damage:
-        return Progress("failed", "damaged", log._replace(last_line=damage))
+        return Progress(run, log._replace(last_line=damage), "failed", "damaged")
     if is_locked(run.folder):
         silent = f"silent for {log.age / 60:.0f} min" if YOUNG <= log.age < float("inf") else ""
-        return Progress(RUNNING, "still running" if over else silent, log)
+        return Progress(run, log, RUNNING, "still running" if over else silent)
     status = log.exit_status
     if status in STOPPED:
-        return Progress("to do", "stopped", log)
+        return Progress(run, log, "to do", "stopped")
     if status == 0:  # the run was finished, and its folder has been moved or deleted since
-        return Progress("to do", "no result.json", log)
+        return Progress(run, log, "to do", "no result.json")
     if status is not None:
         ended = f"signal {status - 128}" if status > 128 else f"exit {status}"
-        return Progress("failed", ended, log)
+        return Progress(run, log, "failed", ended)
     if log.age < YOUNG and not over:
-        return Progress(PROBABLY, "", log)
-    return Progress("to do", "lost" if log.age < float("inf") else "", log)
+        return Progress(run, log, PROBABLY)
+    return Progress(run, log, "to do", "lost" if log.age < float("inf") else "")
 
 
-def remaining(run, progress):
+def steps_left(progress):
     """Return the environment steps that a run has left."""
-    return 0 if progress.state == "done" else max(0, run.total_timesteps - progress.log.step)
+    done = progress.state == "done"
+    return 0 if done else max(0, progress.run.total_timesteps - progress.log.step)
 
 
-def summary(runs, progresses):
+def running(progresses):
+    """Return those of the runs that are running, perhaps elsewhere."""
+    return [progress for progress in progresses if progress.state in (RUNNING, PROBABLY)]
+
+
+def summary(progresses):
     """Return one line: how many runs are in which state, how fast it goes, how long it takes."""
-    count = dict.fromkeys(("done", RUNNING, PROBABLY, "failed", "to do"), 0)
+    count = Counter(progress.state for progress in progresses)
+    states = [state for state in STATES if state != PROBABLY or count[state]]
+    text = f"{len(progresses)} runs: " + ", ".join(f"{count[state]} {state}" for state in states)
     speeds = {}
-    for run, progress in zip(runs, progresses, strict=True):
-        count[progress.state] += 1
+    for progress in progresses:
         if progress.log.steps_per_second:
-            for key in (run.kind, None):
+            for key in (progress.run.kind, None):
                 speeds.setdefault(key, []).append(progress.log.steps_per_second)
-    if not count[PROBABLY]:
-        del count[PROBABLY]
-    speed = {key: len(values) / sum(1 / v for v in values) for key, values in speeds.items()}
-    text = f"{len(runs)} runs: " + ", ".join(f"{n} {state}" for state, n in count.items())
-    running = [progress for progress in progresses if progress.state in (RUNNING, PROBABLY)]
-    if running and speed:
-        seconds = 0
-        for run, progress in zip(runs, progresses, strict=True):
-            seconds += remaining(run, progress) / speed.get(run.kind, speed[None])
-        now = sum(progress.log.steps_per_second for progress in running)
-        left = timedelta(seconds=round(seconds / len(running)))
+    speed = {key: harmonic_mean(values) for key, values in speeds.items()}
+    if running(progresses) and speed:
+        seconds = sum(steps_left(p) / speed.get(p.run.kind, speed[None]) for p in progresses)
+        left = timedelta(seconds=round(seconds / len(running(progresses))))
+        now = sum(progress.log.steps_per_second for progress in running(progresses))
         text += f"; about {left} left"
         text += f", {now:,.0f} steps/s" * bool(now)  # a narrow terminal cuts the end off
     return text
 
 
-def show_slowest(runs, progresses):
-    """Print those of the running runs that will take longest."""
-    left = []
-    for run, progress in zip(runs, progresses, strict=True):
-        speed = progress.log.steps_per_second
-        if progress.state in (RUNNING, PROBABLY) and speed:
-            shown = f"{speed}/s", str(progress.log.step), str(run.folder)
-            left.append((remaining(run, progress) / speed, *shown))
-    if left:
-        print("slowest of those running (time left, steps per second, step):")
-        slowest = sorted(left, reverse=True)[:5]
-        table([(str(timedelta(seconds=round(seconds))), *shown) for seconds, *shown in slowest])
-
-
-def table(rows):
-    """Print rows as columns."""
+def table(title, rows):
+    """Print rows as columns, if there are any."""
+    if rows:
+        print(title)
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         print("  " + "  ".join(map(str.ljust, row, widths)).rstrip())
 
 
-# ------------------------------------------------------------------------- the views: exit statuses
+# ------------------------------------------------- the views, which may return an exit status
 
 
-def show_list(sweep, with_cost=False):
-    """Print the runs for benchmark.sh: folder, state and command; on stderr how many there are.
+def show_list(args, runs, choices, with_cost=False):
+    """Print the runs to do for benchmark.sh: folder and command; on stderr how many there are.
 
     with_cost: also what they will take. A choice says it of each of its batches.
     """
-    states = []
-    for run in sweep.runs:
-        done, damage = result(run)
-        states.append("done" if done else "damaged" if damage else "todo")
+    done, todo = [], []
+    for run in runs:
+        finished, damage = result(run)
         if damage:
             print(f"warning: {damage}", file=sys.stderr)
-    if "todo" in states:
-        check_rollouts(sweep.runs)
-    for run, state in zip(sweep.runs, states, strict=True):
+        else:
+            (done if finished else todo).append(run)
+    for run in todo:
         folder = f"{run.folder.parent}/{run.folder.name}"  # with a slash, for --runs-dir . too
-        print(folder, state, command_line(run), sep="\t")
-    plan = [f"{len(sweep.runs)} runs, {states.count('todo')} to do"]
-    if sweep.choices:
+        print(folder, command_line(run), sep="\t")
+    plan = [f"{len(runs)} runs, {len(todo)} to do"]
+    if choices:
         from sweep import choose
 
-        plan = choose.plan(sweep.choices, sweep.args)
-    elif with_cost and "todo" in states:
-        todo = [run for run, state in zip(sweep.runs, states, strict=True) if state == "todo"]
-        done = [run for run, state in zip(sweep.runs, states, strict=True) if state == "done"]
-        plan[0] += "; " + cost(sweep.args, done, todo)
+        plan = choose.plan(choices, args)
+    elif with_cost and todo:
+        plan[0] += "; " + cost(args, done, todo)
     for line in plan:
         print(line, file=sys.stderr)
-    return 0
 
 
-def watch(sweep):
+def watch(args, runs, choices):
     """Show the summary until benchmark.sh ends: on a terminal one line that is rewritten.
 
     Elsewhere lines follow each other, seldom enough for the log of a sweep that takes days.
@@ -170,66 +149,72 @@ def watch(sweep):
     # benchmark.sh may be killed before this line: then another process is the parent already
     parent = int(os.environ.get("WATCHED", os.getppid()))
     terminal = sys.stderr.isatty()
-    pause = 10 if terminal or sweep.args.preset == "demo" else 600  # seconds
+    pause = 10 if terminal or args.preset == "demo" else 600  # seconds
     shown = -pause if terminal else time.monotonic()
     while os.getppid() == parent:
         if time.monotonic() - shown >= pause:
             shown = time.monotonic()
-            line = summary(sweep.runs, [progress_of(run, over=False) for run in sweep.runs])
+            line = summary([progress_of(run, over=False) for run in runs])
             if terminal:
                 width = shutil.get_terminal_size().columns - 1
                 line = f"\r{line[:width].ljust(width)}"
             print(line, end="" if terminal else "\n", file=sys.stderr, flush=True)
         time.sleep(1)
-    return 0
 
 
-def show_status(sweep):
+def show_status(args, runs, choices):
     """Print how far a sweep is; the exit status is 1 where a run's files are damaged."""
-    progresses = show_progress(sweep, "failed", over=False)
+    progresses = show_progress(args, runs, over=False)
     silent = [p for p in progresses if p.state == RUNNING and p.reason]
-    if silent:
-        print("running, but silent:")
-        table([(f"{p.state}, {p.reason}", str(p.log.path), p.log.last_line) for p in silent])
-    show_slowest(sweep.runs, progresses)
-    if sweep.choices:
+    rows = [(f"{p.state}, {p.reason}", str(p.log.path), p.log.last_line) for p in silent]
+    table("running, but silent:", rows)
+    slowest = []
+    for progress in running(progresses):
+        log = progress.log
+        if log.steps_per_second:
+            shown = f"{log.steps_per_second}/s", str(log.step), str(progress.run.folder)
+            slowest.append((steps_left(progress) / log.steps_per_second, *shown))
+    slowest.sort(reverse=True)
+    rows = [(str(timedelta(seconds=round(left))), *shown) for left, *shown in slowest[:5]]
+    table("slowest of those running (time left, steps per second, step):", rows)
+    if choices:
         from sweep import choose
 
-        print(*choose.standing(sweep.choices, sweep.args), sep="\n")
+        print(*choose.standing(choices, args), sep="\n")
     return int(any(p.reason == "damaged" for p in progresses))
 
 
-def show_stopped(sweep):
+def show_stopped(args, runs, choices):
     """Print where a sweep stands that was stopped."""
-    show_progress(sweep, "failed", over=True)
-    return 0
+    show_progress(args, runs, over=True)
 
 
-def show_report(sweep):
+def show_report(args, runs, choices):
     """Print what came out of a sweep; the exit status is 1 unless all runs are done."""
-    progresses = show_progress(sweep, "not finished", over=True)
+    progresses = show_progress(args, runs, over=True, everything=True)
     unfinished = any(p.state != "done" for p in progresses)
     if unfinished:
-        check_disk(sweep.runs[0].folder.parent / "logs")
-    if sweep.choices:
+        check_disk(runs[0].folder.parent / "logs")
+    if choices:
         from sweep import choose
 
-        choose.report(sweep.choices, Path(sweep.args.runs_dir, "choice.csv"))
+        choose.report(choices, args)
     if any(p.state == "done" for p in progresses):
-        print(f"See the curves with: tensorboard --logdir {sweep.args.runs_dir}")
-        print(f"Make tables and figures with: python analyze.py --runs-dir {sweep.args.runs_dir}")
+        print(f"See the curves with: tensorboard --logdir {args.runs_dir}")
+        print(f"Make tables and figures with: python analyze.py --runs-dir {args.runs_dir}")
     return int(unfinished)
 
 
-def show_progress(sweep, title, over):
-    """Print the summary and the runs that are not on their way; return the progress of all."""
-    progresses = [progress_of(run, over) for run in sweep.runs]
-    print(f"{sweep.args.runs_dir}: {summary(sweep.runs, progresses)}")
-    everything = title == "not finished"
+def show_progress(args, runs, over, everything=False):
+    """Print the summary and the failed runs; return the progress of all.
+
+    everything: also print what else is known to have ended, or not to.
+    """
+    progresses = [progress_of(run, over) for run in runs]
+    print(f"{args.runs_dir}: {summary(progresses)}")
     named = [p for p in progresses if p.state == "failed" or (everything and p.reason)]
-    if named:
-        print(f"{title}:")
-        table([(p.reason, str(p.log.path), p.log.last_line) for p in named])
+    rows = [(p.reason, str(p.log.path), p.log.last_line) for p in named]
+    table("not finished:" if everything else "failed:", rows)
     return progresses
 
 
@@ -256,22 +241,20 @@ VIEWS = {
 
 def main(view, caller, argv):
     """Print one view of the grid; returns the exit status."""
-    args = parse_args(view, caller, argv)
     choices = []
+    with contextlib.redirect_stdout(sys.stderr):  # what a user's module prints is no run
+        args = parse_args(view, caller, argv)
     if view == "status" and args.preset in (None, "custom") and args.given <= {"--runs-dir"}:
         runs = runs_in(args.runs_dir)
-    else:
-        with contextlib.redirect_stdout(sys.stderr):  # what a user's module prints is no run
-            check_arguments(args)
-        if args.preset == "choose":
-            from sweep import choose  # and with it pandas: no other preset should wait for that
+    elif args.preset == "choose":
+        from sweep import choose  # and with it pandas: no other preset should wait for that
 
-            ask = view in ("list", "dry-run")
-            choices = choose.choices(args, ask, keep=view == "list")
-            runs = choose.planned_runs(choices)
-        else:
-            runs = grid(args)
-    return VIEWS[view](Sweep(args, runs, choices))
+        ask = view in ("list", "dry-run")
+        choices = choose.choices(args, ask, keep=view == "list")
+        runs = choose.planned_runs(choices)
+    else:
+        runs = grid(args)
+    return VIEWS[view](args, runs, choices) or 0
 
 
 if __name__ == "__main__":

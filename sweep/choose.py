@@ -10,7 +10,7 @@ import itertools
 import math
 import os
 import sys
-from statistics import fmean
+from pathlib import Path
 from typing import NamedTuple
 
 from analysis.errors import fail, in_words
@@ -21,14 +21,7 @@ from analysis.verdicts import POINTS, what_all_runs_do
 from noisy_wrappers import BASELINE, Configuration, rounded
 from sweep import halving
 from sweep.environment import ask_all, remember, remembered, run_seconds, time_left, wall_time
-from sweep.grid import (
-    PlannedRun,
-    configuration_of,
-    configurations,
-    make_run,
-    of_the_paper,
-    result,
-)
+from sweep.grid import PlannedRun, configuration_of, configurations, make_run, result
 
 
 class Choice(NamedTuple):
@@ -81,7 +74,7 @@ def leave_out(args, env_id, unfit):
         reason = reason.removeprefix(noise.partition("(")[0]).strip()  # of several noises, often
         noises_of.setdefault(reason, []).append(noise)
     told = "; ".join(f"{', '.join(noises)} ({reason})" for reason, noises in noises_of.items())
-    if told and args.noises and not of_the_paper(args):
+    if told and args.noises:
         fail(f"--noises: these cannot act in {env_id}: {told}")
     if told:
         print(f"{env_id}: left out, because they cannot act there: {told}", file=sys.stderr)
@@ -92,6 +85,7 @@ def follow(args, algorithm, env_id, environment):
 
     environment: what is known of it, or None.
     """
+    name = f"{algorithm.upper()} on {env_id}"
     noises = candidates(args, algorithm, env_id, environment.unfit if environment else {})
     budget = 3 * len(noises) if args.budget is None else args.budget
     if budget < len(noises):
@@ -100,8 +94,7 @@ def follow(args, algorithm, env_id, environment):
     last_seed = sum(seeds for _, seeds in schedule)
     if last_seed >= FIRST_CONFIRMATION_SEED:
         fail(f"--budget {budget} is too large: the best noises would run with {last_seed} seeds")
-    metric = args.metric.replace("_", " ")
-    state, runs, tests, returns = walk(args, algorithm, env_id, noises, budget, metric)
+    state, runs, tests, returns = walk(args, algorithm, env_id, noises, budget)
     folders = {steps: runs[key].folder for key, (steps, _) in tests.items()}
     if len(folders) > 1:  # then their scores do not compare
         one, other, *_ = folders.values()
@@ -112,21 +105,16 @@ def follow(args, algorithm, env_id, environment):
     results = set().union(*(values for _, values in tests.values()))
     if len(results) == 1 and (state.rounds or not state.due):
         fail(
-            f"{algorithm.upper()} on {env_id}: {what_all_runs_do(*results, metric)} in "
-            f"{args.total_timesteps:,} steps (runs: {len(returns)}), so further runs would say "
-            "nothing about noise; change --total-timesteps, or leave this out",
+            f"{name}: {what_all_runs_do(*results, args.metric)} in {args.total_timesteps:,} steps "
+            f"(runs: {len(returns)}), so further runs would say nothing about noise; change "
+            "--total-timesteps, or leave this out",
             code=1,
         )
-    last_tests = {}  # of the search
-    for (noise, seed), (_, values) in tests.items():
-        if seed < FIRST_CONFIRMATION_SEED:
-            last_tests.setdefault(noise, []).append(values[-1])
-    taken = [taken for taken in map(wall_time, map(runs.get, returns)) if taken]
-    seconds = fmean(taken) if taken else None
-    if environment and not taken:
+    seconds = wall_time(map(runs.get, returns))
+    if environment and seconds is None:
         seconds = run_seconds(next(iter(runs.values())), environment)
     return Choice(
-        name=f"{algorithm.upper()} on {env_id}",
+        name=name,
         algorithm=algorithm,
         env_id=env_id,
         noises=len(noises),
@@ -135,13 +123,13 @@ def follow(args, algorithm, env_id, environment):
         state=state,
         runs=runs,
         returns=returns,
-        spread=halving.spread(last_tests.values()),
+        spread=halving.spread({run: values[-1] for run, (_, values) in tests.items()}),
         run_seconds=seconds,
-        metric=metric,
+        metric=args.metric,
     )
 
 
-def walk(args, algorithm, env_id, noises, budget, metric):
+def walk(args, algorithm, env_id, noises, budget):
     """Go from batch to batch as long as runs are finished.
 
     Returns the state; the runs that were due; the steps and the results of the tests of those that
@@ -151,24 +139,39 @@ def walk(args, algorithm, env_id, noises, budget, metric):
     runs, tests, returns = {}, {}, {}
     while True:
         state = halving.advance(noises, budget, args.confirm, returns)
+        if runs.keys() >= set(state.due):  # they have not finished
+            return state, runs, tests, returns
         phase = SEARCH if len(state.rounds) < rounds else CONFIRMATION
-        known = len(returns)
         for noise, seed in state.due:
             run, row = read(make_run(args, algorithm, env_id, noise, seed, phase))
             runs[noise, seed] = run
             if row:
-                steps, values = row["steps"], tests_of(run, row, metric)
-                tests[noise, seed] = tuple(steps), values
-                score = halving.score(steps, values) if phase == SEARCH else values[-1]
+                values = row["success_rates" if args.metric == SUCCESS else "returns"]
+                if values is None:
+                    fail(f"--metric success_rate: {env_id} tells no `is_success` or `success`")
+                tests[noise, seed] = tuple(row["steps"]), values
+                score = halving.score(row["steps"], values) if phase == SEARCH else values[-1]
                 returns[noise, seed] = score
-        if len(returns) == known:
-            return state, runs, tests, returns
+
+
+def read(run):
+    """Return a run, with what is damaged in it, and its data, None if it has not finished."""
+    runs_dir, phase = run.folder.parents[1], run.folder.parent
+    if not phase.exists() and (runs_dir / run.folder.name).exists():
+        fail(f"{flat_choice(runs_dir)} (or choose another --runs-dir, if it is another sweep)")
+    if not result(run)[0]:
+        return run, None
+    row = read_run(run.folder)
+    if row["status"] == "finished":
+        return run, row
+    damage = f"{run.folder}/{row['reason']}; move its folder away to run it again"
+    return run._replace(damage=damage), None
 
 
 def planned_runs(found):
     """Return the runs of all choices, the first seed of everything first."""
-    runs = [(seed, run) for choice in found for (_, seed), run in choice.runs.items()]
-    return [run for _, run in sorted(runs, key=lambda pair: pair[0])]
+    runs = [run for choice in found for run in choice.runs.values()]
+    return sorted(runs, key=lambda run: run.seed)
 
 
 def candidates(args, algorithm, env_id, unfit=()):
@@ -186,29 +189,6 @@ def candidates(args, algorithm, env_id, unfit=()):
     if not noises:
         fail("there is no noise to choose from")
     return noises
-
-
-def read(run):
-    """Return a run, with what is damaged in it, and its data, None if it has not finished."""
-    runs_dir, phase = run.folder.parents[1], run.folder.parent
-    if not phase.exists() and (runs_dir / run.folder.name).exists():
-        fail(f"{flat_choice(runs_dir)} (or choose another --runs-dir, if it is another sweep)")
-    if not result(run)[0]:
-        return run, None
-    row = read_run(run.folder)
-    if row["status"] == "finished":
-        return run, row
-    damage = f"{run.folder}/{row['reason']}; move its folder away to run it again"
-    return run._replace(damage=damage), None
-
-
-def tests_of(run, row, metric):
-    """Return the results of a run's tests (tests,), or exit if the environment tells no success."""
-    if metric != SUCCESS:
-        return row["returns"]
-    if row["success_rates"] is None:
-        fail(f"--metric success_rate: {run.kind[1]} tells no `is_success` or `success`")
-    return row["success_rates"]
 
 
 # ---------------------------------------------------------------------------------------- in words
@@ -249,19 +229,15 @@ def total(found, args):
     )
     if any(choice.run_seconds is None for choice in found):
         return text
-    batches = []
-    for numbers in itertools.zip_longest(*map(left, found), fillvalue=0):  # side by side
-        batches.append([])
-        for choice, runs in zip(found, numbers, strict=True):
-            batches[-1] += runs * [choice.run_seconds]
-    elsewhere = args.elsewhere and not finished
-    return f"{text}, {time_left(batches, args.jobs, elsewhere)}"
+    batches = [sum(batch, []) for batch in itertools.zip_longest(*map(left, found), fillvalue=[])]
+    return f"{text}, {time_left(batches, args.jobs, args.elsewhere and not finished)}"
 
 
 def left(choice):
-    """Return the numbers of runs in the batches that are left."""
+    """Return the batches that are left, each as the seconds of its runs."""
     numbers = [noises * seeds for noises, seeds in choice.schedule] + [2 * choice.confirm]
-    return [len(choice.state.due), *numbers[len(choice.state.rounds) + 1 :]]
+    numbers = [len(choice.state.due), *numbers[len(choice.state.rounds) + 1 :]]
+    return [number * [choice.run_seconds] for number in numbers]
 
 
 def detectable_gain(choice, verdicts):
@@ -301,7 +277,7 @@ def standing(found, args):
     When all choices are finished, these are the verdicts.
     """
     if not any(choice.state.due for choice in found):
-        yield from sentences(judged(found))
+        yield from (sentence for _, sentence in verdicts(found))
         return
     for choice in found:
         yield describe(choice)
@@ -313,18 +289,17 @@ def standing(found, args):
     yield total(found, args)
 
 
-def report(found, path):
+def report(found, args):
     """Print the verdicts, and write choice.csv; or, where runs are left, what to do about them."""
     if any(choice.state.due for choice in found):
         lines = [obstacle(choice) if choice.state.due else describe(choice) for choice in found]
     else:
-        judgements, records = judged(found), []
-        for choice, comparison, p in judgements:
+        lines, rows = [], []
+        for choice, (helped, sentence) in zip(found, verdicts(found), strict=True):
             names = choice.algorithm.upper(), choice.env_id
-            helped = halving.helps(comparison, p)
-            records += halving.records(*names, choice.state, choice.returns, helped)
-        write_choice(path, records)
-        lines = sentences(judgements)
+            rows += halving.records(*names, choice.state, choice.returns, helped)
+            lines.append(sentence)
+        write_choice(Path(args.runs_dir, "choice.csv"), rows)
     print(*lines, sep="\n")
 
 
@@ -333,25 +308,20 @@ def unit(choice):
     return POINTS if choice.metric == SUCCESS else ""
 
 
-def judged(found):
-    """Return finished choices, each with its comparison and the p corrected for all of them."""
+def verdicts(found):
+    """Return of finished choices whether the noise helps, and the verdict in a sentence."""
     comparisons = []
     for choice in found:
-        [winner] = choice.state.noises
-        comparison = halving.compare(winner, choice.state.seeds, choice.returns)
+        comparison = halving.compare(*choice.state.noises, choice.state.seeds, choice.returns)
         if choice.metric == SUCCESS:
             comparison = comparison._replace(difference_percent=math.nan)  # never percent of a rate
         comparisons.append(comparison)
     corrected = holm([comparison.p for comparison in comparisons])
-    return list(zip(found, comparisons, corrected, strict=True))
-
-
-def sentences(judgements):
-    """Yield the verdicts, a sentence for each choice."""
-    for choice, comparison, p in judgements:
-        [winner] = choice.state.noises
-        found = choice.name, winner, choice.noises, comparison, p
-        yield halving.sentence(*found, len(judgements), unit(choice))
+    judged = []
+    for choice, comparison, p in zip(found, comparisons, corrected, strict=True):
+        what = choice.name, *choice.state.noises, choice.noises, comparison, p, len(found)
+        judged.append((halving.helps(comparison, p), halving.sentence(*what, unit(choice))))
+    return judged
 
 
 def obstacle(choice):
@@ -367,26 +337,22 @@ def obstacle(choice):
 
 
 def write_choice(path, new):
-    """Write choice.csv whole or not at all; it keeps what other commands have chosen."""
+    """Write choice.csv whole or not at all; it keeps what other commands have chosen.
+
+    new: rows of halving.records.
+    """
+    rows, chosen_now = [CHOICE_COLUMNS], {row[:2] for row in new}
+    temporary = path.with_suffix(".tmp")
     try:
         with open(path.with_name(".choice.lock"), "w", encoding="utf-8") as lock:
             fcntl.lockf(lock, fcntl.LOCK_EX)  # until it is closed: commands may end side by side
-            replace_choice(path, new)
-    except (OSError, KeyError, ValueError) as error:
+            if path.exists():
+                with open(path, newline="", encoding="utf-8") as file:
+                    rows = [row for row in csv.reader(file) if tuple(row[:2]) not in chosen_now]
+            if rows[:1] != [CHOICE_COLUMNS]:
+                raise ValueError(f"its columns are not {','.join(CHOICE_COLUMNS)}")
+            with open(temporary, "w", newline="", encoding="utf-8") as file:
+                csv.writer(file, lineterminator="\n").writerows(rows + new)
+            os.replace(temporary, path)
+    except (OSError, ValueError) as error:
         fail(f"cannot write {path} ({in_words(error)})")
-
-
-def replace_choice(path, new):
-    """Replace the records of what was chosen now, and keep the others."""
-    chosen_now = {(record["algorithm"], record["environment"]) for record in new}
-    old = []
-    if path.exists():
-        with open(path, newline="", encoding="utf-8") as file:
-            old = list(csv.DictReader(file))
-    others = [r for r in old if (r["algorithm"], r["environment"]) not in chosen_now]
-    temporary = path.with_suffix(".tmp")
-    with open(temporary, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, CHOICE_COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(others + new)
-    os.replace(temporary, path)

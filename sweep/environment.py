@@ -180,7 +180,7 @@ def number_of_tests(run):
     """Return how often a run tests its policy."""
     frequency = run.options["eval-frequency"]
     if frequency is None:
-        most = constant(run.script, "EVAL_FREQUENCY")
+        most = constant(run.command[0], "EVAL_FREQUENCY")
         frequency = max(1, min(most, run.total_timesteps // 10))
     return math.ceil(run.total_timesteps / frequency) if frequency else 1
 
@@ -197,22 +197,20 @@ def cost(args, done, todo):
 
     The others are estimated, and their environments asked for that.
     """
-    seconds = {}
-    for run in done:
-        if taken := wall_time(run):
-            seconds.setdefault(run.kind, []).append(taken)
-    seconds = {kind: fmean(values) for kind, values in seconds.items()}
-    new = {run.kind: run for run in todo if run.kind not in seconds}
+    kinds = {run.kind: run for run in todo}
+    seconds = {kind: wall_time([run for run in done if run.kind == kind]) for kind in kinds}
+    new = [kind for kind in kinds if seconds[kind] is None]
     answers = ask_all(args, {env_id: [] for _, env_id in new})
-    for (algorithm, env_id), run in new.items():
-        seconds[algorithm, env_id] = run_seconds(run, answers[env_id])
+    for kind in new:
+        seconds[kind] = run_seconds(kinds[kind], answers[kind[1]])
     return time_left([[seconds[run.kind] for run in todo]], args.jobs, args.elsewhere and new)
 
 
-def wall_time(run):
-    """Return how many seconds a finished run has taken, or None where it does not say."""
-    seconds = read_json(run.folder / "result.json").get("wall_time_seconds")
-    return seconds if isinstance(seconds, int | float) and seconds > 0 else None
+def wall_time(runs):
+    """Return how many seconds finished runs have taken on average, or None where none says it."""
+    taken = [read_json(run.folder / "result.json").get("wall_time_seconds") for run in runs]
+    taken = [seconds for seconds in taken if isinstance(seconds, int | float) and seconds > 0]
+    return fmean(taken) if taken else None
 
 
 def hours_of(seconds):

@@ -86,25 +86,22 @@ run_parallel() { # --termseq: where a connection is lost, the runs get TERM and 
     done
 }
 stop_parallel() { # HUP: parallel starts no more runs, and waits for those that USR1 stops
-  local pattern="^bash ./benchmark.sh run-one $sweep" seconds=0
-  while kill -HUP -- "-$group" 2>/dev/null && [ $seconds -lt 3600 ]; do # again for late starters
-    if [ -z "$sshlogin" ]; then
-      pkill -USR1 -f "$pattern" || true
-    else
-      parallel "${parallel_options[@]}" --nonall pkill -USR1 -f "'$pattern'" || true
-    fi
+  local seconds
+  for ((seconds = 0; seconds < 3600; seconds++)); do # again for late starters
+    kill -HUP -- "-$group" 2>/dev/null || break
+    parallel "${parallel_options[@]}" --nonall \
+      pkill -USR1 -f "'^bash ./benchmark.sh run-one $sweep'" || true
     sleep 1
-    seconds=$((seconds + 1))
   done
 }
 
 # -------------------------------------------------------------------------------------------- slurm
 
 submit() { # the array's indices are line numbers, counted from the offset of its part
-  local size offset n id
+  local count size offset n id
+  count=$(wc -l <"$list")
   size=$(scontrol show config | awk '$1 == "MaxArraySize" {print $3}') || true
-  [ "$stopped" -eq 0 ] || return 0
-  [ "${size:-0}" -gt 0 ] || fail "scontrol show config does not show MaxArraySize"
+  [ "${size:-0}" -gt 0 ] || [ "$stopped" -ne 0 ] || fail "scontrol show config does not show MaxArraySize"
   read -ra slurm_options <<<"$slurm_args"
   for ((offset = 0; offset < count && stopped == 0; offset += size)); do
     n=$((count - offset < size ? count - offset : size))

@@ -95,9 +95,9 @@ class PlannedRun(NamedTuple):
 
     folder: Path
     kind: tuple[str, str]  # algorithm, environment: runs of one kind are equally fast
+    seed: int
     total_timesteps: int
-    script: str
-    arguments: list[str]
+    command: list[str]  # the script and its arguments
     options: dict[str, object]  # the script's own, by name: what "--" gives, else the defaults
     damage: str = ""  # what is already known to be wrong with its files
 
@@ -130,8 +130,8 @@ def defaults(script):
 def script_options(script, words):
     """Return {option: value} of a script that is started with these words after the "--".
 
-    Exits with one line about a word that the script would refuse: a typing error is not worth
-    9,100 failed runs.
+    Exits with one line about a word that the script would refuse, or that belongs to the grid: a
+    typing error is not worth 9,100 failed runs.
     """
     known = defaults(script)
     options = {name: default for name, (_, default) in known.items()}
@@ -142,6 +142,8 @@ def script_options(script, words):
         name, equals, text = word[2:].partition("=")
         name = name.replace("_", "-")
         flag = name.removeprefix("no-")
+        if name in GIVEN_BY_THE_GRID:
+            fail(f"--{name} is part of the grid: use {GIVEN_BY_THE_GRID[name]}, before the --")
         if isinstance(options.get(flag), bool):
             if equals:
                 fail(f"--{name} takes no value: write --{flag} or --no-{flag}")
@@ -155,6 +157,8 @@ def script_options(script, words):
         if not text or text.startswith("--"):
             fail(f"--{name} needs a value")
         options[name] = option_value(name, text, known[name][0])
+    if options["overwrite"]:
+        fail("--overwrite would start interrupted runs afresh: delete their folders instead")
     return options
 
 
@@ -195,19 +199,12 @@ def best_pairs():
     return pairs
 
 
-def of_the_paper(args):
-    """Return whether the noises are given as --noises paper; options.entry reads it so."""
-    return args.noises == [[("paper", None)]]
-
-
 def configurations(args, algorithm, env_id):
     """Return the configurations with noise of a grid, in the order given."""
-    given = [] if of_the_paper(args) else args.noises
-    pairs = preset_pairs("paper" if of_the_paper(args) else args.preset, algorithm, env_id)
+    pairs = preset_pairs(args.noises_of, algorithm, env_id)
     entries, rates = [[pair] for pair in pairs], []
-    if given or args.noise_rates:
-        names = dict.fromkeys(noise for noise, _ in pairs)
-        entries = given or [[(noise, None)] for noise in names]
+    if args.noises or args.noise_rates:
+        entries = args.noises or [[(noise, None)] for noise in dict(pairs)]
         rates = args.noise_rates or list(dict.fromkeys(own for _, own in pairs))
     if args.combine:
         entries = entries + [a + b for a, b in itertools.combinations(entries, 2)]
@@ -216,11 +213,11 @@ def configurations(args, algorithm, env_id):
         fail('--noises needs --noise-rates, or a rate with each noise, as in "NOISE@0.1"')
     if args.noise_rates and not crossed:
         fail("--noise-rates needs --noises that have no rate of their own")
-    found = []
-    for pairs in entries:
-        for common in rates if pairs in crossed else [None]:
-            found.append(configuration_of(pairs, common))
-    return found
+    return [
+        configuration_of(pairs, common)
+        for pairs in entries
+        for common in (rates if pairs in crossed else [None])
+    ]
 
 
 def configuration_of(pairs, common=None):
@@ -237,17 +234,15 @@ def configuration_of(pairs, common=None):
 def make_run(args, algorithm, env_id, configuration, seed, phase=""):
     """Return one run of the grid, or of a phase of a choice: that is a folder of its own."""
     runs_dir = f"{args.runs_dir}/{phase}" if phase else args.runs_dir
-    script = script_of(algorithm)
+    script, steps = script_of(algorithm), args.total_timesteps
     noises, rates = configuration.texts
-    arguments = ["--env-id", env_id, "--seed", str(seed)]
+    command = [script, "--env-id", env_id, "--seed", str(seed)]
     if noises:
-        arguments += ["--noise", *noises, "--noise-rate", *map(str, rates)]
-    arguments += ["--total-timesteps", str(args.total_timesteps)]
-    arguments += ["--runs-dir", runs_dir, *args.extra]
-    exp_name, kind = script.removesuffix(".py"), (algorithm, env_id)
-    folder = Path(runs_dir, run_name(env_id, exp_name, noises, rates, seed))
+        command += ["--noise", *noises, "--noise-rate", *map(str, rates)]
+    command += ["--total-timesteps", str(steps), "--runs-dir", runs_dir, *args.extra]
+    folder = Path(runs_dir, run_name(env_id, script.removesuffix(".py"), noises, rates, seed))
     options = script_options(script, tuple(args.extra))
-    return PlannedRun(folder, kind, args.total_timesteps, script, arguments, options)
+    return PlannedRun(folder, (algorithm, env_id), seed, steps, command, options)
 
 
 def grid(args):
@@ -255,11 +250,11 @@ def grid(args):
     runs = {}
     for algorithm, env_id in itertools.product(args.algos, args.envs):
         noisy = configurations(args, algorithm, env_id)
-        seeds = set(itertools.chain(*(args.seeds or [SEEDS[algorithm]])))
-        for seed, configuration in itertools.product(sorted(seeds), [BASELINE, *noisy]):
-            run = make_run(args, algorithm, env_id, configuration, seed)
-            runs.setdefault(run.folder, (seed, run))
-    return [run for _, run in sorted(runs.values(), key=lambda pair: pair[0])]
+        for seed in set(itertools.chain(*(args.seeds or [SEEDS[algorithm]]))):
+            for configuration in [BASELINE, *noisy]:
+                run = make_run(args, algorithm, env_id, configuration, seed)
+                runs.setdefault(run.folder, run)
+    return sorted(runs.values(), key=lambda run: run.seed)
 
 
 def runs_in(folder):
@@ -279,7 +274,7 @@ def runs_in(folder):
                 kind, steps = (config["exp_name"], config["environment"]), config["total"]
             except DamageError as error:
                 damage = f"{path}/{error}"
-        runs.append(PlannedRun(path, kind, steps, "", [], {}, damage))
+        runs.append(PlannedRun(path, kind, 0, steps, [], {}, damage))
     return runs
 
 
@@ -325,19 +320,8 @@ def other_options(run, made_with):
 
 def command_line(run):
     """Return a run's command, complete: it can be pasted into a shell in the project's folder."""
-    words = [os.environ.get("PYTHON", "python"), run.script, *run.arguments]
-    own = any(re.match(r"[\w.]+:[A-Za-z_]", word) for word in run.arguments)  # module:Name
+    words = [os.environ.get("PYTHON", "python"), *run.command]
+    own = any(re.match(r"[\w.]+:[A-Za-z_]", word) for word in run.command)  # module:Name
     if own and "PYTHONPATH" in os.environ:  # where a module of the user's lies
         words = ["env", f"PYTHONPATH={os.environ['PYTHONPATH']}", *words]
     return shlex.join(words)
-
-
-def check_rollouts(runs):
-    """Exit if runs are shorter than one rollout of PPO, which would fail one by one."""
-    for run in runs:
-        rollout = run.options.get("num-steps")
-        if isinstance(rollout, int) and run.total_timesteps < rollout:
-            fail(
-                f"--total-timesteps must be at least {rollout} for PPO (its --num-steps), not "
-                f"{run.total_timesteps}"
-            )

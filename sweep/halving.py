@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from analysis import statistics
-from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED
+from analysis.runs import FIRST_CONFIRMATION_SEED
 from analysis.statistics import LEVEL  # of a verdict, two-sided, over all verdicts of one command
 from analysis.verdicts import (
     borderline,
@@ -107,12 +107,16 @@ def score(steps, returns):
     return float(returns[steps[-1] - steps < SCORED * steps[-1]].mean())
 
 
-def spread(groups):
-    """Return the standard deviation of returns over the seeds of a noise, pooled over noises.
+def spread(returns):
+    """Return the standard deviation over the seeds of a noise in the search, pooled over noises.
 
-    groups: for each noise its returns. NaN if none has two.
+    returns: {(configuration, seed): return}. NaN if no noise has two.
     """
-    groups = [values for values in groups if len(values) > 1]
+    groups = {}
+    for (noise, seed), value in returns.items():
+        if seed < FIRST_CONFIRMATION_SEED:
+            groups.setdefault(noise, []).append(value)
+    groups = [values for values in groups.values() if len(values) > 1]
     freedom = sum(len(values) - 1 for values in groups)
     squares = sum((len(values) - 1) * variance(values) for values in groups)
     return math.sqrt(squares / freedom) if freedom else math.nan
@@ -175,19 +179,17 @@ def sentence(name, winner, noises, comparison, p_corrected, verdicts, unit=""):
 
 
 def records(algorithm, environment, state, returns, helped):
-    """Return the lines of choice.csv for one finished choice, as dicts; see CHOICE_COLUMNS."""
-    lines = []
+    """Return the rows of choice.csv for one finished choice; their columns are CHOICE_COLUMNS."""
+    rows = []
 
     def add(phase, number, noise, seeds, score, survives):
-        values = algorithm, environment, phase, number, *noise.columns, seeds, score, survives
-        lines.append(dict(zip(CHOICE_COLUMNS, values, strict=True)))
+        rows.append((algorithm, environment, phase, number, *noise.columns, seeds, score, survives))
 
     for number, done in enumerate(state.rounds, start=1):
         for noise in done.noises:
             survives = "yes" if noise in done.survivors else "no"
             add("search", number, noise, done.seeds, done.scores[noise], survives)
-    for noise in (BASELINE, *state.noises):
+    for noise, survives in ((BASELINE, ""), (*state.noises, "yes" if helped else "no")):
         score = fmean(returns[noise, seed] for seed in state.seeds)
-        survives = ("yes" if helped else "no") if noise != BASELINE else ""
         add("confirmation", "", noise, len(state.seeds), score, survives)
-    return lines
+    return rows

@@ -8,16 +8,17 @@ from pathlib import Path
 
 from analysis.errors import fail
 from noisy_wrappers import canonical_env_id, split_noises
-from sweep.grid import ENVS, GIVEN_BY_THE_GRID, PRESETS, PROJECT, SEEDS, defaults, script_of
+from sweep.grid import ENVS, PRESETS, SEEDS, defaults, script_of, script_options
 
-GRID_OPTIONS = ["--algos", "--envs", "--noises", "--noise-rates", "--seeds", "--total-timesteps"]
-GRID_OPTIONS += ["--runs-dir", "--combine", "--exclude", "--budget", "--confirm", "--metric"]
 EXECUTOR_OPTIONS = ["--dry-run", "--executor", "--jobs", "--sshlogin", "--remote-dir"]
 EXECUTOR_OPTIONS += ["--slurm-args", "--wait", "--help"]  # benchmark.sh reads these
 
 
 def parse_args(view, caller, argv):
-    """Return the grid's arguments; `extra` are the scripts' own, after "--"."""
+    """Return the grid's arguments; `extra` are the scripts' own, after "--".
+
+    Exits with one line about the first argument that no run could be started with.
+    """
     parser = argparse.ArgumentParser(prog="benchmark.sh", add_help=False, allow_abbrev=False)
     parser.error = lambda message: fail(message.removeprefix("argument "))
     parser.add_argument("preset", nargs="?")
@@ -35,19 +36,54 @@ def parse_args(view, caller, argv):
     parser.add_argument("--metric", choices=("return", "success_rate"), default="return")
     split = argv.index("--") if "--" in argv else len(argv)
     words, extra = argv[:split], argv[split + 1 :]
-    given = {word.partition("=")[0] for word in words if word.startswith("--")}
     preset = words[0] if words and not words[0].startswith("--") else None
     if preset not in PRESETS and not (preset is None and view == "status"):
         named = words[0] if words else ""
         fail(f"unknown preset {named!r}; choose one of {', '.join(PRESETS)}")
-    for name in sorted(given.difference(GRID_OPTIONS)):
-        fail(unknown_option(name))
+    known = [f"--{name.replace('_', '-')}" for name in vars(parser.parse_args([]))]
+    given = {word.partition("=")[0] for word in words if word.startswith("--")}
+    for name in sorted(given.difference(known)):
+        fail(unknown_option(name, known))
     parser.set_defaults(**PRESETS.get(preset, {}))
     args = parser.parse_args(words)
     args.given, args.extra = given, extra
     args.jobs, args.elsewhere = machines()
     args.runs_dir = from_project(caller, args.runs_dir)
+    args.metric = args.metric.replace("_", " ")
+    args.noises_of = preset
+    if args.noises == [[("paper", None)]]:
+        args.noises_of, args.noises = "paper", []
+    check(args)
     return args
+
+
+def check(args):
+    """Exit with one line about an argument that is wrong; give environments their full names."""
+    for algorithm in args.algos:
+        if algorithm not in SEEDS:
+            fail(f"unknown algorithm {algorithm!r}; choose from {', '.join(SEEDS)}")
+    if args.total_timesteps <= 0:
+        fail(f"--total-timesteps must be greater than 0, not {args.total_timesteps}")
+    try:
+        args.envs = list(dict.fromkeys(map(canonical_env_id, args.envs)))
+    except ValueError as error:
+        fail(f"--envs: {error}")
+    for name in ("--exclude", "--budget", "--confirm", "--metric"):
+        if name in args.given and args.preset != "choose":
+            fail(f"{name} is an option of choose")
+    if args.combine and args.preset != "custom":
+        fail("--combine is an option of custom")
+    if args.preset == "choose" and not {"--algos", "--envs"} <= args.given:
+        fail("choose needs --algos and --envs: it chooses a noise for each of them")
+    if args.preset == "choose" and args.seeds:
+        fail("choose picks its own seeds: leave out --seeds; see --budget and --confirm")
+    for script in map(script_of, args.algos):
+        rollout = script_options(script, tuple(args.extra)).get("num-steps", 0)
+        if args.total_timesteps < rollout:
+            fail(
+                f"--total-timesteps must be at least {rollout} for PPO (its --num-steps), not "
+                f"{args.total_timesteps}"
+            )
 
 
 def machines():
@@ -62,18 +98,17 @@ def machines():
     return None if elsewhere else len(os.sched_getaffinity(0)), elsewhere
 
 
-def unknown_option(name):
+def unknown_option(name, known):
     """Say what to write instead of an option that the grid does not have."""
-    scripts = PROJECT.glob(script_of("*"))
-    known = {f"--{option}" for script in scripts for option in defaults(script.name)}
-    if name in known:
+    of_scripts = {f"--{option}" for name in SEEDS for option in defaults(script_of(name))}
+    if name in of_scripts:
         return f"{name} is an option of the scripts: put it at the end, after --"
     if name in EXECUTOR_OPTIONS:  # benchmark.sh reads it, unless it is written with a value
         return f"{name} takes no value"
-    near = difflib.get_close_matches(name, [*GRID_OPTIONS, *EXECUTOR_OPTIONS, *known], n=1)
+    near = difflib.get_close_matches(name, [*known, *EXECUTOR_OPTIONS, *of_scripts], n=1)
     if not near:
         return f"unknown option {name}; ./benchmark.sh --help lists them"
-    after = ", an option of the scripts, at the end after --" if near[0] in known else ""
+    after = ", an option of the scripts, at the end after --" if near[0] in of_scripts else ""
     return f"unknown option {name}; did you mean {near[0]}{after}?"
 
 
@@ -132,37 +167,3 @@ def entry(text):
         reason = f"{text!r}: give each of these noises a rate with @, or none of them"
         raise argparse.ArgumentTypeError(reason)
     return pairs
-
-
-def check_arguments(args):
-    """Exit with one line about the first argument that no run could be started with.
-
-    Environments get their full names on the way.
-    """
-    for algorithm in args.algos:
-        if algorithm not in SEEDS:
-            fail(f"unknown algorithm {algorithm!r}; choose from {', '.join(SEEDS)}")
-    if args.total_timesteps <= 0:
-        fail(f"--total-timesteps must be greater than 0, not {args.total_timesteps}")
-    try:
-        args.envs = list(dict.fromkeys(map(canonical_env_id, args.envs)))
-    except ValueError as error:
-        fail(f"--envs: {error}")
-    for name in ("--exclude", "--budget", "--confirm", "--metric"):
-        if name in args.given and args.preset != "choose":
-            fail(f"{name} is an option of choose")
-    if args.combine and args.preset != "custom":
-        fail("--combine is an option of custom")
-    if args.preset == "choose":
-        if not {"--algos", "--envs"} <= args.given:
-            fail("choose needs --algos and --envs: it chooses a noise for each of them")
-        if "--seeds" in args.given:
-            fail("choose picks its own seeds: leave out --seeds; see --budget and --confirm")
-    for word in args.extra:
-        if not word.startswith("--"):
-            continue
-        name = word.partition("=")[0].removeprefix("--").replace("_", "-")
-        if name in GIVEN_BY_THE_GRID:
-            fail(f"--{name} is part of the grid: use {GIVEN_BY_THE_GRID[name]}, before the --")
-        if name == "overwrite":
-            fail("--overwrite would start interrupted runs afresh: delete their folders instead")

@@ -28,7 +28,7 @@ import stub_run
 from views import ROOT, attempts, finish, folders, locked, log_of, view
 
 from sweep import choose
-from sweep.options import check_arguments, parse_args
+from sweep.options import parse_args
 
 PATH = f"{os.environ['PATH']}:/usr/sbin:/sbin"
 ENV = {**os.environ, "PYTHON": sys.executable, "PATH": PATH}
@@ -435,10 +435,9 @@ def verdicts(out):
 def play(*command):
     """Make a choice's runs in this process, until none is due."""
     args = parse_args("list", "/", command)
-    check_arguments(args)
     while due := [choice.runs[run] for choice in choose.choices(args) for run in choice.state.due]:
         for one in due:
-            stub_run.train([one.script, *one.arguments])
+            stub_run.train(one.command)
 
 
 def undisturbed(folder, *command):

@@ -254,7 +254,7 @@ def test_a_status_makes_no_environment(tmp_path, monkeypatch):
 def test_a_choice_that_has_begun_is_not_asked_again(tmp_path, monkeypatch):
     words = ["--runs-dir", tmp_path, "--noises", f"{SCALE}@1", "--confirm", "4"]
     words += ["--total-timesteps", "4000"]
-    command = choose("Tiny", *words).out.splitlines()[0].split("\t")[2]
+    command = choose("Tiny", *words).out.splitlines()[0].split("\t")[1]
     stub_run.train(shlex.split(command[command.index("ppo_") :]))  # it says that it took 36 seconds
     monkeypatch.setattr(environment, "ask", None)
     shown = choose("Tiny", *words)

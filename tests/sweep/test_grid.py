@@ -31,7 +31,7 @@ def dry_run(*args):
     """Return the grid's lines, each with its text and its options."""
     result = view("list", *args)
     assert result.code == 0, result.err
-    lines = [line.split("\t")[2] for line in result.out.splitlines()]
+    lines = [line.split("\t")[1] for line in result.out.splitlines()]
     assert result.err.startswith(f"{len(lines)} runs")
     parser = argparse.ArgumentParser()
     parser.add_argument("python", choices=[sys.executable])
