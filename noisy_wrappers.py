@@ -89,13 +89,11 @@ __all__ = [
     "RewardNoise",
     "SpaceError",
     "canonical_env_id",
-    "canonical_noises",
     "handle_signals",
     "into_space",
     "make_flat",
     "make_noisy",
     "module_path",
-    "noise_slug",
     "noise_statistics",
     "noise_wrappers",
     "note_versions",
@@ -1173,10 +1171,16 @@ class Configuration:
     def read(
         cls, noises: Sequence[str], rates: Sequence[float | str], *, stored: bool = False
     ) -> "Configuration":
-        """Check noises and rates and make them canonical, as :func:`canonical_noises` says.
+        """Check noises and rates and make them canonical.
 
-        ``stored`` are those of a config.json. They are canonical; one of the user's own is taken as
-        it stands, because its module need not be where its runs are analysed.
+        One rate serves all noises; it is a number in [0, 1], or "start:end" of two such numbers,
+        which is a number if they are equal. Noises of rate 0 are dropped (they are the baseline).
+        Dynamics and action noise come first, where :func:`make_noisy` applies them. ``stored`` are
+        those of a config.json. They are canonical; one of the user's own is taken as it stands,
+        because its module need not be where its runs are analysed.
+
+        Raises:
+            ValueError: a bad noise or rate, or neither one rate nor one for each noise.
         """
         noises = _listed("noises", noises, '["RandomNormalNoisyReward(0.1)"]')
         rates = _listed("rates", rates, "[0.5]")
@@ -1328,26 +1332,6 @@ def _place(wrapper: type[NoiseWrapper]) -> int:
     return {"dynamics": 1, "action": 3}.get(wrapper.kind, 4)
 
 
-def canonical_noises(
-    noises: Sequence[str], rates: Sequence[float | str]
-) -> tuple[list[str], list[float | str]]:
-    """Return noises in canonical notation and one rate for each.
-
-    Noises of rate 0 are dropped (they are the baseline). Dynamics and action noise come first,
-    where :func:`make_noisy` applies them. One rate serves all noises. A rate is a number in
-    [0, 1], or "start:end" of two such numbers, which is a number if they are equal.
-
-    >>> canonical_noises(["RandomNormalNoisyReward(1)", "RandomEarlyTermination(50, 50)"], [0.1])
-    (['RandomEarlyTermination(50)', 'RandomNormalNoisyReward(1.0)'], [0.1, 0.1])
-    >>> canonical_noises(["RandomNormalNoisyReward(1)"], ["1:0"])
-    (['RandomNormalNoisyReward(1.0)'], ['1.0:0.0'])
-
-    Raises:
-        ValueError: a bad noise or rate, or neither one rate nor one for each noise.
-    """
-    return Configuration.read(noises, rates).texts
-
-
 def make_noisy(
     env: Env,
     noises: Sequence[str],
@@ -1369,7 +1353,7 @@ def make_noisy(
     <RandomNormalNoisyReward<RecordEpisodeStatistics<CartPoleEnv<CartPole-v1>>>>
 
     Raises:
-        ValueError: as :func:`canonical_noises`, a space that a noise cannot work on, or an
+        ValueError: as :meth:`Configuration.read`, a space that a noise cannot work on, or an
             environment that records its episodes already; if it shows this only when an episode
             ends, by an "episode" in its info, the error comes then.
         TypeError: not a single environment (a vector environment, for example).
@@ -1495,15 +1479,6 @@ def _call_each(env: Any, method: str, *args: Any, **kwargs: Any) -> Sequence[Any
 
 
 # ----------------------------------------------------------------------- names of files and folders
-
-
-def noise_slug(noises: Sequence[str], rates: Sequence[float | str]) -> str:
-    """Return noises as a part of a file's name, "" for none; equal configurations have equal ones.
-
-    >>> noise_slug(["RandomUniformScaleReward(.5, 1.5)"], [0.05])
-    'p0.05_UniformScaleReward_0.5_1.5'
-    """
-    return Configuration.read(noises, rates).slug
 
 
 def run_name(

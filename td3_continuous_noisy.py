@@ -425,7 +425,7 @@ def make_envs(args):
         fail("--cuda: PyTorch finds no GPU; leave it out to run on the CPU")
     try:
         env_id = noisy.canonical_env_id(args.env_id)
-        noise, noise_rate = noisy.canonical_noises(args.noise, args.noise_rate)
+        noise, noise_rate = noisy.Configuration.read(args.noise, args.noise_rate).texts
     except ValueError as error:
         fail(error)
     limit = {"max_episode_steps": args.max_episode_steps}
