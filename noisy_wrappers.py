@@ -1696,8 +1696,8 @@ def _keys(keys: Any) -> Keys | None:
     if keys is None:
         return None
     found = (keys,) if isinstance(keys, str | int) else keys
-    of_one_kind = isinstance(found, tuple | list) and len({*map(type, found)} & {str, int}) == 1
-    if not of_one_kind or len({*map(type, found)}) > 1:
+    kinds = {type(key) for key in found} if isinstance(found, tuple | list) else set()
+    if kinds not in ({str}, {int}):
         raise ValueError(f"keys must be a tuple of names, or of indices of a Tuple, got {keys!r}")
     return tuple(sorted(set(found)))
 
@@ -1858,23 +1858,16 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and check the first observation."""
         self._steps = 0
-        try:
+        with self._calling("reset(seed=..., options=...) must return (observation, info)"):
             observation, info = self.env.reset(seed=seed, options=options)
-        except (TypeError, ValueError) as error:
-            wanted = "reset(seed=..., options=...) must return (observation, info)"
-            self._refuse_old_api(wanted, error)
-            raise
         return self._checked(observation), dict(info or {})
 
     def step(self, action: Any) -> Step:
         """Step the environment and check the observation and the reward."""
         self._steps += 1
-        try:
+        values = "(observation, reward, terminated, truncated, info)"
+        with self._calling(f"step() must return {values}"):
             observation, reward, terminated, truncated, info = self.env.step(copy.copy(action))
-        except (TypeError, ValueError) as error:
-            values = "(observation, reward, terminated, truncated, info)"
-            self._refuse_old_api(f"step() must return {values}", error)
-            raise
         number = math.nan
         if not isinstance(reward, str):
             with contextlib.suppress(TypeError, ValueError):  # of None, or of several numbers
@@ -1907,14 +1900,25 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             parts[path] = part
         return _replaced(observation, parts) if parts else observation
 
-    def _refuse_old_api(self, wanted: str, error: Exception) -> None:
-        """Raise SpaceError if a wrapper, not the environment's code, failed to call or unpack."""
-        *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-        place = frame.f_globals.get("__name__", "")
-        is_old = re.search("unpack|unexpected keyword", str(error))
-        if is_old and place.startswith(("gymnasium.core", "gymnasium.wrappers.", __name__)):
-            at = f"step {self._steps} of an episode"
-            raise SpaceError(f"{at}: the environment's {wanted}: {error}") from error
+    @contextlib.contextmanager
+    def _calling(self, wanted: str) -> Iterator[None]:
+        """Say what is wrong if a wrapper, not the environment's code, failed to call or unpack.
+
+        An exit becomes an error, because a run would seem to have ended well.
+        """
+        at = f"step {self._steps} of an episode: the environment"
+        try:
+            yield
+        except SystemExit as error:
+            text = f"{at} called sys.exit({error.code!r})"
+            raise RuntimeError(text).with_traceback(error.__traceback__) from None
+        except (TypeError, ValueError) as error:
+            *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+            place = frame.f_globals.get("__name__", "")
+            is_old = re.search("unpack|unexpected keyword", str(error))
+            if is_old and place.startswith(("gymnasium.core", "gymnasium.wrappers.", __name__)):
+                raise SpaceError(f"{at}'s {wanted}: {error}") from error
+            raise
 
     def _blame(self, what: str, value: Any, action: Any) -> None:
         """Stop at a value that is not finite, or rather at an action that was not, either."""
