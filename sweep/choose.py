@@ -27,18 +27,19 @@ from sweep.grid import PlannedRun, configuration_of, configurations, make_run, r
 class Choice(NamedTuple):
     """The choice of a noise for one algorithm and environment, as far as it has come."""
 
-    name: str  # "PPO on Hopper-v5"
-    algorithm: str
-    env_id: str
+    kind: tuple[str, str]  # algorithm, environment
     noises: int  # that it began with
     schedule: list[tuple[int, int]]  # of its search
-    confirm: int  # fresh seeds of the confirmation
     state: halving.State
     runs: dict[tuple[Configuration, int], PlannedRun]  # those that have been due so far
-    returns: dict[tuple[Configuration, int], float]  # of those that are finished
+    returns: dict[tuple[Configuration, int], float]  # of the finished ones: returns, or the metric
     spread: float  # standard deviation over seeds of the search's last tests; NaN if unknown
     run_seconds: float | None  # about what a run takes, if anything tells
-    metric: str  # "return", or "success rate": then `returns` has rates of success in percent
+
+    @property
+    def name(self):
+        """The choice in a sentence."""
+        return f"{self.kind[0].upper()} on {self.kind[1]}"
 
 
 def choices(args, ask=False, keep=False):
@@ -55,7 +56,7 @@ def choices(args, ask=False, keep=False):
         )
     known = {env_id: remembered(args.runs_dir, env_id) for env_id in args.envs}
     found = [follow(args, *pair, known[pair[1]]) for pair in pairs]
-    new = [(c.algorithm, c.env_id) for c in found if ask and not c.returns]
+    new = [choice.kind for choice in found if ask and not choice.returns]
     if not new:
         return found
     noises = {env_id: candidates(args, algorithm, env_id) for algorithm, env_id in new}
@@ -85,7 +86,6 @@ def follow(args, algorithm, env_id, environment):
 
     environment: what is known of it, or None.
     """
-    name = f"{algorithm.upper()} on {env_id}"
     noises = candidates(args, algorithm, env_id, environment.unfit if environment else {})
     budget = 3 * len(noises) if args.budget is None else args.budget
     if budget < len(noises):
@@ -102,31 +102,21 @@ def follow(args, algorithm, env_id, environment):
             f"{one} and {other} were not tested at the same steps: choose another --runs-dir, or "
             "move the runs of one kind away"
         )
-    results = set().union(*(values for _, values in tests.values()))
-    if len(results) == 1 and (state.rounds or not state.due):
-        fail(
-            f"{name}: {what_all_runs_do(*results, args.metric)} in {args.total_timesteps:,} steps "
-            f"(runs: {len(returns)}), so further runs would say nothing about noise; change "
-            "--total-timesteps, or leave this out",
-            code=1,
-        )
+    spread = halving.spread({run: values[-1] for run, (_, values) in tests.items()})
     seconds = wall_time(map(runs.get, returns))
     if environment and seconds is None:
         seconds = run_seconds(next(iter(runs.values())), environment)
-    return Choice(
-        name=name,
-        algorithm=algorithm,
-        env_id=env_id,
-        noises=len(noises),
-        schedule=schedule,
-        confirm=args.confirm,
-        state=state,
-        runs=runs,
-        returns=returns,
-        spread=halving.spread({run: values[-1] for run, (_, values) in tests.items()}),
-        run_seconds=seconds,
-        metric=args.metric,
-    )
+    kind = algorithm, env_id
+    choice = Choice(kind, len(noises), schedule, state, runs, returns, spread, seconds)
+    results = set().union(*(values for _, values in tests.values()))
+    if len(results) == 1 and (state.rounds or not state.due):
+        fail(
+            f"{choice.name}: {what_all_runs_do(*results, args.metric)} in "
+            f"{args.total_timesteps:,} steps (runs: {len(returns)}), so further runs would say "
+            "nothing about noise; change --total-timesteps, or leave this out",
+            code=1,
+        )
+    return choice
 
 
 def walk(args, algorithm, env_id, noises, budget):
@@ -135,14 +125,13 @@ def walk(args, algorithm, env_id, noises, budget):
     Returns the state; the runs that were due; the steps and the results of the tests of those that
     are finished; and their scores. All but the state are {(configuration, seed): ...}.
     """
-    rounds = len(halving.schedule(len(noises), budget))
     runs, tests, returns = {}, {}, {}
     while True:
         state = halving.advance(noises, budget, args.confirm, returns)
         if runs.keys() >= set(state.due):  # they have not finished
             return state, runs, tests, returns
-        phase = SEARCH if len(state.rounds) < rounds else CONFIRMATION
         for noise, seed in state.due:
+            phase = SEARCH if seed < FIRST_CONFIRMATION_SEED else CONFIRMATION
             run, row = read(make_run(args, algorithm, env_id, noise, seed, phase))
             runs[noise, seed] = run
             if row:
@@ -203,25 +192,24 @@ def plan(found, args):
         return []
     lines = list(map(describe, found))
     if not any(choice.returns for choice in found):
-        lines = [*map(question, found), *lines]
+        lines = [*(question(choice, args.confirm) for choice in found), *lines]
     lines.append(total(found, args))
-    lines += filter(None, (detectable_gain(choice, len(found)) for choice in found))
+    lines += filter(None, (detectable_gain(choice, args, len(found)) for choice in found))
     return [*dict.fromkeys(lines), f"runs, logs and the verdict are stored in {args.runs_dir}"]
 
 
-def question(choice):
+def question(choice, confirm):
     """Say what a choice will decide."""
     which = f"the best of {choice.noises} noises" if choice.noises > 1 else "the noise"
     return (
-        f"{choice.name}: is {which} better than no noise? "
-        f"{choice.confirm} fresh seeds of each will decide"
+        f"{choice.name}: is {which} better than no noise? {confirm} fresh seeds of each will decide"
     )
 
 
 def total(found, args):
     """Say how many runs all choices take, and what is left of them."""
     search = sum(noises * seeds for choice in found for noises, seeds in choice.schedule)
-    confirm = sum(2 * choice.confirm for choice in found)
+    confirm = 2 * args.confirm * len(found)
     finished = sum(len(choice.returns) for choice in found)
     text = (
         f"{search + confirm} runs in all, {search} to search and {confirm} to confirm; "
@@ -229,21 +217,22 @@ def total(found, args):
     )
     if any(choice.run_seconds is None for choice in found):
         return text
-    batches = [sum(batch, []) for batch in itertools.zip_longest(*map(left, found), fillvalue=[])]
+    batches = [left(choice, args.confirm) for choice in found]
+    batches = [sum(batch, []) for batch in itertools.zip_longest(*batches, fillvalue=[])]
     return f"{text}, {time_left(batches, args.jobs, args.elsewhere and not finished)}"
 
 
-def left(choice):
+def left(choice, confirm):
     """Return the batches that are left, each as the seconds of its runs."""
-    numbers = [noises * seeds for noises, seeds in choice.schedule] + [2 * choice.confirm]
+    numbers = [noises * seeds for noises, seeds in choice.schedule] + [2 * confirm]
     numbers = [len(choice.state.due), *numbers[len(choice.state.rounds) + 1 :]]
     return [number * [choice.run_seconds] for number in numbers]
 
 
-def detectable_gain(choice, verdicts):
+def detectable_gain(choice, args, verdicts):
     """Say what gain the confirmation can show, or nothing once runs are done without a spread."""
-    gain = detectable_shift(choice.confirm, choice.confirm, halving.LEVEL / verdicts)
-    seeds = f"{choice.confirm} fresh seeds confirm a true gain of"
+    gain = detectable_shift(args.confirm, args.confirm, halving.LEVEL / verdicts)
+    seeds = f"{args.confirm} fresh seeds confirm a true gain of"
     power = "with 80 % power" + (f", corrected for {verdicts} verdicts" if verdicts > 1 else "")
     if not choice.returns:
         return f"{seeds} {gain:.1f} standard deviations over seeds {power}"
@@ -251,7 +240,7 @@ def detectable_gain(choice, verdicts):
         return ""
     shift = gain * choice.spread
     return (
-        f"{choice.name}: {seeds} about {rounded(shift, shift)}{unit(choice)} ({gain:.1f} standard "
+        f"{choice.name}: {seeds} about {rounded(shift, shift)}{unit(args)} ({gain:.1f} standard "
         f"deviations of the last tests in the search) {power}"
     )
 
@@ -277,12 +266,12 @@ def standing(found, args):
     When all choices are finished, these are the verdicts.
     """
     if not any(choice.state.due for choice in found):
-        yield from (sentence for _, sentence in verdicts(found))
+        yield from (sentence for _, sentence in verdicts(found, args))
         return
     for choice in found:
         yield describe(choice)
         if choice.state.due and choice.state.rounds:
-            yield f"  mean {choice.metric} after round {len(choice.state.rounds)}:"
+            yield f"  mean {args.metric} after round {len(choice.state.rounds)}:"
             scores = choice.state.rounds[-1].scores
             for noise in sorted(choice.state.noises, key=scores.get, reverse=True):
                 yield f"  {rounded(scores[noise]):>10}  {noise}"
@@ -294,33 +283,33 @@ def report(found, args):
     if any(choice.state.due for choice in found):
         lines = [obstacle(choice) if choice.state.due else describe(choice) for choice in found]
     else:
-        lines, rows = [], []
-        for choice, (helped, sentence) in zip(found, verdicts(found), strict=True):
-            names = choice.algorithm.upper(), choice.env_id
+        judged, rows = verdicts(found, args), []
+        for choice, (helped, _) in zip(found, judged, strict=True):
+            names = choice.kind[0].upper(), choice.kind[1]
             rows += halving.records(*names, choice.state, choice.returns, helped)
-            lines.append(sentence)
         write_choice(Path(args.runs_dir, "choice.csv"), rows)
+        lines = [sentence for _, sentence in judged]
     print(*lines, sep="\n")
 
 
-def unit(choice):
+def unit(args):
     """Return what stands behind a difference."""
-    return POINTS if choice.metric == SUCCESS else ""
+    return POINTS if args.metric == SUCCESS else ""
 
 
-def verdicts(found):
+def verdicts(found, args):
     """Return of finished choices whether the noise helps, and the verdict in a sentence."""
-    comparisons = []
-    for choice in found:
-        comparison = halving.compare(*choice.state.noises, choice.state.seeds, choice.returns)
-        if choice.metric == SUCCESS:
-            comparison = comparison._replace(difference_percent=math.nan)  # never percent of a rate
-        comparisons.append(comparison)
+    comparisons = [
+        halving.compare(*choice.state.noises, choice.state.seeds, choice.returns)
+        for choice in found
+    ]
     corrected = holm([comparison.p for comparison in comparisons])
     judged = []
     for choice, comparison, p in zip(found, comparisons, corrected, strict=True):
+        if args.metric == SUCCESS:
+            comparison = comparison._replace(difference_percent=math.nan)  # never percent of a rate
         what = choice.name, *choice.state.noises, choice.noises, comparison, p, len(found)
-        judged.append((halving.helps(comparison, p), halving.sentence(*what, unit(choice))))
+        judged.append((halving.helps(comparison, p), halving.sentence(*what, unit(args))))
     return judged
 
 

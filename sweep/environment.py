@@ -43,25 +43,19 @@ class Environment(NamedTuple):
     unfit: dict[str, str]  # noises that cannot act here, as Configuration.noise -> why
 
 
-class Refused(Exception):
-    """The environment cannot be trained in; the message says why, in one line."""
-
-
 # ------------------------------------------------------------------------------------- the question
 
 
 def ask(env_id, configurations=(), max_episode_steps=None, clock=time.perf_counter):
     """Make an environment as the scripts do, time it, and try configurations of noise on it.
 
-    clock: what times the environment. Raises Refused if it cannot be made or played.
+    clock: what times the environment. What it raises if it cannot be made or played passes through.
     """
     deadline = time.perf_counter() + PATIENCE
-    try:
-        with contextlib.redirect_stdout(sys.stderr), contextlib.ExitStack() as stack:
-            env = gym.make(env_id, disable_env_checker=True, max_episode_steps=max_episode_steps)
-            declared = env.spec.max_episode_steps
-            env = noisy.make_flat(env, constant("sac_continuous_noisy.py", "STEP_LIMIT"))
-            stack.callback(env.close)
+    with contextlib.redirect_stdout(sys.stderr):
+        made = gym.make(env_id, disable_env_checker=True, max_episode_steps=max_episode_steps)
+        declared = made.spec.max_episode_steps
+        with noisy.make_flat(made, constant("sac_continuous_noisy.py", "STEP_LIMIT")) as env:
             limit = env.spec.max_episode_steps
             seconds, steps, length = time_steps(env, limit, deadline, clock)
             env.reset()  # a failure after this one is the noise's
@@ -74,9 +68,6 @@ def ask(env_id, configurations=(), max_episode_steps=None, clock=time.perf_count
                 bounded=bool(np.isfinite([env.action_space.low, env.action_space.high]).all()),
                 unfit={noise.noise: reason for noise, reason in reasons.items() if reason},
             )
-    except Exception as error:
-        plain = *noisy.refusals(env_id), noisy.NotFiniteError
-        raise Refused(with_place(error, plain)) from error
 
 
 def time_steps(env, time_limit, deadline, clock):
@@ -142,8 +133,9 @@ def ask_all(args, configurations):
     for env_id, noises in configurations.items():
         try:
             answer = ask(env_id, noises, options["max-episode-steps"])
-        except Refused as error:  # others may be wrong, too
-            reasons.append(f"no algorithm can be trained in {env_id}: {error}")
+        except Exception as error:  # others may be wrong, too
+            reason = with_place(error, (*noisy.refusals(env_id), noisy.NotFiniteError))
+            reasons.append(f"no algorithm can be trained in {env_id}: {reason}")
             continue
         speed = f"{env_id}: {float(f'{1000 * answer.step_seconds:.2g}'):g} ms a step"
         if answer.timed_steps < STEPS:

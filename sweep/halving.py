@@ -14,23 +14,15 @@ baseline on fresh seeds, in one comparison that is fixed beforehand.
 """
 
 import math
+from itertools import count
 from statistics import fmean, variance
 from typing import NamedTuple
 
 import numpy as np
 
-from analysis import statistics
+from analysis import statistics, verdicts
 from analysis.runs import FIRST_CONFIRMATION_SEED
 from analysis.statistics import LEVEL  # of a verdict, two-sided, over all verdicts of one command
-from analysis.verdicts import (
-    borderline,
-    corrected,
-    difference,
-    p_value,
-    significant,
-    smallest,
-    spread_of,
-)
 from noisy_wrappers import BASELINE, Configuration, rounded
 
 SCORED = 0.15  # a run's score in the search is the mean of its tests in this last part of its steps
@@ -131,12 +123,9 @@ def missing(noises, seeds, returns):
 # ----------------------------------------------------------------------------------- the comparison
 
 
-def fewest_seeds(verdicts):
+def fewest_seeds(comparisons):
     """Return the smallest number of fresh seeds with which every verdict can be significant."""
-    seeds = 4
-    while 2 / math.comb(2 * seeds, seeds) > LEVEL / verdicts:
-        seeds += 1
-    return seeds
+    return next(n for n in count(4) if 2 / math.comb(2 * n, n) <= LEVEL / comparisons)
 
 
 def compare(winner, seeds, returns):
@@ -147,34 +136,31 @@ def compare(winner, seeds, returns):
 
 def helps(comparison, p_corrected):
     """Tell whether the noise was shown to be better than none."""
-    return significant(p_corrected) and comparison.t > 0
+    return verdicts.significant(p_corrected) and comparison.t > 0
 
 
-def sentence(name, winner, noises, comparison, p_corrected, verdicts, unit=""):
+def sentence(name, winner, noises, comparison, p_corrected, comparisons, unit=""):
     """Say in one plain sentence what came out.
 
-    name: the algorithm and the environment. noises: how many were searched. verdicts: for how many
-    verdicts p is corrected. unit: of the difference.
+    name: the algorithm and the environment. noises: how many were searched. comparisons: for how
+    many p is corrected. unit: of the difference.
     """
-    start = f"{name}:"
-    evidence = f"{comparison.n} fresh seeds, {difference(comparison, unit)}"
-    evidence += f", p {p_value(comparison.p)}"
-    evidence += smallest(comparison) + corrected(p_corrected, verdicts, "verdict")
-    end = f".{borderline(comparison)}"
+    evidence = f"{comparison.n} fresh seeds, {verdicts.difference(comparison, unit)}"
+    evidence += f", p {verdicts.p_value(comparison.p)}{verdicts.smallest(comparison)}"
+    evidence += verdicts.corrected(p_corrected, comparisons, "verdict")
+    end = f".{verdicts.borderline(comparison)}"
     if helps(comparison, p_corrected):
-        return f"{start} {winner} beats no noise: {evidence}{end}"
+        return f"{name}: {winner} beats no noise: {evidence}{end}"
+    start = f"{name}: none of {noises} noises could be shown to help; the best of them, {winner}"
     if noises == 1:
-        start += f" {winner} could not be shown to help"
-    else:
-        start += f" none of {noises} noises could be shown to help; the best of them, {winner}"
-    if significant(p_corrected):
+        start = f"{name}: {winner} could not be shown to help"
+    if verdicts.significant(p_corrected):
         return f"{start}, is worse than no noise: {evidence}{end}"
     if comparison.detectable > 0:
-        found = rounded(comparison.detectable, spread_of(comparison))
-        evidence += (
-            f"; with {comparison.n} seeds a difference of {found}{unit} would have been seen"
-        )
-        evidence += " (80 % power before the correction)" if verdicts > 1 else " (80 % power)"
+        seen = rounded(comparison.detectable, verdicts.spread_of(comparison))
+        power = "80 % power before the correction" if comparisons > 1 else "80 % power"
+        evidence += f"; with {comparison.n} seeds a difference of {seen}{unit} would have been seen"
+        evidence += f" ({power})"
     return f"{start}: {evidence}{end}"
 
 
