@@ -1,15 +1,9 @@
-"""How far a sweep has come, in six views.
+"""How far a sweep has come, in the views that benchmark.sh asks for.
 
-benchmark.sh calls this file from the project's folder:
+    python -m sweep VIEW FOLDER PRESET ...
 
-    python -m sweep list FOLDER PRESET ...     a line for each run to do: folder, command
-    python -m sweep dry-run FOLDER PRESET ...  the same, after their cost is said on stderr
-    python -m sweep status FOLDER PRESET ...   a summary, the failed runs, the slowest running ones
-    python -m sweep stopped FOLDER PRESET ...  a summary and the failed runs of a stopped sweep
-    python -m sweep report FOLDER PRESET ...   a summary, and what did not finish: exit status 1
-    python -m sweep watch FOLDER PRESET ...    the summary, again and again
-
-FOLDER is the one that benchmark.sh was called from: relative paths count from there.
+VIEW is one of VIEWS. FOLDER is the one that benchmark.sh was called from: relative paths count from
+there.
 
 A run is done when its folder holds result.json, and running while a process holds its lock. How it
 ended otherwise is read from its log, which benchmark.sh ends with the run's exit status. A run on a
@@ -24,7 +18,6 @@ import tempfile
 import time
 from collections import Counter
 from datetime import timedelta
-from functools import partial
 from statistics import harmonic_mean
 from typing import NamedTuple
 
@@ -115,10 +108,10 @@ def table(title, rows):
 # ------------------------------------------------- the views, which may return an exit status
 
 
-def show_list(args, runs, choices, with_cost=False):
+def show_list(args, runs, choices):
     """Print the runs to do for benchmark.sh: folder and command; on stderr how many there are.
 
-    with_cost: also what they will take. A choice says it of each of its batches.
+    A dry run also says what they will take; a choice says it of each of its batches.
     """
     done, todo = [], []
     for run in runs:
@@ -135,7 +128,7 @@ def show_list(args, runs, choices, with_cost=False):
         from sweep import choose
 
         plan = choose.plan(choices, args)
-    elif with_cost and todo:
+    elif args.view == "dry-run" and todo:
         plan[0] += "; " + cost(args, done, todo)
     for line in plan:
         print(line, file=sys.stderr)
@@ -231,7 +224,7 @@ def check_disk(folder):
 
 VIEWS = {
     "list": show_list,
-    "dry-run": partial(show_list, with_cost=True),
+    "dry-run": show_list,
     "status": show_status,
     "stopped": show_stopped,
     "report": show_report,
@@ -249,11 +242,11 @@ def main(view, caller, argv):
     elif args.preset == "choose":
         from sweep import choose  # and with it pandas: no other preset should wait for that
 
-        ask = view in ("list", "dry-run")
-        choices = choose.choices(args, ask, keep=view == "list")
-        runs = choose.planned_runs(choices)
+        choices = choose.choices(args)
+        runs = [run for choice in choices for run in choice.runs.values()]
     else:
         runs = grid(args)
+    runs.sort(key=lambda run: run.seed)  # the first seed of everything first
     return VIEWS[view](args, runs, choices) or 0
 
 

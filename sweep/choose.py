@@ -42,10 +42,10 @@ class Choice(NamedTuple):
         return f"{self.kind[0].upper()} on {self.kind[1]}"
 
 
-def choices(args, ask=False, keep=False):
+def choices(args):
     """Return the choices of one command, or exit if its numbers make no choice.
 
-    ask: make and time the environments of choices that have not begun. keep: what they answer.
+    Where runs are listed, the environments of choices that have not begun are made and timed.
     """
     pairs = list(itertools.product(dict.fromkeys(args.algos), args.envs))
     fewest = halving.fewest_seeds(len(pairs))
@@ -56,14 +56,15 @@ def choices(args, ask=False, keep=False):
         )
     known = {env_id: remembered(args.runs_dir, env_id) for env_id in args.envs}
     found = [follow(args, *pair, known[pair[1]]) for pair in pairs]
-    new = [choice.kind for choice in found if ask and not choice.returns]
+    listed = args.view in ("list", "dry-run")
+    new = [choice.kind for choice in found if listed and not choice.returns]
     if not new:
         return found
     noises = {env_id: candidates(args, algorithm, env_id) for algorithm, env_id in new}
     for env_id, answer in ask_all(args, noises).items():
         leave_out(args, env_id, answer.unfit)
         known[env_id] = answer
-        if keep:
+        if args.view == "list":
             remember(args.runs_dir, env_id, answer)
     return [follow(args, *pair, known[pair[1]]) for pair in pairs]
 
@@ -155,12 +156,6 @@ def read(run):
         return run, row
     damage = f"{run.folder}/{row['reason']}; move its folder away to run it again"
     return run._replace(damage=damage), None
-
-
-def planned_runs(found):
-    """Return the runs of all choices, the first seed of everything first."""
-    runs = [run for choice in found for run in choice.runs.values()]
-    return sorted(runs, key=lambda run: run.seed)
 
 
 def candidates(args, algorithm, env_id, unfit=()):

@@ -246,15 +246,15 @@ def make_run(args, algorithm, env_id, configuration, seed, phase=""):
 
 
 def grid(args):
-    """Return the runs, each once, the first seed of everything first."""
+    """Return the runs, each once."""
     runs = {}
     for algorithm, env_id in itertools.product(args.algos, args.envs):
         noisy = configurations(args, algorithm, env_id)
-        for seed in set(itertools.chain(*(args.seeds or [SEEDS[algorithm]]))):
+        for seed in sorted(itertools.chain(*(args.seeds or [SEEDS[algorithm]]))):
             for configuration in [BASELINE, *noisy]:
                 run = make_run(args, algorithm, env_id, configuration, seed)
                 runs.setdefault(run.folder, run)
-    return sorted(runs.values(), key=lambda run: run.seed)
+    return list(runs.values())
 
 
 def runs_in(folder):

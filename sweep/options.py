@@ -46,7 +46,7 @@ def parse_args(view, caller, argv):
         fail(unknown_option(name, known))
     parser.set_defaults(**PRESETS.get(preset, {}))
     args = parser.parse_args(words)
-    args.given, args.extra = given, extra
+    args.view, args.given, args.extra = view, given, extra
     args.jobs, args.elsewhere = machines()
     args.runs_dir = from_project(caller, args.runs_dir)
     args.metric = args.metric.replace("_", " ")

@@ -80,7 +80,7 @@ DAMAGED_TESTS = {  # of eval.csv
 def searched(tmp_path_factory):
     """A choice in two environments after its first batch: two noises in each."""
     folder = tmp_path_factory.mktemp("choice")
-    args = parse_args("list", "/", [*CHOOSE, "--runs-dir", str(folder)])
+    args = parse_args("status", "/", [*CHOOSE, "--runs-dir", str(folder)])
     for found in choose.choices(args):
         for run in found.runs.values():
             stub_run.train(run.command)

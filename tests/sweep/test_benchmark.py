@@ -434,7 +434,7 @@ def verdicts(out):
 
 def play(*command):
     """Make a choice's runs in this process, until none is due."""
-    args = parse_args("list", "/", command)
+    args = parse_args("status", "/", command)
     while due := [choice.runs[run] for choice in choose.choices(args) for run in choice.state.due]:
         for one in due:
             stub_run.train(one.command)

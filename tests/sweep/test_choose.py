@@ -298,7 +298,7 @@ def test_records_of_choice_csv():
 
 def arguments(text, tmp_path):
     words = [*text.split(" | "), "--total-timesteps", "4000", "--runs-dir", str(tmp_path)]
-    args = parse_args("list", "/", ["choose", *words])
+    args = parse_args("status", "/", ["choose", *words])
     return args
 
 
@@ -423,9 +423,8 @@ def test_the_readme_says_what_it_takes_by_default(tmp_path):
     pattern = r"takes (\d+) runs of a .*: about (\d+) core-hours with PPO and (\d+) with SAC in a"
     runs, *hours = map(int, re.search(pattern, text).groups())
     for algorithm, announced in zip(("ppo", "sac"), hours, strict=True):
-        args = parse_args(
-            "list", str(tmp_path), ["choose", "--algos", algorithm, "--envs", "Hopper"]
-        )
+        words = ["choose", "--algos", algorithm, "--envs", "Hopper", "--runs-dir", str(tmp_path)]
+        args = parse_args("status", "/", words)
         known = Environment(0.05e-3, 200, 1000, 11, True, {})
         remember(args.runs_dir, "Hopper-v5", known)
         choices = choose.choices(args)
@@ -437,7 +436,7 @@ def test_the_default_noises_and_those_of_the_paper(tmp_path):
     words = f"choose --algos ppo --envs Pendulum-v1 --runs-dir {tmp_path}"
 
     def tried(more=""):
-        args = parse_args("list", "/", f"{words} {more}".split())
+        args = parse_args("status", "/", f"{words} {more}".split())
         [choice] = choose.choices(args)
         return choice.state.noises
 
