@@ -123,10 +123,8 @@ done
   fail "--slurm-args and --wait belong to --executor slurm"
 [ "${grid[0]:-}" != choose ] || wait=1 # for each batch of runs: their returns decide on the next
 
-if [ -z "${PYTHON:-}" ]; then
-  if [ -x .venv/bin/python ]; then PYTHON=.venv/bin/python; else PYTHON=python; fi
-fi
-export PYTHON
+[ -n "${PYTHON:-}" ] || [ ! -x .venv/bin/python ] || PYTHON=.venv/bin/python
+export PYTHON=${PYTHON:-python}
 # An environment of the user's own lies where the command was given
 [ "$caller" = "$(pwd -P)" ] || export PYTHONPATH="${PYTHONPATH:+$PYTHONPATH:}$caller"
 lacking=$("$PYTHON" -c "import sys, importlib.util as u
@@ -140,10 +138,7 @@ show() {
   SWEEP_EXECUTOR=$executor SWEEP_JOBS=$jobs SWEEP_HOSTS=$sshlogin OMP_NUM_THREADS=1 \
     "$PYTHON" -m sweep "$1" "$caller" ${grid[@]+"${grid[@]}"}
 }
-if [ $view = status ]; then
-  show status
-  exit
-fi
+[ $view != status ] || { show status; exit; }
 
 # sets `todo`: the runs to do, but for those that were tried, a line each: folder, command.
 # LC_ALL=C: folders may have names that are not UTF-8

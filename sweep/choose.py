@@ -212,16 +212,13 @@ def total(found, args):
     )
     if any(choice.run_seconds is None for choice in found):
         return text
-    batches = [left(choice, args.confirm) for choice in found]
-    batches = [sum(batch, []) for batch in itertools.zip_longest(*batches, fillvalue=[])]
+    left = []  # of each choice, the batches that are left: the seconds of their runs
+    for choice in found:
+        runs = [noises * seeds for noises, seeds in choice.schedule] + [2 * args.confirm]
+        runs = [len(choice.state.due), *runs[len(choice.state.rounds) + 1 :]]
+        left.append([number * [choice.run_seconds] for number in runs])
+    batches = [sum(batch, []) for batch in itertools.zip_longest(*left, fillvalue=[])]
     return f"{text}, {time_left(batches, args.jobs, args.elsewhere and not finished)}"
-
-
-def left(choice, confirm):
-    """Return the batches that are left, each as the seconds of its runs."""
-    numbers = [noises * seeds for noises, seeds in choice.schedule] + [2 * confirm]
-    numbers = [len(choice.state.due), *numbers[len(choice.state.rounds) + 1 :]]
-    return [number * [choice.run_seconds] for number in numbers]
 
 
 def detectable_gain(choice, args, verdicts):

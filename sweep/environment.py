@@ -156,25 +156,20 @@ def ask_all(args, configurations):
 
 def run_seconds(run, environment):
     """Return about how many seconds a run takes: learning, the environment's steps, tests."""
-    learned = max(0, run.total_timesteps - run.options.get("learning-starts", 0))
-    test_steps = number_of_tests(run) * run.options["eval-episodes"] * environment.episode_steps
-    playing = (run.total_timesteps + test_steps) * environment.step_seconds
-    return START_UP + learned * learning_seconds(run.kind[0], environment) + playing
+    steps, frequency = run.total_timesteps, run.options["eval-frequency"]
+    if frequency is None:
+        frequency = max(1, min(constant(run.command[0], "EVAL_FREQUENCY"), steps // 10))
+    tests = math.ceil(steps / frequency) if frequency else 1
+    test_steps = tests * run.options["eval-episodes"] * environment.episode_steps
+    learned = max(0, steps - run.options.get("learning-starts", 0))
+    learning = learned * learning_seconds(run.kind[0], environment)
+    return START_UP + learning + (steps + test_steps) * environment.step_seconds
 
 
 def learning_seconds(algorithm, environment):
     """Return about how many seconds an algorithm learns for each step of an environment."""
     base, for_each = LEARNING[algorithm]
     return base + for_each * environment.observed
-
-
-def number_of_tests(run):
-    """Return how often a run tests its policy."""
-    frequency = run.options["eval-frequency"]
-    if frequency is None:
-        most = constant(run.command[0], "EVAL_FREQUENCY")
-        frequency = max(1, min(most, run.total_timesteps // 10))
-    return math.ceil(run.total_timesteps / frequency) if frequency else 1
 
 
 @functools.cache

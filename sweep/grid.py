@@ -184,19 +184,12 @@ def preset_pairs(preset, algorithm, env_id):
     """Return a preset's (noise, rate) pairs for one algorithm and environment."""
     if preset != "best":
         return PAIRS.get(preset, [])
-    pair = best_pairs().get((algorithm, env_id.rpartition("-v")[0]))
-    return [pair] if pair else fail(f"the paper has no best noise for {algorithm} on {env_id}")
-
-
-@functools.cache
-def best_pairs():
-    """Return the paper's best noise and rate for each algorithm and environment."""
-    pairs = {}
     with open(PROJECT / "results/paper/best.csv", newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
             case = row["algorithm"].lower(), row["environment"].rpartition("-v")[0]
-            pairs[case] = row["noise_as_run"], float(row["noise_rate"])
-    return pairs
+            if case == (algorithm, env_id.rpartition("-v")[0]):
+                return [(row["noise_as_run"], float(row["noise_rate"]))]
+    return fail(f"the paper has no best noise for {algorithm} on {env_id}")
 
 
 def configurations(args, algorithm, env_id):

@@ -1,6 +1,7 @@
 """The arguments of benchmark.sh that name a grid; `./benchmark.sh --help` explains them."""
 
 import argparse
+import contextlib
 import difflib
 import os
 import re
@@ -127,14 +128,10 @@ def from_project(caller, text):
 
 def whole_number(text):
     """Read "1000000" or "1e6"."""
-    try:
-        value = float(text)
-        if value != int(value):
-            raise ValueError
-    except (ValueError, OverflowError):
-        reason = f"{text!r} is not a whole number, such as 1000000 or 1e6"
-        raise argparse.ArgumentTypeError(reason) from None
-    return int(value)
+    with contextlib.suppress(ValueError):
+        if float(text).is_integer():
+            return int(float(text))
+    raise argparse.ArgumentTypeError(f"{text!r} is not a whole number, such as 1000000 or 1e6")
 
 
 def seeds(text):
