@@ -537,6 +537,7 @@ def test_a_bad_run_is_named_and_the_others_are_tested(runs, capsys, message, mon
     assert main(Args((one(runs, "TD3"), run_dir), episodes=1)) == 1
     out, err = capsys.readouterr()
     assert err.count("\n") == 1 and re.match(f"error: {run_dir}: .*{message}", err), err
+    assert (", line " in err) == (", line " in message)  # only a user's own error has a place
     assert len(stored(one(runs, "TD3"))) == 1 and "TD3" in out and "PPO" not in out
 
 
