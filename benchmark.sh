@@ -172,14 +172,6 @@ sweep=$HOSTNAME-$$-$(date +%Y%m%d%H%M%S)
 logs=${first%/*}/logs list=${first%/*}/logs/lines-$sweep.tsv
 trap 'rm -f "$list"' EXIT
 
-write_list() { # the runs to do, for the executor; and the folders of their logs
-  local folders reason
-  mapfile -t folders < <(cut -f1 <<<"$todo" | LC_ALL=C sed 's,/[^/]*$,/logs,' | LC_ALL=C sort -u)
-  reason=$( (mkdir -p "${folders[@]}" && printf '%s\n' "$todo" >"$list") 2>&1) ||
-    fail "--runs-dir: cannot write to $logs: ${reason##*: }"
-  locks_work "$list" || fail "--runs-dir: $(no_locks "$logs")"
-}
-
 # Were this command killed, the executor would start run after run: the guard stops it then
 guard() { # a killed command may stay as a zombie: it is dead when the guard has another parent
   local me=$BASHPID
@@ -203,8 +195,11 @@ stop() { # EXIT_STATUS
 # The executor and its guard have process groups of their own, so that one signal to the executor's
 # reaches every run once.
 run_todo() {
-  local guard watch
-  write_list
+  local folders reason guard watch # the folders of the logs
+  mapfile -t folders < <(cut -f1 <<<"$todo" | LC_ALL=C sed 's,/[^/]*$,/logs,' | LC_ALL=C sort -u)
+  reason=$( (mkdir -p "${folders[@]}" && printf '%s\n' "$todo" >"$list") 2>&1) ||
+    fail "--runs-dir: cannot write to $logs: ${reason##*: }"
+  locks_work "$list" || fail "--runs-dir: $(no_locks "$logs")"
   if [ "$executor" = slurm ]; then
     trap - EXIT # its tasks read the list later
     submit

@@ -308,12 +308,9 @@ def verdicts(found, args):
 def obstacle(choice):
     """Say that a choice cannot continue, and what to do."""
     text = f"{describe(choice)}. These did not finish; run the same command again to retry them."
-    for configuration, _ in choice.state.due:
-        pairs = zip(*configuration.texts, strict=True)
-        excluded = "+".join(f"{noise}@{rate}" for noise, rate in pairs)
-        advice = f'\n  If it fails every time, leave it out: --exclude "{excluded}"'
-        if excluded and advice not in text:
-            text += advice
+    for noise in dict.fromkeys(noise for noise, _ in choice.state.due if noise != BASELINE):
+        excluded = "+".join(f"{name}@{rate}" for name, rate in zip(*noise.texts, strict=True))
+        text += f'\n  If it fails every time, leave it out: --exclude "{excluded}"'
     return text
 
 

@@ -4,11 +4,12 @@ import contextlib
 import json
 import re
 import shlex
+from pathlib import Path
 
 import pytest
 import stub_run
 import toy_envs
-from views import view
+from views import finish, view
 
 from noisy_wrappers import BASELINE, Configuration
 from sweep import environment
@@ -225,17 +226,21 @@ def test_any_dry_run_says_what_it_costs_and_finished_runs_tell_better(tmp_path):
     expected = 3 * (10 + 4000 * 0.103e-3 + (4000 + 10 * 10 * 100) * seconds) / 3600
     assert float(hours) == pytest.approx(expected, rel=0.1, abs=0.05)
     assert view("list", *grid).err == "3 runs, 3 to do\n"
-    folder = tmp_path / shown.out.split("\t")[0]
-    folder.mkdir()
-    result = {"final_return_mean": 1.0, "total_timesteps": 4000, "wall_time_seconds": 1800}
-    (folder / "result.json").write_text(json.dumps(result))
-    args = {"env_id": "toy_envs:Slow-v0", "exp_name": "x", "seed": 1, "noise": [], "noise_rate": []}
-    args |= {"eval_episodes": 10, "total_timesteps": 4000}
-    (folder / "config.json").write_text(json.dumps({"algorithm": "PPO", "args": args}))
-    assert view("dry-run", *grid).err == (
+    first, second = (Path(line.split("\t")[0]) for line in shown.out.splitlines()[:2])
+    finish(first, 4000, env_id="toy_envs:Slow-v0")
+    result = json.loads((first / "result.json").read_text()) | {"wall_time_seconds": 1800}
+    (first / "result.json").write_text(json.dumps(result))
+    left = (
         "3 runs, 2 to do; about 1.0 core-hours are left, 0.5 hours on the clock with 2 runs at a "
-        "time\n"
     )
+    assert view("dry-run", *grid).err == f"{left}time\n"
+    finish(second, 4000, env_id="toy_envs:Slow-v0")  # it does not say how long it took
+    assert "3 runs, 1 to do; about 0.5 core-hours are left" in view("dry-run", *grid).err
+    # PPO's time tells nothing about TD3, which does not learn yet
+    shown = view("dry-run", *grid, "--algos", "ppo", "td3").err
+    hours = re.search(r"6 runs, 4 to do; about ([\d.]+) core-hours are left, ", shown)[1]
+    expected = 0.5 + 3 * (10 + (4000 + 10 * 10 * 100) * seconds) / 3600
+    assert float(hours) == pytest.approx(expected, rel=0.1, abs=0.05)
 
 
 # THE MEMORY
