@@ -8,6 +8,7 @@ returns. Keeping the baseline fixed would not do: a baseline that was unlucky is
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 
 from analysis.runs import STUDY, rows_of
 from analysis.statistics import LEVEL
@@ -16,6 +17,10 @@ from noisy_wrappers import BASELINE
 DRAWS = 10_000
 SEEDS_TO_RESAMPLE = 20  # with fewer seeds of the baseline, returns are taken as normal
 CONSISTENT_PERCENT = 80  # of the environments, as in the paper
+COLUMNS = [*STUDY, "environments", "best_beyond_luck", "configurations"]
+for _name in ("consistent", "consistently_worse"):
+    COLUMNS += [_name, f"{_name}_by_luck", f"{_name}_by_luck_95", f"p_{_name}"]
+    COLUMNS += [f"{_name}_beyond_luck"]
 
 
 @dataclass
@@ -141,11 +146,26 @@ def p_of_luck(draws, observed):
     return (1 + (draws >= observed).sum()) / (1 + len(draws))
 
 
-def add_luck_of_best(best, lucks):
-    """Add to a table of best noises what the best of as many useless configurations shows.
+def add_luck(lucks, best, good, bad):
+    """Return the tables of best, consistent and consistently worse noise with p_luck, and of luck.
+
+    p_luck is the probability that as many useless configurations show a best difference as high, a
+    highest average improvement as high, or a lowest as low.
 
     lucks: a dict of what the columns STUDY have -> Luck.
     """
+    best = add_luck_of_best(best, lucks)
+    columns = [*STUDY, "average_improvement_percent"]
+    p = [p_of_luck(lucks[*key].highest, value) for *key, value in good[columns].values]
+    good = good.assign(p_luck=p)
+    p = [p_of_luck(-lucks[*key].lowest, -value) for *key, value in bad[columns].values]
+    bad = bad.assign(p_luck=p)
+    luck = pd.DataFrame(luck_rows(lucks, best, good, bad), columns=COLUMNS)
+    return best, good, bad, luck
+
+
+def add_luck_of_best(best, lucks):
+    """Add to a table of best noises what the best of as many useless configurations shows."""
     best = best.assign(luck_median=np.nan, luck_95=np.nan, p_luck=np.nan)
     for row in best.itertuples():
         draws = lucks[row.algorithm, row.exp_name, row.phase].best.get(row.environment)
@@ -156,25 +176,8 @@ def add_luck_of_best(best, lucks):
     return best
 
 
-def add_luck_of_consistent(good, bad, lucks):
-    """Add p_luck to the tables of consistent and of consistently worse noise.
-
-    It is the probability that the highest average improvement of as many useless configurations is
-    at least as high, and that the lowest is at least as low.
-    """
-    columns = [*STUDY, "average_improvement_percent"]
-    rows = good[columns].itertuples(index=False)
-    good = good.assign(p_luck=[p_of_luck(lucks[*key].highest, value) for *key, value in rows])
-    rows = bad[columns].itertuples(index=False)
-    bad = bad.assign(p_luck=[p_of_luck(-lucks[*key].lowest, -value) for *key, value in rows])
-    return good, bad
-
-
 def luck_rows(lucks, best, good, bad):
-    """Yield one row per study: what its tables have, and what they would have by luck.
-
-    The tables are those of best, consistent and consistently worse noise, with p_luck.
-    """
+    """Yield one row per study: what its tables have, and what they would have by luck."""
     for key, luck in lucks.items():
         p_best, p_good, p_bad = (
             table.loc[rows_of(table, key), "p_luck"] for table in (best, good, bad)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from analysis.luck import add_luck_of_best, add_luck_of_consistent, luck_of_paper, luck_rows
+from analysis.luck import add_luck, luck_of_paper
 from analysis.runs import KEYS, rows_of, script_name, split_version
 from noisy_wrappers import BASELINE, Configuration
 
@@ -80,9 +80,7 @@ def with_luck(paper):
     best, good, bad = (paper[name] for name in ("best", "consistent", "consistently_worse"))
     best = best.assign(difference=best["noisy_mean"] - best["baseline_mean"])
     lucks = luck_of_paper(best, PAPER_SEEDS, PAPER_CONFIGURATIONS)
-    best = add_luck_of_best(best, lucks)
-    good, bad = add_luck_of_consistent(good, bad, lucks)
-    luck = pd.DataFrame(luck_rows(lucks, best, good, bad))
+    best, good, bad, luck = add_luck(lucks, best, good, bad)
     return paper | {"best": best, "consistent": good, "consistently_worse": bad}, luck
 
 

@@ -348,7 +348,7 @@ class Study:
         """
         if self.metric == SUCCESS:
             return difference * np.nan
-        return percent_of(difference, self.final(BASELINE)[:, e])
+        return percent_of(difference, self.sample(BASELINE, e))
 
     def all_equal(self):
         """Return the environments where all tests of two or more runs are equal: {name: value}."""
@@ -359,6 +359,13 @@ class Study:
             if tests.shape[1] > 1 and (tests == tests[0, 0]).all():
                 found[env] = tests[0, 0]
         return found
+
+    def sample(self, config, e):
+        """Return the final test returns (seeds,) in one environment, of the runs that exist."""
+        if config not in self.returns:
+            return np.empty(0)
+        returns = self.final(config)[:, e]
+        return returns[np.isfinite(returns)]
 
     def final(self, config):
         """Return the (seeds x envs) array of final test returns."""

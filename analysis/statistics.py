@@ -49,13 +49,12 @@ def percent_of(difference, baseline):
     zero, or, with fewer than three seeds, the returns have not all one sign. baseline (seeds,).
     """
     baseline = baseline[np.isfinite(baseline)]
-    n, mean = len(baseline), baseline.mean() if len(baseline) else 0.0
-    if n < 3:
-        clear = n > 0 and (np.all(baseline > 0) or np.all(baseline < 0))
+    if len(baseline) < 3:
+        clear = len(baseline) > 0 and (np.all(baseline > 0) or np.all(baseline < 0))
     else:
-        half = scipy.special.stdtrit(n - 1, 0.975) * baseline.std(ddof=1) / sqrt(n)
-        clear = abs(mean) > half
-    return 100 * difference / abs(mean) if clear else difference * nan
+        _, _, low, high = contrast([baseline], [1])
+        clear = not low <= 0 <= high
+    return 100 * difference / abs(baseline.mean()) if clear else difference * nan
 
 
 def iqm(scores):
@@ -75,16 +74,18 @@ def bootstrap_iqm(scores, baseline=None, resamples=RESAMPLES):
     """IQM over seeds and environments with its 95 % interval.
 
     With a baseline it is the IQM of the scores minus that of the baseline, both in percent of the
-    baseline's IQM in each environment.
+    baseline's IQM in each environment, and NaN where the interval of one of these includes zero.
 
     The interval is iqm +- t_{0.975, df} sqrt(sum of v). There is one v for each sample (the seeds
     of one environment, with noise or without): n / (n - 1) times the variance of the IQM when
     this sample is drawn anew from its own n seeds (Efron and Tibshirani, 1993, chapter 12). df is
-    Satterthwaite's (1946), (sum of v)^2 / sum of v^2 / (n - 1), so few seeds of the baseline count.
+    Satterthwaite's (1946), so few seeds of the baseline count.
 
     scores (seeds x envs), baseline (other seeds x envs) or None -> iqm, low, high.
     """
-    rng = np.random.default_rng(0)
+    noisy, alone = columns(scores), [] if baseline is None else columns(baseline)
+    if any(low <= 0 <= high for _, low, high in map(bootstrap_iqm, alone)):
+        return nan, nan, nan
 
     def improvement(x, y):
         pairs = [(a, np.asarray(iqm(b))[..., None]) for a, b in zip(x, y, strict=True)]
@@ -94,29 +95,27 @@ def bootstrap_iqm(scores, baseline=None, resamples=RESAMPLES):
         x, y = samples[: len(noisy)], samples[len(noisy) :]
         return improvement(x, y) - improvement(y, y) if y else iqm(np.concatenate(x, axis=-1))
 
-    noisy = columns(scores)
-    samples = noisy + ([] if baseline is None else columns(baseline))
+    samples = noisy + alone
     value = estimate(samples)
     n = np.array([len(sample) for sample in samples])
     if n.min() < SEEDS_FOR_IQM:
-        return value, np.nan, np.nan
+        return value, nan, nan
+    rng = np.random.default_rng(0)
     observed = [np.broadcast_to(sample, (resamples, len(sample))) for sample in samples]
     variances = np.empty(len(samples))
     for i, sample in enumerate(samples):
         drawn = sample[rng.integers(n[i], size=(resamples, n[i]))]
         estimates = estimate([*observed[:i], drawn, *observed[i + 1 :]])
         variances[i] = n[i] / (n[i] - 1) * estimates.var(ddof=1)
-    variance = variances.sum()
-    if variance == 0:  # all seeds alike
-        return value, value, value
-    df = variance**2 / (variances**2 / (n - 1)).sum()
-    half = scipy.special.stdtrit(df, 0.975) * np.sqrt(variance)
+    half = 0.0  # where all seeds are alike
+    if variances.any():
+        _, half = satterthwaite(variances, n)
     return value, value - half, value + half
 
 
-def wins(x, y):
-    """Mann-Whitney's U: the number of pairs with x > y, a tie counting half. x (n), y (m)."""
-    return (x[:, None] > y).sum() + 0.5 * (x[:, None] == y).sum()
+def win_rate(x, y):
+    """P(x > y) of samples x (n) and y (m), a tie counting half: Mann-Whitney's U / (n m)."""
+    return ((x[:, None] > y) + 0.5 * (x[:, None] == y)).mean()
 
 
 def newcombe_interval(p, n, m):
@@ -144,9 +143,9 @@ def probability_of_improvement(x, y):
     Donner, 2008). x (seeds x envs), y (seeds x envs) -> p, low, high.
     """
     x, y = columns(x), columns(y)
-    rates = np.array([wins(a, b) / (len(a) * len(b)) for a, b in zip(x, y, strict=True)])
+    rates = np.array(list(map(win_rate, x, y)))
     if min(map(len, x + y)) < SEEDS_FOR_PROBABILITY:
-        return rates.mean(), np.nan, np.nan
+        return rates.mean(), nan, nan
     limits = [newcombe_interval(p, len(a), len(b)) for p, a, b in zip(rates, x, y, strict=True)]
     below, above = np.abs(rates[:, None] - limits).T
     p = rates.mean()

@@ -24,7 +24,7 @@ MAX_SEEDS = 1000  # a difference that would take more seeds is said to take more
 
 def verdict(row):
     """Name the verdict of a row of statistics: one of VERDICTS, or NaN without a baseline."""
-    if pd.isna(row["n_baseline"]):
+    if pd.isna(row["smallest_p"]):
         return nan
     if row.get("verdict") == ALL_EQUAL:
         return ALL_EQUAL

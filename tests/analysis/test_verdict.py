@@ -31,9 +31,7 @@ def study(baseline, noisy):
 def judge(baseline, noisy):
     """The statistics table and the sentences of such a study."""
     one = study(baseline, noisy)
-    table = analysis.tables.adjust(
-        analysis.tables.frame("statistics", analysis.tables.statistics_rows(one))
-    )
+    table = analysis.tables.judge([one])
     return table[table["verdict"].notna()], analysis.verdicts.in_sentences(table)
 
 
@@ -63,13 +61,13 @@ def test_better_needs_the_corrected_p():
 
 
 def test_p_of_exactly_five_percent_is_enough():
-    row = {"n_baseline": 5, "p": 0.05 + 1e-15, "p_adjusted": 0.05, "t": 2.0}
+    row = {"smallest_p": 0.01, "p": 0.05 + 1e-15, "p_adjusted": 0.05, "t": 2.0}
     assert analysis.verdicts.verdict(row) == "better"
     assert analysis.verdicts.verdict(row | {"t": -2.0}) == "worse"
     assert analysis.verdicts.verdict(row | {"p_adjusted": 0.0501}) == "perhaps better"
     assert analysis.verdicts.verdict(row | {"p": 0.0501}) == "no clear difference"
     assert analysis.verdicts.verdict(row | {"p": np.nan}) == "too few seeds"
-    assert pd.isna(analysis.verdicts.verdict(row | {"n_baseline": np.nan}))
+    assert pd.isna(analysis.verdicts.verdict(row | {"smallest_p": np.nan}))
 
 
 def test_few_seeds():
