@@ -287,7 +287,7 @@ class Study:
     environments: list
     seeds: list
     steps: np.ndarray  # the evaluation steps that all runs share
-    returns: dict  # Configuration -> array (steps x seeds x envs), NaN where there is no run
+    returns: dict  # Configuration, the baseline first -> (steps x seeds x envs), NaN without a run
     metric: str = "return"  # or "success rate": then `returns` has rates of success in percent
 
     @property
@@ -300,14 +300,12 @@ class Study:
         """Its name for people."""
         return study_name(*self.key)
 
-    def percent_of(self, difference, e):
-        """Return a difference in percent of the baseline's mean in an environment, if it has any.
+    def percent(self, e):
+        """Return what a difference of 1 is in percent of the baseline's mean in an environment.
 
-        A rate of success has none: differences of rates are in percentage points.
+        A rate of success has no percent: differences of rates are in percentage points.
         """
-        if self.metric == SUCCESS:
-            return difference * np.nan
-        return percent_of(difference, self.sample(BASELINE, e))
+        return np.nan if self.metric == SUCCESS else percent_of(1.0, self.sample(BASELINE, e))
 
     def all_equal(self):
         """Return the environments where all tests of two or more runs are equal: {name: value}."""

@@ -9,12 +9,7 @@ from scipy import stats
 
 from analysis.folders import CONFIRMATION, PHASES, SEARCH
 from analysis.formatting import P_VALUE, PLAIN, SHARE, TENTH, WHOLE, Table
-from analysis.luck import (
-    CONSISTENT_PERCENT,
-    DRAWS,
-    add_luck,
-    luck_of_study,
-)
+from analysis.luck import CONSISTENT_PERCENT, DRAWS, add_luck, luck_of_study
 from analysis.paper import compare_tables
 from analysis.runs import KEYS, STUDY, SUCCESS, study_name
 from analysis.statistics import (
@@ -81,11 +76,9 @@ _COLUMNS_WITH = {
     PLAIN: "steps_millions",
 }
 FORMATS = {name: form for form, names in _COLUMNS_WITH.items() for name in names.split()}
-ONLY_CSV = {
-    "statistics": """iqm iqm_low iqm_high t pooled_std environments seeds_needed comparisons
-        smallest_p smallest_p_adjusted""",
-    "luck": "consistent_by_luck_95 consistently_worse_by_luck_95",
-}
+STATISTICS_ONLY_CSV = ("iqm", "iqm_low", "iqm_high", "t", "pooled_std", "environments")
+STATISTICS_ONLY_CSV += ("seeds_needed", "comparisons", "smallest_p", "smallest_p_adjusted")
+LUCK_ONLY_CSV = ("consistent_by_luck_95", "consistently_worse_by_luck_95")
 
 # --------------------------------------------------------------------------------------------- rows
 
@@ -173,18 +166,15 @@ def consistency_rows(judged):
     for key, group in judged[judged["difference"].notna()].groupby(keys):
         mean, std, _ = mean_std(group["improvement_percent"])
         without = group.loc[group["improvement_percent"].isna(), "environment"]
-        yield (
-            dict(zip(keys, key, strict=True))
-            | tests.get(key, {})
-            | {
-                "percent_of_environments": 100 * (group["difference"] >= 0).mean(),
-                "average_improvement_percent": mean,
-                "std_improvement_percent": std,
-                "environments": len(group),
-                "without_percent": ", ".join(without),
-                "n": group["n"].min(),
-            }
-        )
+        row = dict(zip(keys, key, strict=True)) | tests.get(key, {})
+        yield row | {
+            "percent_of_environments": 100 * (group["difference"] >= 0).mean(),
+            "average_improvement_percent": mean,
+            "std_improvement_percent": std,
+            "environments": len(group),
+            "without_percent": ", ".join(without),
+            "n": group["n"].min(),
+        }
 
 
 def early_rows(study):
@@ -227,7 +217,7 @@ def interaction_rows(study):
             continue
         both, first, second, alone = samples
         value, error, low, high = contrast(samples, [1, -1, -1, 1])
-        percent = study.percent_of(1.0, e)
+        percent = study.percent(e)
         yield {
             **row_keys(study, environment, config),
             "n": min(map(len, samples)),
@@ -399,12 +389,13 @@ def make_tables(studies, paper=None):
     compared = judged["verdict"].notna()
     statistics = judged.assign(n_baseline=judged["n_baseline"].where(compared))
     statistics = statistics[COLUMNS["statistics"]]
+    shape = {"view": statistics[compared], "only_csv": STATISTICS_ONLY_CSV}
     tables = [
         table_of("best", best[COLUMNS["best"]], view=best_view(best), note=note),
         table_of("consistent", good, note=note),
         table_of("consistently_worse", bad, note=f"{failing} {note}".strip()),
-        table_of("luck", luck),
-        table_of("statistics", statistics, view=statistics[compared], note=note),
+        table_of("luck", luck, only_csv=LUCK_ONLY_CSV),
+        table_of("statistics", statistics, note=note, **shape),
         table_of("early_performance", early, rates_beside=True),
     ]
     found = frame("interactions", (row for study in judging for row in interaction_rows(study)))
@@ -420,7 +411,7 @@ def make_tables(studies, paper=None):
         for name, table in compare_tables(paper, lengths, *ours):
             section = name.removeprefix("compare_")
             if section == "luck":
-                more = {"kind": name}
+                more = {"kind": name, "only_csv": LUCK_ONLY_CSV}
             else:
                 more = {"kind": "compare", "note": f"Our steps: {steps}."}
             tables.append(table_of(frame=table, section=section, name=name, **more))
@@ -429,9 +420,7 @@ def make_tables(studies, paper=None):
 
 def table_of(kind, frame, name=None, section=None, **more):
     """Make a Table as this module describes its kind; name and section may be kind."""
-    section = section or kind
-    only_csv = ONLY_CSV.get(section, "").split()
-    return Table(name or kind, frame, CAPTIONS[kind], section, FORMATS, only_csv=only_csv, **more)
+    return Table(name or kind, frame, CAPTIONS[kind], section or kind, FORMATS, **more)
 
 
 def best_view(best):
