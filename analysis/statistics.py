@@ -6,8 +6,8 @@ https://arxiv.org/abs/2108.13264.
 """
 
 from functools import cache, lru_cache, reduce
-from itertools import combinations
-from math import ceil, comb, copysign, inf, isnan, nan, prod, sqrt
+from itertools import combinations, count
+from math import ceil, comb, inf, isnan, nan, prod, sqrt
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -29,9 +29,8 @@ RANDOM_PARTITIONS = 99_999
 
 def columns(scores):
     """Split a sample into one array per environment, without the missing runs."""
-    scores = np.asarray(scores, float)
-    scores = scores[:, None] if scores.ndim == 1 else scores
-    return [column[np.isfinite(column)] for column in scores.T]
+    scores = np.atleast_2d(np.asarray(scores, float).T)
+    return [column[np.isfinite(column)] for column in scores]
 
 
 def mean_std(values):
@@ -107,9 +106,7 @@ def bootstrap_iqm(scores, baseline=None, resamples=RESAMPLES):
         drawn = sample[rng.integers(n[i], size=(resamples, n[i]))]
         estimates = estimate([*observed[:i], drawn, *observed[i + 1 :]])
         variances[i] = n[i] / (n[i] - 1) * estimates.var(ddof=1)
-    half = 0.0  # where all seeds are alike
-    if variances.any():
-        _, half = satterthwaite(variances, n)
+    _, half = satterthwaite(variances, n)
     return value, value - half, value + half
 
 
@@ -268,15 +265,12 @@ def compare(x, y):
     """Compare the means of two samples x and y of the same environments."""
     xs, ys = columns(x), columns(y)
     pairs = list(zip(xs, ys, strict=True))
-    differences = [a.mean() - b.mean() for a, b in pairs]
-    stds = [sqrt((mean_std(a)[1] ** 2 + mean_std(b)[1] ** 2) / 2) for a, b in pairs]
-    effects = [
-        difference / std if std else copysign(inf, difference) if difference else 0.0
-        for difference, std in zip(differences, stds, strict=True)
-    ]
-    percents = [percent_of(d, baseline) for d, baseline in zip(differences, ys, strict=True)]
-    with np.errstate(invalid="ignore"):
-        effect = np.mean(effects)  # of inf and -inf there is none
+    differences = np.array([a.mean() - b.mean() for a, b in pairs])
+    stds = np.array([sqrt((mean_std(a)[1] ** 2 + mean_std(b)[1] ** 2) / 2) for a, b in pairs])
+    percents = list(map(percent_of, differences, ys))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        effects = np.where(differences == 0, 0 * stds, differences / stds)
+        effect = effects.mean()  # of inf and -inf there is none
     difference = low = high = std = detectable = needed = nan
     n, m = min(map(len, xs)), min(map(len, ys))
     if len(pairs) == 1:
@@ -312,8 +306,6 @@ def contrast(samples, weights):
     if sizes.min() < 2:
         return estimate, nan, nan, nan
     variances = np.array([np.var(sample, ddof=1) for sample in samples])
-    if not variances.any():
-        return estimate, 0.0, estimate, estimate
     error, half = satterthwaite(np.square(weights) * variances / sizes, sizes)
     return estimate, error, estimate - half, estimate + half
 
@@ -324,7 +316,8 @@ def satterthwaite(variances, sizes):
     variances (k, ...): of the k means; sizes (k, ...): how many values each is the mean of.
     """
     total = np.sum(variances, axis=0)
-    freedom = total**2 / np.sum(np.square(variances) / (sizes - 1), axis=0)
+    squares = np.sum(np.square(variances) / (sizes - 1), axis=0)
+    freedom = np.divide(total**2, squares, out=np.ones_like(total), where=squares > 0)
     return np.sqrt(total), np.sqrt(total) * scipy.special.stdtrit(freedom, 0.975)
 
 
@@ -372,9 +365,9 @@ def simulated_shift(n, m, level):
 @cache
 def seeds_needed(shift):
     """Return how many seeds each side needs to find a shift (in sd) with 80 % power; maybe inf."""
-    if isnan(shift) or shift == 0:
-        return nan if isnan(shift) else inf
-    n = max(4, ceil(2 * (DETECTABLE / shift) ** 2))  # of infinitely many degrees of freedom
-    while not detectable_shift(n, n) <= shift:
-        n += 1
-    return n
+    if isnan(shift):
+        return nan
+    if shift == 0:
+        return inf
+    least = ceil(2 * (DETECTABLE / shift) ** 2)  # of infinitely many degrees of freedom
+    return next(n for n in count(max(4, least)) if detectable_shift(n, n) <= shift)

@@ -190,11 +190,10 @@ def luck_sentence(best):
     if not (best["difference"] > 0).any():
         return "Nothing that was tried has a higher mean return than no noise."
     tried = set(best["chosen_from"])
-    rivals = f"the best of {max(tried):.0f} useless noises would"
+    number = "as many" if len(tried) > 1 else f"{max(tried):.0f}"
+    rivals = f"the best of {number} useless noises would"
     if tried == {1}:
         rivals = "one useless noise might"
-    elif len(tried) > 1:
-        rivals = "the best of as many useless noises would"
     beyond = best[best["p_luck"] <= LEVEL]
     if beyond.empty:
         where = " in each environment" if len(best) > 1 else ""
@@ -249,11 +248,9 @@ def in_sentences(statistics, unit=""):
     All environments together come before each alone, and clear differences before others.
     """
     compared = statistics[statistics["verdict"].notna()]
-    compared = compared.assign(
-        apart=compared["scope"] != "all",
-        rank=[VERDICTS.index(verdict) for verdict in compared["verdict"]],
-    )
+    sentences = [sentence(row, unit) for _, row in compared.iterrows()]
+    rank = compared["verdict"].map(VERDICTS.index)
+    compared = compared.assign(sentence=sentences, apart=compared["scope"] != "all", rank=rank)
     compared = compared.sort_values([*STUDY, "apart", "environment", "rank", "p"], kind="stable")
-    compared["sentence"] = [sentence(row, unit) for _, row in compared.iterrows()]
     columns = [*STUDY, "scope", "environment", "verdict", "sentence"]
     return compared[columns].reset_index(drop=True)
