@@ -213,14 +213,11 @@ def read_log(folder):
         status = os.fstat(file.fileno())
         file.seek(max(0, status.st_size - 8192))
         lines = file.read().decode(errors="replace").splitlines()
-    step, steps_per_second, exit_status, last_line = 0, 0, None, ""
-    for line in lines:
-        end, progress = END.fullmatch(line), PROGRESS.match(line)
-        exit_status = int(end[1]) if end else None
-        if progress:
-            step, steps_per_second = int(progress[1]), int(progress[2])
-        # "(" begins the notes that the scripts leave below a traceback
-        if not line.startswith(("# ", "(")) and re.search(r"\w", line):
-            last_line = line.strip()
+    end = END.fullmatch(lines[-1]) if lines else None
+    steps = [found.groups() for found in map(PROGRESS.match, lines) if found]
+    step, steps_per_second = map(int, steps[-1]) if steps else (0, 0)
+    # "(" begins the notes that the scripts leave below a traceback
+    own = [line for line in lines if re.search(r"\w", line) and not line.startswith(("# ", "("))]
     age = time.time() - status.st_mtime
-    return Log(path, age, step, steps_per_second, exit_status, last_line)
+    last_line = own[-1].strip() if own else ""
+    return Log(path, age, step, steps_per_second, int(end[1]) if end else None, last_line)

@@ -375,8 +375,7 @@ def version_notes(runs):
             counts = Counter(str(versions.get(library)) for versions in group["versions"])
             if len(counts) > 1:
                 found = ", ".join(f"{version} (n = {n})" for version, n in sorted(counts.items()))
-                what = "of different code versions"
-                if library != "git commit":
-                    what = f"with different {library}"
+                code = library == "git commit"
+                what = "of different code versions" if code else f"with different {library}"
                 notes.append(f"{study_name(*key)}: some rows average runs {what}: {found}")
     return notes

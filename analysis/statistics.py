@@ -18,9 +18,8 @@ LEVEL, POWER = 0.05, 0.8
 normal_quantile = NormalDist().inv_cdf
 # A test at this level finds an effect of so many standard errors with this power.
 DETECTABLE = normal_quantile(1 - LEVEL / 2) + normal_quantile(POWER)
-# With fewer seeds there is no interval of an IQM; of the probability of improvement, which for 3
-# against 3 would exclude 0.5 where p = 0.1; of a difference of means, which for 4 against 4 would
-# say something else than p in 16 % of cases (5 seeds: 5 %).
+# With fewer there is no interval. That of a difference of means would say something else than p in
+# 16 % of cases for 4 against 4 seeds (5 seeds: 5 %); of the others docs/statistics.md says why.
 SEEDS_FOR_IQM, SEEDS_FOR_PROBABILITY, SEEDS_FOR_INTERVAL = 3, 4, 5
 RESAMPLES = 2000
 MOST_PARTITIONS = 20_000  # where there are more, a test draws RANDOM_PARTITIONS

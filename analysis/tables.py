@@ -7,30 +7,13 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+from analysis import statistics, verdicts
 from analysis.folders import CONFIRMATION, PHASES, SEARCH
 from analysis.formatting import P_VALUE, PLAIN, SHARE, TENTH, WHOLE, Table
 from analysis.luck import CONSISTENT_PERCENT, DRAWS, add_luck, luck_of_study
 from analysis.paper import compare_tables
 from analysis.runs import KEYS, STUDY, SUCCESS, study_name
-from analysis.statistics import (
-    LEVEL,
-    bootstrap_iqm,
-    compare,
-    contrast,
-    holm,
-    mean_std,
-    probability_of_improvement,
-    steps_to_reach,
-)
-from analysis.verdicts import (
-    ALL_EQUAL,
-    counted,
-    difference,
-    listed,
-    seeds_of,
-    verdict,
-    what_all_runs_do,
-)
+from analysis.verdicts import ALL_EQUAL, counted, listed, seeds_of
 from noisy_wrappers import BASELINE
 
 SEEDS_FOR_INTERACTION = 3  # of each of the four configurations
@@ -53,9 +36,6 @@ _COLUMNS = {
         environments without_percent n fails_at_every_rate""",
     "success": """environment noise noise_rate mean std baseline_mean baseline_std difference
         p p_adjusted n n_baseline""",
-    "interactions": """environment noise noise_rate n both_mean first_mean second_mean
-        baseline_mean interaction interaction_low interaction_high standard_error
-        interaction_percent percent_low percent_high""",
     "early_performance": "environment noise steps_millions noise_rate mean std n",
     "statistics": """scope environment noise noise_rate verdict difference difference_low
         difference_high difference_percent effect_size p p_adjusted n n_baseline n_baseline_most
@@ -110,11 +90,13 @@ def final_rows(study):
         if len(sample) == 0:
             continue
         row = row_keys(study, environment, config) | {"scope": "environment"}
-        row["mean"], row["std"], row["n"] = mean_std(sample)
-        row["baseline_mean"], row["baseline_std"], row["n_baseline"] = mean_std(baseline)
-        row["iqm"], row["iqm_low"], row["iqm_high"] = bootstrap_iqm(sample)
+        row["mean"], row["std"], row["n"] = statistics.mean_std(sample)
+        row["baseline_mean"], row["baseline_std"], row["n_baseline"] = statistics.mean_std(baseline)
+        row["iqm"], row["iqm_low"], row["iqm_high"] = statistics.bootstrap_iqm(sample)
         curves = study.returns[config][..., e]
-        row["steps_to_baseline"] = steps_to_reach(curves, study.steps, row["baseline_mean"])
+        row["steps_to_baseline"] = statistics.steps_to_reach(
+            curves, study.steps, row["baseline_mean"]
+        )
         if config != BASELINE and len(baseline) and study.phase != SEARCH:
             row |= against_baseline(study, config, [e])
             row["improvement_percent"] = row["difference_percent"]
@@ -138,12 +120,12 @@ def against_baseline(study, config, places):
     places: the numbers of the environments.
     """
     x, y = study.final(config)[:, places], study.final(BASELINE)[:, places]
-    row = compare(x, y)._asdict()
-    row |= zip(PROBABILITY, probability_of_improvement(x, y), strict=True)
+    row = statistics.compare(x, y)._asdict()
+    row |= zip(PROBABILITY, statistics.probability_of_improvement(x, y), strict=True)
     if study.metric == SUCCESS:  # never percent of a rate
         row["difference_percent"] = np.nan
     if np.isfinite(row["difference_percent"]):
-        row |= zip(IQM_CHANGE, bootstrap_iqm(x, y), strict=True)
+        row |= zip(IQM_CHANGE, statistics.bootstrap_iqm(x, y), strict=True)
     return row
 
 
@@ -164,7 +146,7 @@ def consistency_rows(judged):
     keys = [*STUDY, "noise", "noise_rate"]
     tests = judged[judged["scope"] == "all"].set_index(keys)[["p", "p_adjusted"]].to_dict("index")
     for key, group in judged[judged["difference"].notna()].groupby(keys):
-        mean, std, _ = mean_std(group["improvement_percent"])
+        mean, std, _ = statistics.mean_std(group["improvement_percent"])
         without = group.loc[group["improvement_percent"].isna(), "environment"]
         row = dict(zip(keys, key, strict=True)) | tests.get(key, {})
         yield row | {
@@ -190,7 +172,7 @@ def early_rows(study):
         if not any(len(study.sample(config, e)) for config in configs):
             continue  # not tried here: the baseline alone would be no comparison
         for i, config in product(places, [BASELINE, *configs]):
-            mean, std, n = mean_std(study.returns[config][i, :, e])
+            mean, std, n = statistics.mean_std(study.returns[config][i, :, e])
             if n > 0:
                 yield {
                     **row_keys(study, env, config),
@@ -216,7 +198,7 @@ def interaction_rows(study):
         if min(map(len, samples)) < SEEDS_FOR_INTERACTION:
             continue
         both, first, second, alone = samples
-        value, error, low, high = contrast(samples, [1, -1, -1, 1])
+        value, error, low, high = statistics.contrast(samples, [1, -1, -1, 1])
         percent = study.percent(e)
         yield {
             **row_keys(study, environment, config),
@@ -258,32 +240,32 @@ def split_consistency(consistency):
     return good, bad
 
 
-def adjust(statistics):
+def adjust(rows):
     """Add p corrected for all comparisons of a family, the smallest possible, and verdicts.
 
     A family is a study in one environment, or in all, corrected with Benjamini and Hochberg's
     method. The confirmations of `./benchmark.sh choose` were fixed beforehand: they are one family,
     corrected with Holm's method.
     """
-    tested = statistics[statistics["p"].notna()]
+    tested = rows[rows["p"].notna()]
     confirmed = tested["phase"] == CONFIRMATION
-    families = [(tested[confirmed], holm)] if confirmed.any() else []
+    families = [(tested[confirmed], statistics.holm)] if confirmed.any() else []
     for _, family in tested[~confirmed].groupby([*STUDY, "scope", "environment"], dropna=False):
         families.append((family, stats.false_discovery_control))
     for family, correct in families:
         number = len(family)
-        statistics.loc[family.index, "p_adjusted"] = correct(family["p"].to_numpy(float))
+        rows.loc[family.index, "p_adjusted"] = correct(family["p"].to_numpy(float))
         alone = np.minimum(1, family["smallest_p"].astype(float) * number)
-        statistics.loc[family.index, "smallest_p_adjusted"] = alone
-        statistics.loc[family.index, "comparisons"] = number
-    statistics["verdict"] = [verdict(row) for _, row in statistics.iterrows()]
-    return statistics
+        rows.loc[family.index, "smallest_p_adjusted"] = alone
+        rows.loc[family.index, "comparisons"] = number
+    rows["verdict"] = [verdicts.verdict(row) for _, row in rows.iterrows()]
+    return rows
 
 
-def family_notes(statistics):
+def family_notes(judged):
     """Say where the number of seeds is too small to show a difference, if corrected."""
     notes = []
-    compared = statistics[statistics["verdict"].notna() & (statistics["verdict"] != ALL_EQUAL)]
+    compared = judged[judged["verdict"].notna() & (judged["verdict"] != ALL_EQUAL)]
     keys = ["comparisons", "smallest_p"]
     for study, rows in compared.groupby(STUDY):
         best = rows.sort_values("smallest_p", kind="stable")
@@ -292,12 +274,12 @@ def family_notes(statistics):
             places = same["environment"].mask(same["scope"] == "all", "all")
             where = f"{study_name(*study)}, {', '.join(places)}"
             seeds = counted(min(same["n"].min(), same["n_baseline"].min()), "seed")
-            if smallest > LEVEL:
+            if smallest > statistics.LEVEL:
                 notes.append(
                     f"{where}: with {seeds} no difference can be significant (smallest possible p: "
                     f"{smallest:.2g})."
                 )
-            elif (needed := ceil(round(size * smallest / LEVEL, 9))) > 1:
+            elif (needed := ceil(round(size * smallest / statistics.LEVEL, 9))) > 1:
                 notes.append(
                     f"{where}: with {seeds} and {size:.0f} comparisons, differences can be "
                     f"significant after the correction only if at least {needed} of them are "
@@ -310,7 +292,7 @@ def family_notes(statistics):
 def all_equal_notes(studies):
     """Say where all tests of all runs have the same result, so that comparisons say nothing."""
     return [
-        f"{study.name} on {environment}: {what_all_runs_do(value, study.metric)} in "
+        f"{study.name} on {environment}: {verdicts.what_all_runs_do(value, study.metric)} in "
         f"{study.steps[-1]:,} steps, so they say nothing about noise."
         for study in studies
         for environment, value in study.all_equal().items()
@@ -387,20 +369,19 @@ def make_tables(studies, paper=None):
     failing = f"Worse at every rate that was tried: {failing or 'none'}."
     note = percent_note(judged, studies[0].metric)
     compared = judged["verdict"].notna()
-    statistics = judged.assign(n_baseline=judged["n_baseline"].where(compared))
-    statistics = statistics[COLUMNS["statistics"]]
-    shape = {"view": statistics[compared], "only_csv": STATISTICS_ONLY_CSV}
+    table = judged.assign(n_baseline=judged["n_baseline"].where(compared))[COLUMNS["statistics"]]
+    shape = {"view": table[compared], "only_csv": STATISTICS_ONLY_CSV, "note": note}
     tables = [
         table_of("best", best[COLUMNS["best"]], view=best_view(best), note=note),
         table_of("consistent", good, note=note),
         table_of("consistently_worse", bad, note=f"{failing} {note}".strip()),
         table_of("luck", luck, only_csv=LUCK_ONLY_CSV),
-        table_of("statistics", statistics, note=note, **shape),
+        table_of("statistics", table, **shape),
         table_of("early_performance", early, rates_beside=True),
     ]
-    found = frame("interactions", (row for study in judging for row in interaction_rows(study)))
-    if len(found):
-        tables.append(table_of("interactions", found))
+    interactions = pd.DataFrame(row for study in judging for row in interaction_rows(study))
+    if len(interactions):
+        tables.append(table_of("interactions", interactions))
     for algorithm, table in alone.groupby("algorithm"):
         more = {"name": f"summary_{algorithm}", "note": percent_note(table, studies[0].metric)}
         tables.append(table_of("summary", table[COLUMNS["summary"]], **more))
@@ -427,7 +408,7 @@ def best_view(best):
     """Return the best noises as people read them, in nine columns."""
     names = [f"{study_name(*key)}, {env}" for *key, env in best[[*STUDY, "environment"]].values]
     seeds = [seeds_of(*pair) for pair in best[["n", "n_baseline"]].values]
-    said = [difference(row) for row in best.itertuples()]
+    said = [verdicts.difference(row) for row in best.itertuples()]
     view = best.assign(difference=said, p_luck_of_best=best["p_luck"], n=seeds)
     view["algorithm, environment"] = names
     return view[BEST_VIEW]
