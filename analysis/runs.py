@@ -14,20 +14,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from analysis.folders import (
-    PHASES,
-    SEARCH,
-    STOPPED,
-    DamageError,
-    difference,
-    flat_choice,
-    has_begun,
-    naming,
-    read_config,
-    read_log,
-    read_result,
-    runs_of,
-)
+from analysis import folders
+from analysis.folders import PHASES, SEARCH, DamageError
 from analysis.statistics import percent_of
 from noisy_wrappers import BASELINE, Configuration
 
@@ -73,7 +61,7 @@ def read_evaluations(folder, episodes, total):
     Rates are in percent of the episodes, or None for an environment that does not tell success.
     Raises DamageError unless every evaluation is whole, in order, and the last is at step `total`.
     """
-    with naming(folder / "eval.csv"):
+    with folders.naming(folder / "eval.csv"):
         text = (folder / "eval.csv").read_text("utf-8")
         header, *lines = text.splitlines() or [""]
         names = header.split(",")
@@ -99,15 +87,15 @@ def read_evaluations(folder, episodes, total):
 
 def read_run(folder):
     """Read one run folder: a dict with some of RUN_COLUMNS."""
-    if not has_begun(folder):
+    if not folders.has_begun(folder):
         return {"status": "unfinished", "reason": "no config.json yet"}
     row = {}
     try:
-        config = read_config(folder)
+        config = folders.read_config(folder)
         row = {name: config[name] for name in RUN_COLUMNS if name in config}
         row["noise"] = config["configuration"].noise
         row["noise_rate"] = config["configuration"].noise_rate
-        result = read_result(folder, config)
+        result = folders.read_result(folder, config)
         if result is None:
             reason = f"no result.json; {progress(folder)}"
             return row | {"status": "unfinished", "reason": reason}
@@ -128,7 +116,7 @@ def read_runs(runs_dir):
     say, where their study has a newer version of an environment, and empty for all others.
     """
     runs_dir, rows = Path(runs_dir), []
-    for folder in runs_of(runs_dir):
+    for folder in folders.runs_of(runs_dir):
         row = read_run(folder) | {"run": str(folder.relative_to(runs_dir))}
         rows.append(row | {"phase": "" if folder.parent == runs_dir else folder.parent.name})
     rows += failed_without_a_folder(runs_dir)
@@ -146,7 +134,7 @@ def leave_out_different(runs):
     for (_, exp_name), group in finished.groupby(["algorithm", "exp_name"]):
         usual = usual_settings(group["settings"])
         for index, own in group["settings"].items():
-            differing = difference(own, usual)
+            differing = folders.difference(own, usual)
             if differing:
                 said = ", ".join(f"{name} is {own[name]}, not {usual[name]}" for name in differing)
                 said += f" as in most runs of {exp_name}: give such runs another --exp-name"
@@ -187,8 +175,9 @@ def failed_without_a_folder(runs_dir):
     """
     rows = []
     for path in sorted(runs_dir.glob("logs/*__*.log")):
-        log = read_log(runs_dir / path.stem)
-        if not (runs_dir / path.stem).exists() and log.exit_status not in (None, 0, *STOPPED):
+        log = folders.read_log(runs_dir / path.stem)
+        failed = log.exit_status not in (None, 0, *folders.STOPPED)
+        if failed and not (runs_dir / path.stem).exists():
             rows.append({"run": path.stem, "status": "failed", "reason": log.last_line})
     return rows
 
@@ -202,7 +191,7 @@ def read_choice(runs_dir):
     if not path.exists():
         return None
     if not any((path.parent / phase).exists() for phase in PHASES):
-        raise ValueError(flat_choice(path.parent))
+        raise ValueError(folders.flat_choice(path.parent))
     text = dict.fromkeys(("round", "noise", "noise_rate", "survives"), str)
     choice = pd.read_csv(path, dtype=text, keep_default_na=False)
     if list(choice.columns) != CHOICE_COLUMNS:

@@ -213,10 +213,8 @@ def permutation_t(x, y):
         welch_t(np.concatenate(pair)[:, None], partitions(*size))[:, 0]
         for pair, size in zip(pairs, sizes, strict=True)
     ]
-    if ways <= MOST_PARTITIONS:
+    if len(ts) == 1 or ways <= MOST_PARTITIONS:
         null = reduce(lambda a, b: np.add.outer(a, b).ravel(), ts)
-    elif len(ts) == 1:
-        [null] = ts
     else:
         rng = np.random.default_rng(0)
         null = sum(np.append(t[0], drawn(t, rng)) for t in ts)

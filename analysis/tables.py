@@ -220,11 +220,6 @@ def interaction_rows(study):
 # ------------------------------------------------------------------------------------------- tables
 
 
-def frame(name, rows):
-    """Make a table of a list of dicts, with the columns of its kind even when it is empty."""
-    return pd.DataFrame(list(rows), columns=COLUMNS[name])
-
-
 def split_consistency(consistency):
     """Return the rows with at least 80 % of the environments, best first, and those with 0 %.
 
@@ -359,9 +354,10 @@ def make_tables(studies, paper=None):
     judging = [study for study in studies if study.phase != SEARCH]
     judged = rows[rows["phase"] != SEARCH]
     best = best_rows(judged)
-    consistency = frame("consistency", consistency_rows(judged))
+    consistency = pd.DataFrame(consistency_rows(judged), columns=COLUMNS["consistency"])
     good, bad = split_consistency(consistency)
-    early = frame("early_performance", (row for study in studies for row in early_rows(study)))
+    rows = (row for study in studies for row in early_rows(study))
+    early = pd.DataFrame(rows, columns=COLUMNS["early_performance"])
     lucks = {study.key: luck_of_study(study) for study in judging}
     best, good, bad, luck = add_luck(lucks, best, good, bad)
     failing = bad[bad["fails_at_every_rate"] == "yes"][[*STUDY, "noise"]].drop_duplicates()

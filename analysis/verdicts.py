@@ -223,11 +223,10 @@ def headlines(statistics, best):
             tried += f", {together} in all environments together"
         if len(rows) > 1:
             tried = f"{counted(len(rows), 'comparison')} ({tried})"
-        counts = [(word, (rows["verdict"] == word).sum()) for word in VERDICTS]
-        counts = [(word, n) for word, n in counts if n or word in CLEAR]
-        luck = ""
-        if (rows["verdict"] != ALL_EQUAL).any():
-            luck = luck_sentence(best[rows_of(best, key)])
+        found = rows["verdict"].value_counts()
+        said = [word for word in VERDICTS if word in CLEAR or word in found]
+        counts = [(word, found.get(word, 0)) for word in said]
+        luck = "" if set(found) == {ALL_EQUAL} else luck_sentence(best[rows_of(best, key)])
         lines.append({"name": study_name(*key), "tried": tried, "counts": counts, "luck": luck})
     return lines
 

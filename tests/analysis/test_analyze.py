@@ -224,7 +224,7 @@ def test_consistent_is_80_percent_or_more_best_first():
     study = {"algorithm": "SAC", "exp_name": "", "phase": ""}
     rows = [study | {"environments": 5} | row for row in rows]
     rows.append(rows[2] | {"noise": "in one environment only", "environments": 1})
-    table = analysis.tables.frame("consistency", rows)
+    table = pd.DataFrame(rows, columns=analysis.tables.COLUMNS["consistency"])
     good, bad = analysis.tables.split_consistency(table)
     assert list(good["noise"]) == ["c", "e", "a"] and list(bad["noise"]) == ["f"]
 
@@ -437,7 +437,8 @@ def test_coverage_of_the_probability_of_improvement(shift, envs):
 
 
 def test_benjamini_hochberg_by_hand_and_its_limit():
-    table = analysis.tables.frame("statistics", [{"p": p} for p in (0.01, 0.04, 0.03, 0.2, NAN)])
+    rows = [{"p": p} for p in (0.01, 0.04, 0.03, 0.2, NAN)]
+    table = pd.DataFrame(rows, columns=analysis.tables.COLUMNS["statistics"])
     table[["algorithm", "scope", "environment"]] = "SAC", "environment", "Hopper-v5"
     table["smallest_p"], table["n_baseline"], table["t"] = 0.01, 5, 1.0
     table = analysis.tables.adjust(table)
