@@ -258,7 +258,7 @@ def few(texts):
 def ranges(numbers):
     """Write whole numbers as ranges: [1, 2, 3, 5] -> "1-3, 5"."""
     parts = []
-    for number in sorted(numbers.dropna()):
+    for number in sorted(set(numbers.dropna())):
         if parts and number == parts[-1][1] + 1:
             parts[-1][1] = number
         else:

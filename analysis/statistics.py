@@ -36,8 +36,8 @@ def mean_std(values):
     """Mean, sample standard deviation (ddof=1) and number of the values that are not NaN."""
     values = np.asarray(values, float)
     values = values[np.isfinite(values)]
-    mean = values.mean() if len(values) else np.nan
-    return mean, values.std(ddof=1) if len(values) > 1 else np.nan, len(values)
+    mean = values.mean() if len(values) else nan
+    return mean, values.std(ddof=1) if len(values) > 1 else nan, len(values)
 
 
 def percent_of(difference, baseline):
@@ -52,7 +52,7 @@ def percent_of(difference, baseline):
     else:
         _, _, low, high = contrast([baseline], [1])
         clear = not low <= 0 <= high
-    return 100 * difference / abs(baseline.mean()) if clear else difference * nan
+    return 100 * difference / abs(baseline.mean()) if clear else nan
 
 
 def iqm(scores):

@@ -93,10 +93,8 @@ def final_rows(study):
         row["mean"], row["std"], row["n"] = statistics.mean_std(sample)
         row["baseline_mean"], row["baseline_std"], row["n_baseline"] = statistics.mean_std(baseline)
         row["iqm"], row["iqm_low"], row["iqm_high"] = statistics.bootstrap_iqm(sample)
-        curves = study.returns[config][..., e]
-        row["steps_to_baseline"] = statistics.steps_to_reach(
-            curves, study.steps, row["baseline_mean"]
-        )
+        curves, target = study.returns[config][..., e], row["baseline_mean"]
+        row["steps_to_baseline"] = statistics.steps_to_reach(curves, study.steps, target)
         if config != BASELINE and len(baseline) and study.phase != SEARCH:
             row |= against_baseline(study, config, [e])
             row["improvement_percent"] = row["difference_percent"]

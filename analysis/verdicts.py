@@ -1,9 +1,4 @@
-"""One plain sentence for each environment and noise: is it better than no noise?
-
-A noise is called better or worse only where the p of its comparison (statistics.compare), corrected
-for all configurations of a study in that environment, is at most 0.05; where only the uncorrected p
-is, it is "perhaps" so.
-"""
+"""One plain sentence for each environment and noise: is it better than no noise?"""
 
 from math import nan
 
@@ -226,7 +221,9 @@ def headlines(statistics, best):
         found = rows["verdict"].value_counts()
         said = [word for word in VERDICTS if word in CLEAR or word in found]
         counts = [(word, found.get(word, 0)) for word in said]
-        luck = "" if set(found) == {ALL_EQUAL} else luck_sentence(best[rows_of(best, key)])
+        luck = (
+            "" if set(rows["verdict"]) == {ALL_EQUAL} else luck_sentence(best[rows_of(best, key)])
+        )
         lines.append({"name": study_name(*key), "tried": tried, "counts": counts, "luck": luck})
     return lines
 
