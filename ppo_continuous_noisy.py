@@ -447,7 +447,7 @@ def make_envs(args):
         fail("--cuda: PyTorch finds no GPU; leave it out to run on the CPU")
     try:
         env_id = noisy.canonical_env_id(args.env_id)
-        noise, noise_rate = noisy.canonical_noises(args.noise, args.noise_rate)
+        noise, noise_rate = noisy.Configuration.read(args.noise, args.noise_rate).texts
     except ValueError as error:
         fail(error)
     limit = {"max_episode_steps": args.max_episode_steps}
@@ -615,7 +615,7 @@ class Run:
                 self.writer.file_writer.add_summary(summary)
         self.first_step, self.first_time = step, time.monotonic() - 1e-6
         self.printed, self.saved_step = self.first_time, step
-        self.learning, self.last_test = None, ""
+        self.learning, self.last_test = False, ""
         total = self.args.total_timesteps
         self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None)
         return step
@@ -658,10 +658,10 @@ class Run:
         """Log numbers as group/name to TensorBoard, and the speed; show the progress."""
         now = time.monotonic()
         if "losses" in groups and self.learning:
-            sps = (step - self.learning[0]) / (now - self.learning[1])
+            sps = (step - self.first_step) / (now - self.first_time)
             groups["charts"] = groups.get("charts", {}) | {"SPS": sps}
         elif "losses" in groups:  # the first ones: the time until now went into compiling
-            self.learning = step, now - 1e-6
+            self.learning, self.first_step, self.first_time = True, step, now - 1e-6
         tags = {f"{g}/{n}": float(x) for g, values in groups.items() for n, x in values.items()}
         if not all(map(math.isfinite, tags.values())):
             reason = f"step {step}: training diverged, some values are not finite: {tags}"
@@ -675,8 +675,8 @@ class Run:
         taken = step - self.first_step
         if self.bar.disable and taken and now - self.printed > 10:
             total, sps = self.bar.total, taken / (now - self.first_time)
-            eta = tqdm.format_interval((total - step) / sps)
-            # sweep/__main__.py reads this line
+            eta = tqdm.format_interval((total - step) / sps) if self.learning else "?"
+            # analysis/folders.py reads this line
             say(f"step={step}/{total} sps={sps:.0f} {self.last_test}eta={eta}")
             self.printed = now
 

@@ -356,6 +356,13 @@ def test_what_is_no_reward_is_one_line(algorithm, name, reward, tmp_path):
 
 
 @one_script
+def test_an_exit_of_the_environment_is_an_error_with_its_place(algorithm, tmp_path):
+    with pytest.raises(RuntimeError, match="^step 1 of an episode: .* sys.exit") as error:
+        run(algorithm, tmp_path, env_id="hostile_envs:Exits-v0")
+    assert Path(error.traceback[-1].path).name == "hostile_envs.py"
+
+
+@one_script
 def test_an_info_may_be_none(algorithm, tmp_path):
     run(algorithm, tmp_path, env_id="hostile_envs:NoInfo-v0")
 

@@ -476,7 +476,7 @@ def test_the_time_left_is_told_by_the_speed_since_resuming(
     capsys.readouterr()
     ending(algorithm, runs_dir, checkpoint | {"seconds": 1e6}, tmp_path)
     [line, *_] = re.findall(r"step=(\d+)/260 sps=(\d+) .*eta=00:0\d\n", capsys.readouterr().out)
-    assert int(line[0]) > checkpoint["step"] and int(line[1]) > 20
+    assert int(line[0]) > checkpoint["step"] and int(line[1]) > 0
     result = json.loads((folder(tmp_path / "copy") / "result.json").read_text())
     assert result["wall_time_seconds"] > 1e6  # of all attempts
 
