@@ -21,7 +21,6 @@ DETECTABLE = normal_quantile(1 - LEVEL / 2) + normal_quantile(POWER)
 # With fewer there is no interval. That of a difference of means would say something else than p in
 # 16 % of cases for 4 against 4 seeds (5 seeds: 5 %); of the others docs/statistics.md says why.
 SEEDS_FOR_IQM, SEEDS_FOR_PROBABILITY, SEEDS_FOR_INTERVAL = 3, 4, 5
-RESAMPLES = 2000
 MOST_PARTITIONS = 20_000  # where there are more, a test draws RANDOM_PARTITIONS
 RANDOM_PARTITIONS = 99_999
 
@@ -68,7 +67,7 @@ def iqm(scores):
     return np.where(np.isnan(ordered[..., -1]), np.nan, means)[()]
 
 
-def bootstrap_iqm(scores, baseline=None, resamples=RESAMPLES):
+def bootstrap_iqm(scores, baseline=None, resamples=2000):
     """IQM over seeds and environments with its 95 % interval.
 
     With a baseline it is the IQM of the scores minus that of the baseline, both in percent of the

@@ -246,11 +246,9 @@ def adjust(rows):
     for _, family in tested[~confirmed].groupby([*STUDY, "scope", "environment"], dropna=False):
         families.append((family, stats.false_discovery_control))
     for family, correct in families:
-        number = len(family)
         rows.loc[family.index, "p_adjusted"] = correct(family["p"].to_numpy(float))
-        alone = np.minimum(1, family["smallest_p"].astype(float) * number)
-        rows.loc[family.index, "smallest_p_adjusted"] = alone
-        rows.loc[family.index, "comparisons"] = number
+        rows.loc[family.index, "comparisons"] = len(family)
+    rows["smallest_p_adjusted"] = (rows["smallest_p"] * rows["comparisons"]).clip(upper=1)
     rows["verdict"] = [verdicts.verdict(row) for _, row in rows.iterrows()]
     return rows
 
@@ -354,8 +352,8 @@ def make_tables(studies, paper=None):
     best = best_rows(judged)
     consistency = pd.DataFrame(consistency_rows(judged), columns=COLUMNS["consistency"])
     good, bad = split_consistency(consistency)
-    rows = (row for study in studies for row in early_rows(study))
-    early = pd.DataFrame(rows, columns=COLUMNS["early_performance"])
+    returns = (row for study in studies for row in early_rows(study))
+    early = pd.DataFrame(returns, columns=COLUMNS["early_performance"])
     lucks = {study.key: luck_of_study(study) for study in judging}
     best, good, bad, luck = add_luck(lucks, best, good, bad)
     failing = bad[bad["fails_at_every_rate"] == "yes"][[*STUDY, "noise"]].drop_duplicates()
