@@ -591,9 +591,9 @@ class Run:
             metrics = "eval/episodic_return_mean", "charts/episodic_return", "eval/success_rate"
             for summary in hparams(columns, dict.fromkeys(metrics, 0))[:2]:
                 self.writer.file_writer.add_summary(summary)
-        self.first_step, self.first_time = step, time.monotonic() - 1e-6
-        self.printed, self.saved_step = self.first_time, step
-        self.learning, self.last_test = False, ""
+        self.begun = step, time.monotonic() - 1e-6
+        self.printed, self.saved_step = self.begun[1], step
+        self.learning, self.last_test = None, ""
         total = self.args.total_timesteps
         self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None)
         return step
@@ -636,10 +636,10 @@ class Run:
         """Log numbers as group/name to TensorBoard, and the speed; show the progress."""
         now = time.monotonic()
         if "losses" in groups and self.learning:
-            sps = (step - self.first_step) / (now - self.first_time)
+            sps = (step - self.learning[0]) / (now - self.learning[1])
             groups["charts"] = groups.get("charts", {}) | {"SPS": sps}
         elif "losses" in groups:  # the first ones: the time until now went into compiling
-            self.learning, self.first_step, self.first_time = True, step, now - 1e-6
+            self.learning = step, now - 1e-6
         tags = {f"{g}/{n}": float(x) for g, values in groups.items() for n, x in values.items()}
         if not all(map(math.isfinite, tags.values())):
             reason = f"step {step}: training diverged, some values are not finite: {tags}"
@@ -650,10 +650,11 @@ class Run:
         step = max(step, self.bar.n)  # PPO logs a test under the step at which it fell due
         self.bar.update(step - self.bar.n)
         self.bar.n = step  # update() does nothing where there is no terminal
-        taken = step - self.first_step
-        if self.bar.disable and taken and now - self.printed > 10:
-            total, sps = self.bar.total, taken / (now - self.first_time)
-            eta = tqdm.format_interval((total - step) / sps) if self.learning else "?"
+        learned = self.learning and step > self.learning[0]
+        first_step, since = self.learning if learned else self.begun
+        if self.bar.disable and step > first_step and now - self.printed > 10:
+            total, sps = self.bar.total, (step - first_step) / (now - since)
+            eta = tqdm.format_interval((total - step) / sps) if learned else "?"
             # analysis/folders.py reads this line
             say(f"step={step}/{total} sps={sps:.0f} {self.last_test}eta={eta}")
             self.printed = now
