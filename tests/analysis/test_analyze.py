@@ -205,6 +205,8 @@ def test_consistent_by_hand(sweep):
     assert len(bad) == 1 and worst["percent_of_environments"] == 0
     assert worst["average_improvement_percent"] == pytest.approx((-90 / 1.15 - 100) / 2)
     assert worst["fails_at_every_rate"] == "yes"
+    together = row(sweep.tables["statistics"], scope="all", noise=ENDING)
+    assert worst[["p", "p_adjusted"]].equals(together[["p", "p_adjusted"]])
     assert f"Worse at every rate that was tried: {ENDING} (SAC)" in read(
         sweep, "consistently_worse.md"
     )
