@@ -368,7 +368,7 @@ def test_seeds_that_are_all_alike_have_an_interval_of_one_point():
 
 
 def test_an_iqm_has_no_percent_of_what_may_be_zero():
-    x, y = np.full((3, 2), 5.0), np.array([[10.0, -1], [11, 0], [12, 1]])
+    x, y = np.full((3, 2), 5.0), np.array([[10.0, -1], [11, 1], [12, 2]])
     assert np.isnan(statistics.bootstrap_iqm(x, y)).all()
     assert np.isfinite(statistics.bootstrap_iqm(x[:, :1], y[:, :1])).all()
 
