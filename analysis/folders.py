@@ -11,6 +11,7 @@ import re
 import shlex
 import struct
 import time
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -67,17 +68,24 @@ def flat_choice(runs_dir):
 # ------------------------------------------------------------------------------------- the contents
 
 
+@contextmanager
+def naming(path):
+    """Turn what reading a file raises into a DamageError that begins with the file's name."""
+    try:
+        yield
+    except (OSError, ValueError, OverflowError, RecursionError) as error:
+        reason = error.strerror if isinstance(error, OSError) else " ".join(str(error).split())
+        raise DamageError(f"{path.name}: {reason}") from None
+
+
 def read_json(path):
     """Read an object from a file. Raises DamageError."""
 
     def refuse(constant):
         raise ValueError(f"{constant} is no number of JSON")
 
-    try:
+    with naming(path):
         value = json.loads(path.read_text("utf-8"), parse_constant=refuse)
-    except (OSError, ValueError, RecursionError) as error:
-        reason = error.strerror if isinstance(error, OSError) else " ".join(str(error).split())
-        raise DamageError(f"{path.name}: {reason}") from None
     if not isinstance(value, dict):
         raise DamageError(f"{path.name} is no JSON object")
     return value
@@ -91,30 +99,24 @@ def read_config(folder):
     arguments that a study shares) and "versions".
     """
     config = read_json(folder / "config.json")
-    args, versions = config.get("args"), config.get("versions", {})
 
-    def check(name, value, is_good):
-        if not is_good:
+    def get(values, name, is_good):
+        value = values.get(name)
+        if not is_good(value):
             raise DamageError(f"config.json: {name} is {shortened(value)}")
         return value
 
-    check("args", args, isinstance(args, dict))
-    check("versions", versions, isinstance(versions, dict))
-    for name, value in args.items():
-        check(name, value, not any(map(is_nested, value if isinstance(value, list) else [value])))
+    def number(least):
+        return lambda value: type(value) is int and value >= least
 
-    def number(name, least):
-        value = args.get(name)
-        return check(name, value, type(value) is int and value >= least)
+    def text(is_good):
+        return lambda value: isinstance(value, str) and is_good(value)
 
-    def text(name, is_good):
-        value = args.get(name)
-        return check(name, value, isinstance(value, str) and is_good(value))
-
-    algorithm = config.get("algorithm")
-    check("algorithm", algorithm, algorithm in ALGORITHMS)
-    if args.get("max_episode_steps") is not None:
-        number("max_episode_steps", 1)
+    args = get(config, "args", lambda value: isinstance(value, dict))
+    versions = get(config, "versions", lambda value: isinstance(value, dict | None))
+    for name in args:
+        get(args, name, lambda value: not isinstance(value, dict))
+    get(args, "max_episode_steps", lambda value: value is None or number(1)(value))
     noises, rates = args.get("noise"), args.get("noise_rate")
     try:
         configuration = Configuration.read(noises, rates, stored=True)
@@ -123,21 +125,19 @@ def read_config(folder):
         named = f"noise {shortened(noises)} at {shortened(rates)}"
         raise DamageError(f"config.json: {named}: {reason}") from None
     commit = str(config.get("git_commit"))  # 40 digits, perhaps with "-dirty"
+    more = {"matmul precision": config.get("matmul_precision")}
+    more["git commit"] = commit[:10] + commit[40:]
     return {
-        "algorithm": algorithm,
-        "environment": text("env_id", ENV_ID.fullmatch),
-        "exp_name": text("exp_name", str.isprintable),
+        "algorithm": get(config, "algorithm", ALGORITHMS.__contains__),
+        "environment": get(args, "env_id", text(ENV_ID.fullmatch)),
+        "exp_name": get(args, "exp_name", text(str.isprintable)),
         "configuration": configuration,
-        "seed": number("seed", 0),
-        "episodes": number("eval_episodes", 1),
-        "total": number("total_timesteps", 1),
+        "seed": get(args, "seed", number(0)),
+        "episodes": get(args, "eval_episodes", number(1)),
+        "total": get(args, "total_timesteps", number(1)),
         "args": args,
         "settings": {name: args[name] for name in args if name not in NOT_SETTINGS},
-        "versions": {
-            **versions,
-            "matmul precision": config.get("matmul_precision"),
-            "git commit": commit[:10] + commit[40:],
-        },
+        "versions": (versions or {}) | more,
     }
 
 
@@ -157,11 +157,6 @@ def read_result(folder, config):
         said = f"total_timesteps is {shortened(steps)}, in config.json {config['total']}"
         raise DamageError(f"result.json: {said}")
     return result
-
-
-def is_nested(value):
-    """Tell whether a value is a list or an object, which no item of an argument is."""
-    return isinstance(value, list | dict)
 
 
 def shortened(value):
@@ -218,14 +213,11 @@ def read_log(folder):
         status = os.fstat(file.fileno())
         file.seek(max(0, status.st_size - 8192))
         lines = file.read().decode(errors="replace").splitlines()
-    step, steps_per_second, exit_status, last_line = 0, 0, None, ""
-    for line in lines:
-        end, progress = END.fullmatch(line), PROGRESS.match(line)
-        exit_status = int(end[1]) if end else None
-        if progress:
-            step, steps_per_second = int(progress[1]), int(progress[2])
-        # "(" begins the notes that the scripts leave below a traceback
-        if not line.startswith(("# ", "(")) and re.search(r"\w", line):
-            last_line = line.strip()
+    end = END.fullmatch(lines[-1]) if lines else None
+    steps = [found.groups() for found in map(PROGRESS.match, lines) if found]
+    step, steps_per_second = map(int, steps[-1]) if steps else (0, 0)
+    # "(" begins the notes that the scripts leave below a traceback
+    own = [line for line in lines if re.search(r"\w", line) and not line.startswith(("# ", "("))]
     age = time.time() - status.st_mtime
-    return Log(path, age, step, steps_per_second, exit_status, last_line)
+    last_line = own[-1].strip() if own else ""
+    return Log(path, age, step, steps_per_second, int(end[1]) if end else None, last_line)

@@ -8,21 +8,26 @@ returns. Keeping the baseline fixed would not do: a baseline that was unlucky is
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 
 from analysis.runs import STUDY, rows_of
 from analysis.statistics import LEVEL
-from noisy_wrappers import BASELINE
 
 DRAWS = 10_000
 SEEDS_TO_RESAMPLE = 20  # with fewer seeds of the baseline, returns are taken as normal
 CONSISTENT_PERCENT = 80  # of the environments, as in the paper
+_COLUMNS = """environments best_beyond_luck configurations
+    consistent consistent_by_luck consistent_by_luck_95 p_consistent consistent_beyond_luck
+    consistently_worse consistently_worse_by_luck consistently_worse_by_luck_95
+    p_consistently_worse consistently_worse_beyond_luck"""
+COLUMNS = [*STUDY, *_COLUMNS.split()]  # of the table of luck
 
 
 @dataclass
 class Luck:
     """What DRAWS sweeps of an algorithm show in which no noise does anything."""
 
-    best: dict  # environment -> (draws,) the highest difference, in units of the return
+    best: dict  # environment -> (draws,) the highest difference, in units of the return, or NaN
     configurations: int  # how many there are in two or more environments
     highest: np.ndarray  # (draws,) the highest average improvement of any of them, in percent
     lowest: np.ndarray  # (draws,) the lowest one
@@ -72,11 +77,7 @@ def summarize(environments, draws, percents):
     mean nothing.
     """
     tried = np.isfinite(draws[..., 0])
-    best = {
-        name: values[here].max(axis=0)
-        for name, values, here in zip(environments, draws, tried, strict=True)
-        if here.any()
-    }
+    best = dict(zip(environments, np.fmax.reduce(draws, axis=1, initial=np.nan), strict=True))
     several = tried.sum(axis=0) > 1
     draws, number = draws[:, several], tried[:, several].sum(axis=0)[:, None]
     share = 100 * (draws >= 0).sum(axis=0) / number  # NaN >= 0 is false
@@ -96,17 +97,14 @@ def summarize(environments, draws, percents):
 def luck_of_study(study):
     """Draw the sweep of a Study again, with its numbers of seeds, as if no noise did anything."""
     rng = np.random.default_rng(0)
-    configs = [config for config in study.returns if config != BASELINE]
-    draws = np.full((len(study.environments), len(configs), DRAWS), np.nan)
-    percents = np.array([study.percent_of(1.0, e) for e in range(len(study.environments))])
+    draws = np.full((len(study.environments), len(study.returns) - 1, DRAWS), np.nan)
     for e in range(len(study.environments)):
-        samples = [study.final(config)[:, e] for config in (BASELINE, *configs)]
-        samples = [sample[np.isfinite(sample)] for sample in samples]
-        baseline, noisy = samples[0], samples[1:]
+        samples = [study.sample(config, e) for config in study.returns]
         std, df = pooled_std(samples)
-        if len(baseline) and df > 0:
-            n_noisy = [len(sample) for sample in noisy]
-            draws[e] = draw_differences(std, df, len(baseline), n_noisy, rng, baseline)
+        n_baseline, *n_noisy = map(len, samples)
+        if n_baseline and df > 0:
+            draws[e] = draw_differences(std, df, n_baseline, n_noisy, rng, samples[0])
+    percents = np.array([study.percent(e) for e in range(len(study.environments))])
     return summarize(study.environments, draws, percents)
 
 
@@ -134,67 +132,56 @@ def luck_of_paper(best, seeds, configurations):
 def p_of_luck(draws, observed):
     """P(a draw is as high as `observed`), the observation counted as a draw: never zero.
 
-    NaN where nothing was observed: no environment has percentages.
+    NaN where nothing was observed, because no environment has percentages, or nothing was drawn.
     """
-    if np.isnan(observed):
+    if np.isnan(observed) or np.isnan(draws).all():
         return np.nan
     return (1 + (draws >= observed).sum()) / (1 + len(draws))
 
 
-def add_luck_of_best(best, lucks):
-    """Add to a table of best noises what the best of as many useless configurations shows.
+def add_luck(lucks, best, good, bad):
+    """Return the tables of best, consistent and consistently worse noise with p_luck, and of luck.
+
+    p_luck is the probability that as many useless configurations show a best difference as high, a
+    highest average improvement as high, or a lowest as low.
 
     lucks: a dict of what the columns STUDY have -> Luck.
     """
+    best = add_luck_of_best(best, lucks)
+    columns = [*STUDY, "average_improvement_percent"]
+    p = [p_of_luck(lucks[*key].highest, value) for *key, value in good[columns].values]
+    good = good.assign(p_luck=p)
+    p = [p_of_luck(-lucks[*key].lowest, -value) for *key, value in bad[columns].values]
+    bad = bad.assign(p_luck=p)
+    luck = pd.DataFrame(luck_rows(lucks, best, good, bad), columns=COLUMNS)
+    return best, good, bad, luck
+
+
+def add_luck_of_best(best, lucks):
+    """Add to a table of best noises what the best of as many useless configurations shows."""
     best = best.assign(luck_median=np.nan, luck_95=np.nan, p_luck=np.nan)
     for row in best.itertuples():
-        draws = lucks[row.algorithm, row.exp_name, row.phase].best.get(row.environment)
-        if draws is not None:
-            best.loc[row.Index, "luck_median"] = np.median(draws)
-            best.loc[row.Index, "luck_95"] = np.quantile(draws, 0.95)
-            best.loc[row.Index, "p_luck"] = p_of_luck(draws, row.difference)
+        draws = lucks[row.algorithm, row.exp_name, row.phase].best[row.environment]
+        found = np.median(draws), np.quantile(draws, 0.95), p_of_luck(draws, row.difference)
+        best.loc[row.Index, ["luck_median", "luck_95", "p_luck"]] = found
     return best
 
 
-def add_luck_of_consistent(good, bad, lucks):
-    """Add p_luck to the tables of consistent and of consistently worse noise.
-
-    It is the probability that the highest average improvement of as many useless configurations is
-    at least as high, and that the lowest is at least as low.
-    """
-    columns = [*STUDY, "average_improvement_percent"]
-    rows = good[columns].itertuples(index=False)
-    good = good.assign(p_luck=[p_of_luck(lucks[*key].highest, value) for *key, value in rows])
-    rows = bad[columns].itertuples(index=False)
-    bad = bad.assign(p_luck=[p_of_luck(-lucks[*key].lowest, -value) for *key, value in rows])
-    return good, bad
-
-
 def luck_rows(lucks, best, good, bad):
-    """Yield one row per study: what its tables have, and what they would have by luck.
-
-    The tables are those of best, consistent and consistently worse noise, with p_luck.
-    """
+    """Yield one row per study: what its tables have, and what they would have by luck."""
     for key, luck in lucks.items():
         p_best, p_good, p_bad = (
             table.loc[rows_of(table, key), "p_luck"] for table in (best, good, bad)
         )
         if len(p_best) == 0:
             continue
-        row = dict(zip(STUDY, key, strict=True)) | {"environments": len(p_best)}
-        row |= {"best_beyond_luck": (p_best <= LEVEL).sum(), "configurations": luck.configurations}
+        values = [*key, len(p_best), (p_best <= LEVEL).sum(), luck.configurations]
         if luck.configurations:
-            row |= count_row("consistent", p_good, luck.consistent)
-            row |= count_row("consistently_worse", p_bad, luck.consistently_worse)
-        yield row
+            values += [*counts(p_good, luck.consistent), *counts(p_bad, luck.consistently_worse)]
+        yield dict(zip(COLUMNS, values, strict=False))
 
 
-def count_row(name, p, draws):
-    """Return luck_rows' columns for one table: its rows' p_luck, and how many rows luck makes."""
-    return {
-        name: len(p),
-        f"{name}_by_luck": draws.mean(),
-        f"{name}_by_luck_95": np.quantile(draws, 0.95),
-        f"p_{name}": p_of_luck(draws, len(p)),
-        f"{name}_beyond_luck": (p <= LEVEL).sum(),
-    }
+def counts(p, draws):
+    """Return the columns of one table in luck_rows: p_luck of its rows, and how many luck makes."""
+    by_luck = draws.mean(), np.quantile(draws, 0.95), p_of_luck(draws, len(p))
+    return len(p), *by_luck, (p <= LEVEL).sum()

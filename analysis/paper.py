@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from analysis.luck import add_luck_of_best, add_luck_of_consistent, luck_of_paper, luck_rows
-from analysis.runs import KEYS, rows_of, script_name, split_version
+from analysis.luck import add_luck, luck_of_paper
+from analysis.runs import KEYS, VERSION, rows_of, script_name
 from noisy_wrappers import BASELINE, Configuration
 
 PAPER_SEEDS = {"SAC": 5, "TD3": 5, "PPO": 10}
@@ -22,7 +22,7 @@ PAPER_FILES = {
     "consistently_worse": "consistently_worse.csv",
     "early_performance": "early_performance*.csv",  # one for each algorithm
 }
-LUCK = ("luck_median", "luck_95", "p_luck")
+LUCK = ["luck_median", "luck_95", "p_luck"]
 FINAL = ("mean", "std", "n")
 AVERAGE = ("average_improvement_percent", "std_improvement_percent", "environments")
 
@@ -30,18 +30,14 @@ AVERAGE = ("average_improvement_percent", "std_improvement_percent", "environmen
 def read_paper(folder):
     """Read the paper's tables: a dict of name -> frame, with the noise as run and rates as text.
 
-    Raises ValueError where `folder` has no csv files, or other ones.
+    Raises ValueError where `folder` does not have them.
     """
-    if not any(Path(folder).glob("*.csv")):
-        raise ValueError(f"no csv files in {folder} (results/paper has the paper's tables)")
     tables = {}
     for name, pattern in PAPER_FILES.items():
         parts = [pd.read_csv(path) for path in sorted(Path(folder).glob(pattern))]
-        if not parts:
-            continue
-        table = pd.concat(parts, ignore_index=True)
-        if "noise_as_run" not in table:
+        if not parts or "noise_as_run" not in parts[0]:
             raise ValueError(f"{folder} has no tables of the paper (results/paper has them)")
+        table = pd.concat(parts, ignore_index=True)
         table["noise"] = table["noise_as_run"]
         pairs = zip(table["noise"], table["noise_rate"], strict=True)
         table["noise_rate"] = [Configuration.parse(*pair).noise_rate for pair in pairs]
@@ -50,29 +46,23 @@ def read_paper(folder):
     return tables
 
 
-def compare_tables(paper, lengths, summary, best, consistency, good, bad, early):
+def compare_tables(paper, lengths, alone, best, consistency, good, bad, early):
     """Yield (name, table) for each table of `paper`, a dict from read_paper.
 
     `lengths` has the steps of each study, by the values of its columns STUDY: final returns after
     fewer steps than the paper's are shown beside them, without a difference.
     """
-    luck = None
-    if {"best", "consistent", "consistently_worse"} <= paper.keys():
-        paper, luck = with_luck(paper)
-    if "best" in paper:
-        # The paper's table has baselines too: they are rows of their own here.
-        listed = pd.concat([summary[summary["noise"] == ""], best])
-        table = compare_table(summary, listed, with_baseline_rows(paper["best"]), *FINAL)
-        yield "compare_best", only_equal_steps(table, lengths)
-    for name, listed in (("consistent", good), ("consistently_worse", bad)):
-        if name in paper:
-            table = compare_table(consistency, listed, paper[name], *AVERAGE)
-            yield f"compare_{name}", only_equal_steps(table, lengths)
-    if luck is not None:
-        yield "compare_luck", luck
-    if "early_performance" in paper:
-        table = compare_table(early, None, paper["early_performance"], *FINAL)
-        yield "compare_early_performance", table
+    paper, luck = with_luck(paper)
+    # The paper's table has baselines too: they are rows of their own here.
+    listed = alone.index[alone["noise"] == ""].union(best.index)
+    table = compare_table(alone, listed, with_baseline_rows(paper["best"]), *FINAL)
+    yield "compare_best", only_equal_steps(table, lengths)
+    for name, table in (("consistent", good), ("consistently_worse", bad)):
+        table = compare_table(consistency, table.index, paper[name], *AVERAGE)
+        yield f"compare_{name}", only_equal_steps(table, lengths)
+    yield "compare_luck", luck
+    table = compare_table(early, early.index, paper["early_performance"], *FINAL)
+    yield "compare_early_performance", table[table["listed_by"] != "ours"]
 
 
 def with_luck(paper):
@@ -80,9 +70,7 @@ def with_luck(paper):
     best, good, bad = (paper[name] for name in ("best", "consistent", "consistently_worse"))
     best = best.assign(difference=best["noisy_mean"] - best["baseline_mean"])
     lucks = luck_of_paper(best, PAPER_SEEDS, PAPER_CONFIGURATIONS)
-    best = add_luck_of_best(best, lucks)
-    good, bad = add_luck_of_consistent(good, bad, lucks)
-    luck = pd.DataFrame(luck_rows(lucks, best, good, bad))
+    best, good, bad, luck = add_luck(lucks, best, good, bad)
     return paper | {"best": best, "consistent": good, "consistently_worse": bad}, luck
 
 
@@ -91,8 +79,7 @@ def with_baseline_rows(paper):
     noisy = paper.rename(columns={"noisy_mean": "mean", "noisy_std": "std"})
     baseline = paper.rename(columns={"baseline_mean": "mean", "baseline_std": "std"})
     baseline = baseline.assign(noise=BASELINE.noise, noise_rate=BASELINE.noise_rate)
-    baseline = baseline.drop(columns=[name for name in LUCK if name in baseline])
-    return pd.concat([noisy, baseline], ignore_index=True)
+    return pd.concat([noisy, baseline.drop(columns=LUCK)], ignore_index=True)
 
 
 def only_equal_steps(table, lengths):
@@ -103,53 +90,38 @@ def only_equal_steps(table, lengths):
     return table
 
 
-def matching_keys(table, names):
-    """Return a tuple for each row: the values of `names` as ours and the paper's rows share them.
-
-    The environment is without its version.
-    """
-    shared = table[names].copy()
-    if "environment" in names:
-        shared["environment"] = [split_version(env)[0] for env in table["environment"]]
-    if "steps_millions" in names:
-        shared["steps_millions"] = table["steps_millions"].astype(float).round(6)
-    return list(shared.itertuples(index=False, name=None))
-
-
 def compare_table(ours, listed, paper, mean, std, number):
-    """Set the paper's figures beside ours for every row that `paper` or `listed` has.
+    """Set the paper's figures beside ours for every row that the paper or our own table has.
 
-    `ours` holds every configuration, `listed` those of our own table, or None: all of them, but
-    shown only where the paper has them, too; `mean`, `std` and `number` name its columns. The
-    difference is in standard errors: (ours - paper) / sqrt(std^2 / n + paper_std^2 / paper_n).
+    `ours` holds every configuration, and `listed` the index of those in our own table: a row of the
+    paper may match those of several studies or versions of an environment, of which only one is
+    listed. `mean`, `std` and `number` name its columns. The difference is in standard errors:
+    (ours - paper) / sqrt(std^2 / n + paper_std^2 / paper_n).
     """
     keys = [name for name in (*KEYS, "steps_millions") if name in paper]
-    names = [name for name in keys if name not in ("exp_name", "phase")]
-    ours = ours.assign(key=matching_keys(ours, names))
-    paper = paper.assign(key=matching_keys(paper, names))
-    shared = ours["key"].isin(paper["key"])
-    if listed is None:
-        ours["listed"] = shared
-    else:  # a key unites studies and versions, only one of which may be listed
-        listed_rows = pd.MultiIndex.from_frame(listed[keys])
-        ours["listed"] = pd.MultiIndex.from_frame(ours[keys]).isin(listed_rows)
-    ours = ours[ours["listed"] | shared]
-    paper = paper.add_prefix("paper_").rename(columns={"paper_key": "key"})
-    table = ours.merge(paper, on="key", how="outer")
-    numbers = [mean, std, number, f"paper_{mean}", f"paper_{std}"]
-    table[numbers] = table[numbers].astype(float)  # a table without rows has no types
-
-    in_ours, in_paper = table["listed"].eq(True), table["key"].isin(paper["key"])
+    numbers = [name for name in (mean, std, number, "steps_millions") if name in ours]
+    ours = ours.astype(dict.fromkeys(numbers, float))  # a table without rows has no types
+    ours["listed"] = ours.index.isin(listed)
+    shared = [name for name in keys if name not in ("exp_name", "phase", "environment")]
+    if "environment" in keys:
+        shared.append("place")
+        ours, paper = (
+            table.assign(place=table["environment"].str.extract(VERSION)["name"])
+            for table in (ours, paper)
+        )
+    paper = paper.rename(columns={name: f"paper_{name}" for name in paper if name not in shared})
+    table = ours.merge(paper, on=shared, how="outer", indicator="side")
+    in_ours, in_paper = table["listed"].eq(True), table["side"] != "left_only"
     table["listed_by"] = np.select([in_ours & in_paper, in_ours], ["both", "ours"], "paper")
-    for name in keys:
+    table = table[in_ours | in_paper]
+    for name in set(keys) - set(shared):
         table[name] = table[name].fillna(table[f"paper_{name}"])
+    paper_n = table["algorithm"].map(PAPER_SEEDS)
     if number == "environments":
         paper_n = PAPER_ENVIRONMENTS
-    else:
-        paper_n = table["paper_algorithm"].map(PAPER_SEEDS)
     variance = table[std] ** 2 / table[number] + table[f"paper_{std}"] ** 2 / paper_n
     difference = table[mean] - table[f"paper_{mean}"]
     table["difference_se"] = difference / np.sqrt(variance.where(variance > 0))
     columns = [*keys, "listed_by", number, mean, std, f"paper_{mean}", f"paper_{std}"]
-    luck = [f"paper_{name}" for name in LUCK if f"paper_{name}" in table]
-    return table.sort_values(keys, kind="stable")[[*columns, "difference_se", *luck]]
+    columns += ["difference_se", *(f"paper_{name}" for name in LUCK if f"paper_{name}" in table)]
+    return table.sort_values(keys, kind="stable")[columns]

@@ -5,10 +5,8 @@ arguments. The two phases of a choice are the folders search/ and confirmation/.
 (those with a result.json) count.
 """
 
-import io
 import json
-import re
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
@@ -16,19 +14,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from analysis.folders import (
-    PHASES,
-    SEARCH,
-    STOPPED,
-    DamageError,
-    difference,
-    flat_choice,
-    has_begun,
-    read_config,
-    read_log,
-    read_result,
-    runs_of,
-)
+from analysis import folders
+from analysis.folders import PHASES, SEARCH, DamageError
 from analysis.statistics import percent_of
 from noisy_wrappers import BASELINE, Configuration
 
@@ -37,12 +24,13 @@ KEYS = [*STUDY, "environment", "noise", "noise_rate"]
 ELSEWHERE = ", tested in "
 SUCCESS = "success rate"  # what a Study may have in place of returns
 EVAL_COLUMNS = ["step", "episode", "episodic_return", "episodic_length"]
-RUN_COLUMNS = ["run", "status", "reason", *KEYS, "configuration", "seed", "total"]
-RUN_COLUMNS += ["settings", "versions", "steps", "returns", "success_rates"]
+RUN_COLUMNS = ["run", "status", "reason", *KEYS, "configuration", "seed", "settings", "versions"]
+RUN_COLUMNS += ["steps", "returns", "success_rates"]
 CHOICE_COLUMNS = ["algorithm", "environment", "phase", "round", "noise", "noise_rate"]
 CHOICE_COLUMNS += ["seeds", "score", "survives"]
 ROBUSTNESS_COLUMNS = ["noise", "noise_rate", "episode", "episodic_return", "episodic_length"]
 FIRST_CONFIRMATION_SEED = 1001  # of `./benchmark.sh choose`
+VERSION = r"(?P<name>.*?)(?:-v(?P<version>\d+))?$"  # of an environment's id, if it has one
 OLDER = "environments"  # before their version, in `phase`: see read_runs
 
 
@@ -73,46 +61,41 @@ def read_evaluations(folder, episodes, total):
     Rates are in percent of the episodes, or None for an environment that does not tell success.
     Raises DamageError unless every evaluation is whole, in order, and the last is at step `total`.
     """
-    try:
-        return evaluations((folder / "eval.csv").read_text("utf-8"), episodes, total)
-    except (OSError, ValueError, OverflowError) as error:
-        reason = error.strerror if isinstance(error, OSError) else " ".join(str(error).split())
-        raise DamageError(f"eval.csv: {reason}") from None
-
-
-def evaluations(text, episodes, total):
-    """Read the text of an eval.csv for read_evaluations."""
-    names = text.partition("\n")[0].split(",")
-    if names not in (EVAL_COLUMNS, [*EVAL_COLUMNS, "success"]):
-        raise ValueError("unexpected header")
-    if not text.endswith("\n"):
-        raise ValueError("the last line is half-written")
-    if text.count("\n") == 1:
-        raise ValueError("no evaluation")
-    numbers = np.loadtxt(io.StringIO(text), delimiter=",", skiprows=1, ndmin=2, comments=None)
-    if numbers.shape[1] != len(names) or len(numbers) % episodes or not np.isfinite(numbers).all():
-        raise ValueError("incomplete or non-numeric lines")
-    table = np.moveaxis(numbers.reshape(-1, episodes, len(names)), 2, 0)
-    step, episode, episodic_return, _, *success = table
-    if (episode != np.arange(episodes)).any() or (step != step[:, :1]).any():
-        raise ValueError("an evaluation is incomplete")
-    if (np.diff(step[:, 0]) <= 0).any() or step[-1, 0] != total:
-        raise ValueError(f"steps do not ascend to {total}")
+    with folders.naming(folder / "eval.csv"):
+        text = (folder / "eval.csv").read_text("utf-8")
+        header, *lines = text.splitlines() or [""]
+        names = header.split(",")
+        if names not in (EVAL_COLUMNS, [*EVAL_COLUMNS, "success"]):
+            raise ValueError("unexpected header")
+        if not text.endswith("\n"):
+            raise ValueError("the last line is half-written")
+        if not lines:
+            raise ValueError("no evaluation")
+        numbers = np.loadtxt(lines, delimiter=",", ndmin=2, comments=None)
+        whole = numbers.shape[1] == len(names) and len(numbers) % episodes == 0
+        if not whole or not np.isfinite(numbers).all():
+            raise ValueError("incomplete or non-numeric lines")
+        table = np.moveaxis(numbers.reshape(-1, episodes, len(names)), 2, 0)
+        step, episode, episodic_return, _, *success = table
+        if (episode != np.arange(episodes)).any() or (step != step[:, :1]).any():
+            raise ValueError("an evaluation is incomplete")
+        if (np.diff(step[:, 0]) <= 0).any() or step[-1, 0] != total:
+            raise ValueError(f"steps do not ascend to {total}")
     rates = 100 * success[0].mean(axis=1) if success else None
     return step[:, 0].astype(int), episodic_return.mean(axis=1), rates
 
 
 def read_run(folder):
     """Read one run folder: a dict with some of RUN_COLUMNS."""
-    if not has_begun(folder):
+    if not folders.has_begun(folder):
         return {"status": "unfinished", "reason": "no config.json yet"}
     row = {}
     try:
-        config = read_config(folder)
+        config = folders.read_config(folder)
         row = {name: config[name] for name in RUN_COLUMNS if name in config}
         row["noise"] = config["configuration"].noise
         row["noise_rate"] = config["configuration"].noise_rate
-        result = read_result(folder, config)
+        result = folders.read_result(folder, config)
         if result is None:
             reason = f"no result.json; {progress(folder)}"
             return row | {"status": "unfinished", "reason": reason}
@@ -133,36 +116,29 @@ def read_runs(runs_dir):
     say, where their study has a newer version of an environment, and empty for all others.
     """
     runs_dir, rows = Path(runs_dir), []
-    for folder in runs_of(runs_dir):
+    for folder in folders.runs_of(runs_dir):
         row = read_run(folder) | {"run": str(folder.relative_to(runs_dir))}
         rows.append(row | {"phase": "" if folder.parent == runs_dir else folder.parent.name})
-    leave_out_different(rows)
     rows += failed_without_a_folder(runs_dir)
     runs = pd.DataFrame(rows, columns=RUN_COLUMNS, dtype=object)
+    leave_out_different(runs)
     set_older_versions_apart(runs)
     twice = (runs["status"] == "finished") & runs.duplicated(["status", *KEYS, "seed"])
     runs.loc[twice, ["status", "reason"]] = ["duplicate", "same configuration and seed as another"]
     return runs
 
 
-def leave_out_different(rows):
-    """Mark the finished runs whose arguments are not those of most runs of their exp_name.
-
-    rows: dicts of read_run, which are changed.
-    """
-    studies = {}
-    for row in rows:
-        if row["status"] == "finished":
-            studies.setdefault((row["algorithm"], row["exp_name"]), []).append(row)
-    for (_, exp_name), runs in studies.items():
-        usual = usual_settings([run["settings"] for run in runs])
-        for run in runs:
-            differing = difference(run["settings"], usual)
+def leave_out_different(runs):
+    """Mark the finished runs whose arguments are not those of most runs of their exp_name."""
+    finished = runs[runs["status"] == "finished"]
+    for (_, exp_name), group in finished.groupby(["algorithm", "exp_name"]):
+        usual = usual_settings(group["settings"])
+        for index, own in group["settings"].items():
+            differing = folders.difference(own, usual)
             if differing:
-                own = run["settings"]
                 said = ", ".join(f"{name} is {own[name]}, not {usual[name]}" for name in differing)
                 said += f" as in most runs of {exp_name}: give such runs another --exp-name"
-                run |= {"status": "different", "reason": said}
+                runs.loc[index, ["status", "reason"]] = ["different", said]
 
 
 def usual_settings(settings):
@@ -171,13 +147,12 @@ def usual_settings(settings):
     settings: a dict for each run. An argument that a run lacks, because an older version made it,
     is no difference. Of equally frequent values, that of the longest runs is taken.
     """
-    found = {}  # argument -> {value as text: how many runs have it, the steps of the longest}
-    for run in settings:
+    counts = defaultdict(Counter)  # argument -> how many runs have a value, as text
+    for run in sorted(settings, key=lambda run: -run.get("total_timesteps", 0)):
         for name, value in run.items():
-            runs, steps = found.setdefault(name, {}).get(json.dumps(value), (0, 0))
-            longest = max(steps, run.get("total_timesteps", 0))
-            found[name][json.dumps(value)] = runs + 1, longest
-    return {name: json.loads(max(counts, key=counts.get)) for name, counts in found.items()}
+            counts[name][json.dumps(value)] += 1
+    # of equals, the first one counted
+    return {name: json.loads(values.most_common(1)[0][0]) for name, values in counts.items()}
 
 
 def set_older_versions_apart(runs):
@@ -186,12 +161,11 @@ def set_older_versions_apart(runs):
     So an average over environments has one version of each.
     """
     finished = runs[(runs["status"] == "finished") & (runs["phase"] == "")]
-    for _, group in finished.groupby(STUDY):
-        newest = newest_versions(group["environment"])
-        for run in group.itertuples():
-            environment, version = split_version(run.environment)
-            if version != newest[environment]:
-                runs.loc[run.Index, "phase"] = f"{OLDER} v{version}"
+    parts = finished["environment"].str.extract(VERSION)
+    version = parts["version"].fillna(-1).astype(int)
+    newest = version.groupby([*(finished[name] for name in STUDY), parts["name"]]).transform("max")
+    older = parts.loc[version < newest, "version"].fillna("")
+    runs.loc[older.index, "phase"] = f"{OLDER} v" + older
 
 
 def failed_without_a_folder(runs_dir):
@@ -201,8 +175,9 @@ def failed_without_a_folder(runs_dir):
     """
     rows = []
     for path in sorted(runs_dir.glob("logs/*__*.log")):
-        log = read_log(runs_dir / path.stem)
-        if not (runs_dir / path.stem).exists() and log.exit_status not in (None, 0, *STOPPED):
+        log = folders.read_log(runs_dir / path.stem)
+        failed = log.exit_status not in (None, 0, *folders.STOPPED)
+        if failed and not (runs_dir / path.stem).exists():
             rows.append({"run": path.stem, "status": "failed", "reason": log.last_line})
     return rows
 
@@ -216,7 +191,7 @@ def read_choice(runs_dir):
     if not path.exists():
         return None
     if not any((path.parent / phase).exists() for phase in PHASES):
-        raise ValueError(flat_choice(path.parent))
+        raise ValueError(folders.flat_choice(path.parent))
     text = dict.fromkeys(("round", "noise", "noise_rate", "survives"), str)
     choice = pd.read_csv(path, dtype=text, keep_default_na=False)
     if list(choice.columns) != CHOICE_COLUMNS:
@@ -224,19 +199,6 @@ def read_choice(runs_dir):
     pairs = zip(choice["noise"], choice["noise_rate"], strict=True)
     choice["noise_rate"] = [Configuration.parse(*pair).noise_rate for pair in pairs]
     return choice
-
-
-def newest_versions(environments):
-    """Return {name: newest version} of environment ids: ["Hopper-v4"] -> {"Hopper": "4"}."""
-    newest = {}
-    for name, version in map(split_version, set(environments)):
-        newest[name] = max(newest.get(name, ""), version, key=lambda text: int(text or -1))
-    return newest
-
-
-def split_version(environment):
-    """Split "Hopper-v5" into ("Hopper", "5"); an id without a version gives "" for it."""
-    return re.fullmatch(r"(.*?)(?:-v(\d+))?", environment).groups("")
 
 
 def progress(folder):
@@ -257,20 +219,16 @@ def missing_runs(runs):
     """
     rows = []
     runs = runs[runs["algorithm"].notna() & (runs["status"] != "different")]
-    for study, group in runs.groupby(STUDY):
-        if study[2] == SEARCH:
-            continue
+    for study, group in runs[runs["phase"] != SEARCH].groupby(STUDY):
         found = group.groupby(["environment", "configuration"])["seed"].agg(set).to_dict()
         baselines = {(environment, BASELINE) for environment, _ in found}
         usual = [seeds for key, seeds in found.items() if key not in baselines]
-        if not usual:
-            usual = list(found.values())
+        usual = usual or list(found.values())
         counts = Counter(seed for seeds in usual for seed in seeds)
         expected = {seed for seed, n in counts.items() if 2 * n >= len(usual)}
-        for key in sorted(found.keys() | baselines):
-            environment, config = key
+        for environment, config in sorted(found.keys() | baselines):
             keys = (*study, environment, config.noise, config.noise_rate)
-            for seed in sorted(expected - found.get(key, set())):
+            for seed in sorted(expected - found.get((environment, config), set())):
                 rows.append((*keys, int(seed), "missing", "no run folder"))
     return pd.DataFrame(rows, columns=[*KEYS, "seed", "status", "reason"])
 
@@ -282,26 +240,16 @@ def left_out(runs):
     run whose config.json cannot be read has a row of its own.
     """
     out = pd.concat([runs[runs["status"] != "finished"], missing_runs(runs)], ignore_index=True)
-    rows = []
-    nameless = out["run"].where(out["algorithm"].isna())
-    keys = [out["status"], *(out[name] for name in KEYS), nameless.fillna("")]
-    for (status, *config, _), group in out.groupby(keys, sort=False, dropna=False):
-        rows.append(
-            {
-                "status": status,
-                **dict(zip(KEYS, config, strict=True)),
-                "seeds": ranges(group["seed"].dropna()),
-                "run": few(group["run"].dropna()),
-                "reason": few(group["reason"]),
-            }
-        )
-    table = pd.DataFrame(rows, columns=["status", *KEYS, "seeds", "run", "reason"])
-    return table, Counter(out["status"])
+    nameless = out["run"].where(out["algorithm"].isna(), "")
+    keys = [out["status"], *(out[name] for name in KEYS), nameless.rename("nameless")]
+    groups = out.groupby(keys, sort=False, dropna=False)
+    table = groups.agg(seeds=("seed", ranges), run=("run", few), reason=("reason", few))
+    return table.droplevel("nameless").reset_index(), Counter(out["status"])
 
 
 def few(texts):
     """Join one or two different texts; of more, give the first and the number of the others."""
-    different = list(dict.fromkeys(texts))
+    different = list(texts.dropna().unique())
     if len(different) > 2:
         return f"{different[0]} and {len(different) - 1} more"
     return ", ".join(different)
@@ -310,7 +258,7 @@ def few(texts):
 def ranges(numbers):
     """Write whole numbers as ranges: [1, 2, 3, 5] -> "1-3, 5"."""
     parts = []
-    for number in sorted(numbers):
+    for number in sorted(set(numbers.dropna())):
         if parts and number == parts[-1][1] + 1:
             parts[-1][1] = number
         else:
@@ -328,7 +276,7 @@ class Study:
     environments: list
     seeds: list
     steps: np.ndarray  # the evaluation steps that all runs share
-    returns: dict  # Configuration -> array (steps x seeds x envs), NaN where there is no run
+    returns: dict  # Configuration, the baseline first -> (steps x seeds x envs), NaN without a run
     metric: str = "return"  # or "success rate": then `returns` has rates of success in percent
 
     @property
@@ -341,14 +289,12 @@ class Study:
         """Its name for people."""
         return study_name(*self.key)
 
-    def percent_of(self, difference, e):
-        """Return a difference in percent of the baseline's mean in an environment, if it has any.
+    def percent(self, e):
+        """Return what a difference of 1 is in percent of the baseline's mean in an environment.
 
-        A rate of success has none: differences of rates are in percentage points.
+        A rate of success has no percent: differences of rates are in percentage points.
         """
-        if self.metric == SUCCESS:
-            return difference * np.nan
-        return percent_of(difference, self.final(BASELINE)[:, e])
+        return np.nan if self.metric == SUCCESS else percent_of(1.0, self.sample(BASELINE, e))
 
     def all_equal(self):
         """Return the environments where all tests of two or more runs are equal: {name: value}."""
@@ -359,6 +305,13 @@ class Study:
             if tests.shape[1] > 1 and (tests == tests[0, 0]).all():
                 found[env] = tests[0, 0]
         return found
+
+    def sample(self, config, e):
+        """Return the final test returns (seeds,) in one environment, of the runs that exist."""
+        if config not in self.returns:
+            return np.empty(0)
+        returns = self.final(config)[:, e]
+        return returns[np.isfinite(returns)]
 
     def final(self, config):
         """Return the (seeds x envs) array of final test returns."""
@@ -375,25 +328,24 @@ def make_studies(runs, metric="return"):
     finished = runs[(runs["status"] == "finished") & runs[column].notna()]
     for key, group in finished.groupby(STUDY):
         name = study_name(*key)
-        grids = list({steps.tobytes(): steps for steps in group["steps"]}.values())
-        grid = reduce(np.intersect1d, grids)
-        longest = max(map(len, grids))
-        if len(grid) < longest:
+        steps, longest = reduce(np.intersect1d, group["steps"]), group["steps"].map(len).max()
+        if len(steps) < longest:
             notes.append(
                 f"{name}: runs differ in their evaluation steps; curves are cut to the "
-                f"{len(grid)} steps that all share (of up to {longest})"
+                f"{len(steps)} steps that all share (of up to {longest})"
             )
         envs, seeds = sorted(set(group["environment"])), sorted(set(group["seed"]))
-        configs = {*group["configuration"], BASELINE}
-        shape = (len(grid), len(seeds), len(envs))
-        returns = {config: np.full(shape, np.nan) for config in sorted(configs)}
+        shape = (len(steps), len(seeds), len(envs))
+        configs = sorted({*group["configuration"], BASELINE})
+        study = Study(
+            *key, envs, seeds, steps, {c: np.full(shape, np.nan) for c in configs}, metric
+        )
         for run in group.itertuples():
             place = seeds.index(run.seed), envs.index(run.environment)
-            shared = np.isin(run.steps, grid)
-            returns[run.configuration][:, *place] = getattr(run, column)[shared]
-        study = Study(*key, envs, seeds, grid, returns, metric)
-        for env, values in zip(envs, study.final(BASELINE).T, strict=True):
-            if np.isnan(values).all() and study.phase != "search":
+            shared = np.isin(run.steps, steps)
+            study.returns[run.configuration][:, *place] = getattr(run, column)[shared]
+        for e, env in enumerate(envs):
+            if study.phase != SEARCH and len(study.sample(BASELINE, e)) == 0:
                 notes.append(f"{name}: no finished baseline on {env}, so no improvement there")
         if study.phase.startswith(OLDER):
             notes.append(
@@ -412,8 +364,7 @@ def version_notes(runs):
             counts = Counter(str(versions.get(library)) for versions in group["versions"])
             if len(counts) > 1:
                 found = ", ".join(f"{version} (n = {n})" for version, n in sorted(counts.items()))
-                what = "of different code versions"
-                if library != "git commit":
-                    what = f"with different {library}"
+                code = library == "git commit"
+                what = "of different code versions" if code else f"with different {library}"
                 notes.append(f"{study_name(*key)}: some rows average runs {what}: {found}")
     return notes

@@ -6,8 +6,8 @@ https://arxiv.org/abs/2108.13264.
 """
 
 from functools import cache, lru_cache, reduce
-from itertools import combinations
-from math import ceil, comb, copysign, inf, isnan, nan, prod, sqrt
+from itertools import combinations, count
+from math import ceil, comb, inf, isnan, nan, prod, sqrt
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -18,28 +18,25 @@ LEVEL, POWER = 0.05, 0.8
 normal_quantile = NormalDist().inv_cdf
 # A test at this level finds an effect of so many standard errors with this power.
 DETECTABLE = normal_quantile(1 - LEVEL / 2) + normal_quantile(POWER)
-# With fewer seeds there is no interval of an IQM; of the probability of improvement, which for 3
-# against 3 would exclude 0.5 where p = 0.1; of a difference of means, which for 4 against 4 would
-# say something else than p in 16 % of cases (5 seeds: 5 %).
+# With fewer there is no interval. That of a difference of means would say something else than p in
+# 16 % of cases for 4 against 4 seeds (5 seeds: 5 %); of the others docs/statistics.md says why.
 SEEDS_FOR_IQM, SEEDS_FOR_PROBABILITY, SEEDS_FOR_INTERVAL = 3, 4, 5
-RESAMPLES = 2000
 MOST_PARTITIONS = 20_000  # where there are more, a test draws RANDOM_PARTITIONS
 RANDOM_PARTITIONS = 99_999
 
 
 def columns(scores):
     """Split a sample into one array per environment, without the missing runs."""
-    scores = np.asarray(scores, float)
-    scores = scores[:, None] if scores.ndim == 1 else scores
-    return [column[np.isfinite(column)] for column in scores.T]
+    scores = np.atleast_2d(np.asarray(scores, float).T)
+    return [column[np.isfinite(column)] for column in scores]
 
 
 def mean_std(values):
     """Mean, sample standard deviation (ddof=1) and number of the values that are not NaN."""
     values = np.asarray(values, float)
     values = values[np.isfinite(values)]
-    mean = values.mean() if len(values) else np.nan
-    return mean, values.std(ddof=1) if len(values) > 1 else np.nan, len(values)
+    mean = values.mean() if len(values) else nan
+    return mean, values.std(ddof=1) if len(values) > 1 else nan, len(values)
 
 
 def percent_of(difference, baseline):
@@ -49,13 +46,12 @@ def percent_of(difference, baseline):
     zero, or, with fewer than three seeds, the returns have not all one sign. baseline (seeds,).
     """
     baseline = baseline[np.isfinite(baseline)]
-    n, mean = len(baseline), baseline.mean() if len(baseline) else 0.0
-    if n < 3:
-        clear = n > 0 and (np.all(baseline > 0) or np.all(baseline < 0))
+    if len(baseline) < 3:
+        clear = len(baseline) > 0 and (np.all(baseline > 0) or np.all(baseline < 0))
     else:
-        half = scipy.special.stdtrit(n - 1, 0.975) * baseline.std(ddof=1) / sqrt(n)
-        clear = abs(mean) > half
-    return 100 * difference / abs(mean) if clear else difference * nan
+        _, _, low, high = contrast([baseline], [1])
+        clear = not low <= 0 <= high
+    return 100 * difference / abs(baseline.mean()) if clear else nan
 
 
 def iqm(scores):
@@ -71,20 +67,22 @@ def iqm(scores):
     return np.where(np.isnan(ordered[..., -1]), np.nan, means)[()]
 
 
-def bootstrap_iqm(scores, baseline=None, resamples=RESAMPLES):
+def bootstrap_iqm(scores, baseline=None, resamples=2000):
     """IQM over seeds and environments with its 95 % interval.
 
     With a baseline it is the IQM of the scores minus that of the baseline, both in percent of the
-    baseline's IQM in each environment.
+    baseline's IQM in each environment, and NaN where the interval of one of these includes zero.
 
     The interval is iqm +- t_{0.975, df} sqrt(sum of v). There is one v for each sample (the seeds
     of one environment, with noise or without): n / (n - 1) times the variance of the IQM when
     this sample is drawn anew from its own n seeds (Efron and Tibshirani, 1993, chapter 12). df is
-    Satterthwaite's (1946), (sum of v)^2 / sum of v^2 / (n - 1), so few seeds of the baseline count.
+    Satterthwaite's (1946), so few seeds of the baseline count.
 
     scores (seeds x envs), baseline (other seeds x envs) or None -> iqm, low, high.
     """
-    rng = np.random.default_rng(0)
+    noisy, alone = columns(scores), [] if baseline is None else columns(baseline)
+    if any(low <= 0 <= high for _, low, high in map(bootstrap_iqm, alone)):
+        return nan, nan, nan
 
     def improvement(x, y):
         pairs = [(a, np.asarray(iqm(b))[..., None]) for a, b in zip(x, y, strict=True)]
@@ -94,29 +92,25 @@ def bootstrap_iqm(scores, baseline=None, resamples=RESAMPLES):
         x, y = samples[: len(noisy)], samples[len(noisy) :]
         return improvement(x, y) - improvement(y, y) if y else iqm(np.concatenate(x, axis=-1))
 
-    noisy = columns(scores)
-    samples = noisy + ([] if baseline is None else columns(baseline))
+    samples = noisy + alone
     value = estimate(samples)
     n = np.array([len(sample) for sample in samples])
     if n.min() < SEEDS_FOR_IQM:
-        return value, np.nan, np.nan
+        return value, nan, nan
+    rng = np.random.default_rng(0)
     observed = [np.broadcast_to(sample, (resamples, len(sample))) for sample in samples]
     variances = np.empty(len(samples))
     for i, sample in enumerate(samples):
         drawn = sample[rng.integers(n[i], size=(resamples, n[i]))]
         estimates = estimate([*observed[:i], drawn, *observed[i + 1 :]])
         variances[i] = n[i] / (n[i] - 1) * estimates.var(ddof=1)
-    variance = variances.sum()
-    if variance == 0:  # all seeds alike
-        return value, value, value
-    df = variance**2 / (variances**2 / (n - 1)).sum()
-    half = scipy.special.stdtrit(df, 0.975) * np.sqrt(variance)
+    _, half = satterthwaite(variances, n)
     return value, value - half, value + half
 
 
-def wins(x, y):
-    """Mann-Whitney's U: the number of pairs with x > y, a tie counting half. x (n), y (m)."""
-    return (x[:, None] > y).sum() + 0.5 * (x[:, None] == y).sum()
+def win_rate(x, y):
+    """P(x > y) of samples x (n) and y (m), a tie counting half: Mann-Whitney's U / (n m)."""
+    return ((x[:, None] > y) + 0.5 * (x[:, None] == y)).mean()
 
 
 def newcombe_interval(p, n, m):
@@ -144,9 +138,9 @@ def probability_of_improvement(x, y):
     Donner, 2008). x (seeds x envs), y (seeds x envs) -> p, low, high.
     """
     x, y = columns(x), columns(y)
-    rates = np.array([wins(a, b) / (len(a) * len(b)) for a, b in zip(x, y, strict=True)])
+    rates = np.array(list(map(win_rate, x, y)))
     if min(map(len, x + y)) < SEEDS_FOR_PROBABILITY:
-        return rates.mean(), np.nan, np.nan
+        return rates.mean(), nan, nan
     limits = [newcombe_interval(p, len(a), len(b)) for p, a, b in zip(rates, x, y, strict=True)]
     below, above = np.abs(rates[:, None] - limits).T
     p = rates.mean()
@@ -218,10 +212,8 @@ def permutation_t(x, y):
         welch_t(np.concatenate(pair)[:, None], partitions(*size))[:, 0]
         for pair, size in zip(pairs, sizes, strict=True)
     ]
-    if ways <= MOST_PARTITIONS:
+    if len(ts) == 1 or ways <= MOST_PARTITIONS:
         null = reduce(lambda a, b: np.add.outer(a, b).ravel(), ts)
-    elif len(ts) == 1:
-        [null] = ts
     else:
         rng = np.random.default_rng(0)
         null = sum(np.append(t[0], drawn(t, rng)) for t in ts)
@@ -269,15 +261,12 @@ def compare(x, y):
     """Compare the means of two samples x and y of the same environments."""
     xs, ys = columns(x), columns(y)
     pairs = list(zip(xs, ys, strict=True))
-    differences = [a.mean() - b.mean() for a, b in pairs]
-    stds = [sqrt((mean_std(a)[1] ** 2 + mean_std(b)[1] ** 2) / 2) for a, b in pairs]
-    effects = [
-        difference / std if std else copysign(inf, difference) if difference else 0.0
-        for difference, std in zip(differences, stds, strict=True)
-    ]
-    percents = [percent_of(d, baseline) for d, baseline in zip(differences, ys, strict=True)]
-    with np.errstate(invalid="ignore"):
-        effect = np.mean(effects)  # of inf and -inf there is none
+    differences = np.array([a.mean() - b.mean() for a, b in pairs])
+    stds = np.array([sqrt((mean_std(a)[1] ** 2 + mean_std(b)[1] ** 2) / 2) for a, b in pairs])
+    percents = list(map(percent_of, differences, ys))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        effects = np.where(differences == 0, 0 * stds, differences / stds)
+        effect = effects.mean()  # of inf and -inf there is none
     difference = low = high = std = detectable = needed = nan
     n, m = min(map(len, xs)), min(map(len, ys))
     if len(pairs) == 1:
@@ -313,8 +302,6 @@ def contrast(samples, weights):
     if sizes.min() < 2:
         return estimate, nan, nan, nan
     variances = np.array([np.var(sample, ddof=1) for sample in samples])
-    if not variances.any():
-        return estimate, 0.0, estimate, estimate
     error, half = satterthwaite(np.square(weights) * variances / sizes, sizes)
     return estimate, error, estimate - half, estimate + half
 
@@ -325,7 +312,8 @@ def satterthwaite(variances, sizes):
     variances (k, ...): of the k means; sizes (k, ...): how many values each is the mean of.
     """
     total = np.sum(variances, axis=0)
-    freedom = total**2 / np.sum(np.square(variances) / (sizes - 1), axis=0)
+    squares = np.sum(np.square(variances) / (sizes - 1), axis=0)
+    freedom = np.divide(total**2, squares, out=np.ones_like(total), where=squares > 0)
     return np.sqrt(total), np.sqrt(total) * scipy.special.stdtrit(freedom, 0.975)
 
 
@@ -373,9 +361,9 @@ def simulated_shift(n, m, level):
 @cache
 def seeds_needed(shift):
     """Return how many seeds each side needs to find a shift (in sd) with 80 % power; maybe inf."""
-    if isnan(shift) or shift == 0:
-        return nan if isnan(shift) else inf
-    n = max(4, ceil(2 * (DETECTABLE / shift) ** 2))  # of infinitely many degrees of freedom
-    while not detectable_shift(n, n) <= shift:
-        n += 1
-    return n
+    if isnan(shift):
+        return nan
+    if shift == 0:
+        return inf
+    least = ceil(2 * (DETECTABLE / shift) ** 2)  # of infinitely many degrees of freedom
+    return next(n for n in count(max(4, least)) if detectable_shift(n, n) <= shift)

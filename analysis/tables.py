@@ -7,42 +7,23 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from analysis.folders import SEARCH
+from analysis import statistics, verdicts
+from analysis.folders import CONFIRMATION, PHASES, SEARCH
 from analysis.formatting import P_VALUE, PLAIN, SHARE, TENTH, WHOLE, Table
-from analysis.luck import (
-    CONSISTENT_PERCENT,
-    DRAWS,
-    add_luck_of_best,
-    add_luck_of_consistent,
-    luck_of_study,
-    luck_rows,
-)
+from analysis.luck import CONSISTENT_PERCENT, DRAWS, add_luck, luck_of_study
 from analysis.paper import compare_tables
 from analysis.runs import KEYS, STUDY, SUCCESS, study_name
-from analysis.statistics import (
-    LEVEL,
-    bootstrap_iqm,
-    compare,
-    contrast,
-    holm,
-    mean_std,
-    probability_of_improvement,
-    steps_to_reach,
-)
-from analysis.verdicts import (
-    ALL_EQUAL,
-    counted,
-    difference,
-    listed,
-    seeds_of,
-    verdict,
-    what_all_runs_do,
-)
+from analysis.verdicts import ALL_EQUAL, counted, listed, seeds_of
 from noisy_wrappers import BASELINE
 
-PERCENTS = ("difference_percent", "iqm_change_percent", "iqm_change_low", "iqm_change_high")
-INTERVAL = ("difference_low", "difference_high")
 SEEDS_FOR_INTERACTION = 3  # of each of the four configurations
+PROBABILITY = ("probability_of_improvement", "probability_low", "probability_high")
+IQM_CHANGE = ("iqm_change_percent", "iqm_change_low", "iqm_change_high")
+# What a comparison does not tell where all returns are equal
+UNKNOWN = ("t", "p", "difference_low", "difference_high", "difference_percent", *IQM_CHANGE)
+BEST_VIEW = ["algorithm, environment", "noise", "noise_rate", "baseline_mean", "baseline_std"]
+BEST_VIEW += ["noisy_mean", "noisy_std", "difference", "p_adjusted", "luck_95", "p_luck_of_best"]
+BEST_VIEW += ["n"]
 # After those that name a study
 _COLUMNS = {
     "summary": """environment noise noise_rate n mean std n_baseline baseline_mean
@@ -53,15 +34,8 @@ _COLUMNS = {
     "consistency": """noise noise_rate percent_of_environments
         average_improvement_percent std_improvement_percent p p_adjusted p_luck
         environments without_percent n fails_at_every_rate""",
-    "luck": """environments best_beyond_luck configurations
-        consistent consistent_by_luck consistent_by_luck_95 p_consistent consistent_beyond_luck
-        consistently_worse consistently_worse_by_luck consistently_worse_by_luck_95
-        p_consistently_worse consistently_worse_beyond_luck""",
     "success": """environment noise noise_rate mean std baseline_mean baseline_std difference
         p p_adjusted n n_baseline""",
-    "interactions": """environment noise noise_rate n both_mean first_mean second_mean
-        baseline_mean interaction interaction_low interaction_high standard_error
-        interaction_percent percent_low percent_high""",
     "early_performance": "environment noise steps_millions noise_rate mean std n",
     "statistics": """scope environment noise noise_rate verdict difference difference_low
         difference_high difference_percent effect_size p p_adjusted n n_baseline n_baseline_most
@@ -70,6 +44,7 @@ _COLUMNS = {
         environments comparisons smallest_p smallest_p_adjusted""",
 }
 COLUMNS = {name: [*STUDY, *text.split()] for name, text in _COLUMNS.items()}
+COLUMNS["judged"] = [*dict.fromkeys(COLUMNS["summary"] + COLUMNS["statistics"])]
 _COLUMNS_WITH = {
     WHOLE: """n n_baseline n_baseline_most environments chosen_from configurations seeds
         seeds_needed steps_to_baseline percent_of_environments best_beyond_luck consistent
@@ -93,51 +68,86 @@ def row_keys(study, environment, config):
     return dict(zip(KEYS, (*study.key, environment, config.noise, config.noise_rate), strict=True))
 
 
-def summary_rows(study):
-    """Yield the final mean and std of every configuration, against the baseline of its env."""
-    for (e, env), config in product(enumerate(study.environments), study.returns):
-        mean, std, n = mean_std(study.final(config)[:, e])
-        if n == 0:
+def judge(studies):
+    """Return all that is known of the final returns of studies, with the verdicts on them.
+
+    The result has the columns of the tables summary and statistics, and a row for every
+    configuration in every environment (scope "environment"), then for every noise in all
+    environments together (scope "all").
+    """
+    rows = [row for study in studies for row in final_rows(study)]
+    return adjust(pd.DataFrame(rows, columns=COLUMNS["judged"]))
+
+
+def final_rows(study):
+    """Yield the rows of `judge` for one study, without corrections and verdicts.
+
+    The seeds of a search chose the noise, so they are not compared.
+    """
+    all_equal = study.all_equal()
+    for (e, environment), config in product(enumerate(study.environments), study.returns):
+        sample, baseline = study.sample(config, e), study.sample(BASELINE, e)
+        if len(sample) == 0:
             continue
-        baseline = study.final(BASELINE)[:, e]
-        base_mean, base_std, base_n = mean_std(baseline)
-        row = {
-            **row_keys(study, env, config),
-            "n": n,
-            "mean": mean,
-            "std": std,
-            "n_baseline": base_n,
-            "baseline_mean": base_mean,
-            "baseline_std": base_std,
-        }
-        if config != BASELINE:
-            row["difference"] = mean - base_mean
-            row["improvement_percent"] = study.percent_of(mean - base_mean, e)
-        curves = study.returns[config][..., e]
-        row["steps_to_baseline"] = steps_to_reach(curves, study.steps, base_mean)
+        row = row_keys(study, environment, config) | {"scope": "environment"}
+        row["mean"], row["std"], row["n"] = statistics.mean_std(sample)
+        row["baseline_mean"], row["baseline_std"], row["n_baseline"] = statistics.mean_std(baseline)
+        row["iqm"], row["iqm_low"], row["iqm_high"] = statistics.bootstrap_iqm(sample)
+        curves, target = study.returns[config][..., e], row["baseline_mean"]
+        row["steps_to_baseline"] = statistics.steps_to_reach(curves, study.steps, target)
+        if config != BASELINE and len(baseline) and study.phase != SEARCH:
+            row |= against_baseline(study, config, [e])
+            row["improvement_percent"] = row["difference_percent"]
+            if environment in all_equal:
+                row |= dict.fromkeys(UNKNOWN, np.nan) | {"verdict": ALL_EQUAL}
         yield row
+    if study.phase in PHASES:  # in a confirmation each environment has its one comparison
+        return
+    differing = np.array([environment not in all_equal for environment in study.environments])
+    for config in study.returns:
+        seeds = [np.isfinite(study.final(side)).sum(axis=0) for side in (config, BASELINE)]
+        places = np.flatnonzero(differing & (np.minimum(*seeds) >= 2))
+        if config != BASELINE and len(places) > 1:
+            row = row_keys(study, "", config) | {"scope": "all"}
+            yield row | against_baseline(study, config, places)
 
 
-def best_rows(summary):
-    """Yield the best noise of every study and environment, from the rows of a summary."""
-    noisy = summary[summary["difference"].notna()]
-    for _, group in noisy.groupby([*STUDY, "environment"]):
-        best = group.loc[group["mean"].idxmax()]
-        named = {"noisy_mean": best["mean"], "noisy_std": best["std"]}
-        yield best.to_dict() | named | {"chosen_from": len(group)}
+def against_baseline(study, config, places):
+    """Return the part of a row that compares a configuration with the baseline.
+
+    places: the numbers of the environments.
+    """
+    x, y = study.final(config)[:, places], study.final(BASELINE)[:, places]
+    row = statistics.compare(x, y)._asdict()
+    row |= zip(PROBABILITY, statistics.probability_of_improvement(x, y), strict=True)
+    if study.metric == SUCCESS:  # never percent of a rate
+        row["difference_percent"] = np.nan
+    if np.isfinite(row["difference_percent"]):
+        row |= zip(IQM_CHANGE, statistics.bootstrap_iqm(x, y), strict=True)
+    return row
 
 
-def consistency_rows(summary):
+def best_rows(judged):
+    """Return the rows of `judge` about the best noise of every study and environment."""
+    noisy = judged[judged["difference"].notna()]
+    means = noisy.groupby([*STUDY, "environment"])["mean"]
+    best = noisy.assign(chosen_from=means.transform("size")).loc[means.idxmax()]
+    return best.rename(columns={"mean": "noisy_mean", "std": "noisy_std"})
+
+
+def consistency_rows(judged):
     """Yield per noise and rate the share of envs that are matched or better, and by how much.
 
     Every environment counts in the share, by the sign of its difference; the average is over those
-    whose baseline has a percentage, and the others are named.
+    whose baseline has a percentage, and the others are named. p is that of all environments.
     """
     keys = [*STUDY, "noise", "noise_rate"]
-    for key, group in summary[summary["difference"].notna()].groupby(keys):
-        mean, std, _ = mean_std(group["improvement_percent"])
+    tests = judged[judged["scope"] == "all"].set_index(keys)[["p", "p_adjusted"]].to_dict("index")
+    for key, group in judged[judged["difference"].notna()].groupby(keys):
+        mean, std, _ = statistics.mean_std(group["improvement_percent"])
         without = group.loc[group["improvement_percent"].isna(), "environment"]
-        yield dict(zip(keys, key, strict=True)) | {
+        row = dict(zip(keys, key, strict=True)) | tests.get(key, {})
+        yield row | {
             "percent_of_environments": 100 * (group["difference"] >= 0).mean(),
             "average_improvement_percent": mean,
             "std_improvement_percent": std,
@@ -157,10 +167,10 @@ def early_rows(study):
     noises = sorted({config.noise for config in study.returns if not config.is_baseline})
     for (e, env), noise in product(enumerate(study.environments), noises):
         configs = [config for config in study.returns if config.noise == noise]
-        if not any(np.isfinite(study.final(config)[:, e]).any() for config in configs):
+        if not any(len(study.sample(config, e)) for config in configs):
             continue  # not tried here: the baseline alone would be no comparison
         for i, config in product(places, [BASELINE, *configs]):
-            mean, std, n = mean_std(study.returns[config][i, :, e])
+            mean, std, n = statistics.mean_std(study.returns[config][i, :, e])
             if n > 0:
                 yield {
                     **row_keys(study, env, config),
@@ -170,66 +180,6 @@ def early_rows(study):
                     "std": std,
                     "n": n,
                 }
-
-
-def statistics_rows(study):
-    """Yield the comparison of every configuration with the baseline, per env and over all.
-
-    The scope of a row is "environment", or "all": of those with two seeds of both kinds.
-    """
-    places = [("environment", env, [e]) for e, env in enumerate(study.environments)]
-    if study.phase != "confirmation":  # there each environment has its one comparison
-        places.append(("all", "", list(range(len(study.environments)))))
-    limits, all_equal = baseline_limits(study), study.all_equal()
-    differing = np.array([env not in all_equal for env in study.environments])
-    for (scope, environment, chosen), config in product(places, study.returns):
-        x, y = study.final(config)[:, chosen], study.final(BASELINE)[:, chosen]
-        seeds = np.isfinite(x).sum(axis=0)
-        fewest = 2 if scope == "all" else 1
-        both = (seeds >= fewest) & (np.isfinite(y).sum(axis=0) >= fewest)
-        if scope == "all":
-            both &= differing
-        row = row_keys(study, environment, config) | {"scope": scope}
-        if scope == "all":
-            if config == BASELINE or both.sum() < 2:
-                continue
-        elif not seeds.any():
-            continue
-        else:  # returns of different environments have no common scale
-            row["n"] = seeds[0]
-            row["iqm"], row["iqm_low"], row["iqm_high"] = bootstrap_iqm(x)
-        if config != BASELINE and both.any():
-            clear = not any(low <= 0 <= high for low, high in limits[:, chosen][:, both].T)
-            row |= against_baseline(x[:, both], y[:, both], clear)
-            if study.metric == SUCCESS:  # never percent of a rate
-                row |= dict.fromkeys(PERCENTS, np.nan)
-            if environment in all_equal:
-                row |= dict.fromkeys([*PERCENTS, *INTERVAL, "t", "p"], np.nan)
-                row["verdict"] = ALL_EQUAL
-        yield row
-
-
-def baseline_limits(study):
-    """Return the 95 % intervals (2 x envs) of the baseline's IQM, NaN where there is none."""
-    limits = np.full((2, len(study.environments)), np.nan)
-    for e, returns in enumerate(study.final(BASELINE).T):
-        if np.isfinite(returns).any():
-            limits[:, e] = bootstrap_iqm(returns)[1:]
-    return limits
-
-
-def against_baseline(x, y, clear):
-    """Return the part of a row of statistics that compares x with y, both (seeds x envs).
-
-    clear: whether the IQM of every baseline is clearly not zero, so that the IQM has percent.
-    """
-    row = compare(x, y)._asdict()
-    names = ("probability_of_improvement", "probability_low", "probability_high")
-    row |= zip(names, probability_of_improvement(x, y), strict=True)
-    if clear and np.isfinite(row["difference_percent"]):
-        names = ("iqm_change_percent", "iqm_change_low", "iqm_change_high")
-        row |= zip(names, bootstrap_iqm(x, y), strict=True)
-    return row
 
 
 def interaction_rows(study):
@@ -242,15 +192,12 @@ def interaction_rows(study):
         parts = config.parts
         if len(parts) != 2 or parts[0] == parts[1]:
             continue
-        samples = []
-        for part in (config, *parts, BASELINE):
-            finals = study.final(part)[:, e] if part in study.returns else np.empty(0)
-            samples.append(finals[np.isfinite(finals)])
+        samples = [study.sample(part, e) for part in (config, *parts, BASELINE)]
         if min(map(len, samples)) < SEEDS_FOR_INTERACTION:
             continue
         both, first, second, alone = samples
-        value, error, low, high = contrast(samples, [1, -1, -1, 1])
-        percent = study.percent_of(1.0, e)
+        value, error, low, high = statistics.contrast(samples, [1, -1, -1, 1])
+        percent = study.percent(e)
         yield {
             **row_keys(study, environment, config),
             "n": min(map(len, samples)),
@@ -271,11 +218,6 @@ def interaction_rows(study):
 # ------------------------------------------------------------------------------------------- tables
 
 
-def frame(name, rows):
-    """Make a table of a list of dicts, with the columns of its kind even when it is empty."""
-    return pd.DataFrame(list(rows), columns=COLUMNS[name])
-
-
 def split_consistency(consistency):
     """Return the rows with at least 80 % of the environments, best first, and those with 0 %.
 
@@ -291,47 +233,30 @@ def split_consistency(consistency):
     return good, bad
 
 
-def adjust(statistics):
+def adjust(rows):
     """Add p corrected for all comparisons of a family, the smallest possible, and verdicts.
 
     A family is a study in one environment, or in all, corrected with Benjamini and Hochberg's
     method. The confirmations of `./benchmark.sh choose` were fixed beforehand: they are one family,
     corrected with Holm's method.
     """
-    tested = statistics[statistics["p"].notna()]
-    confirmed = tested["phase"] == "confirmation"
-    families = [(tested[confirmed], holm)] if confirmed.any() else []
+    tested = rows[rows["p"].notna()]
+    confirmed = tested["phase"] == CONFIRMATION
+    families = [(tested[confirmed], statistics.holm)] if confirmed.any() else []
     for _, family in tested[~confirmed].groupby([*STUDY, "scope", "environment"], dropna=False):
         families.append((family, stats.false_discovery_control))
     for family, correct in families:
-        number = len(family)
-        statistics.loc[family.index, "p_adjusted"] = correct(family["p"].to_numpy(float))
-        alone = np.minimum(1, family["smallest_p"].astype(float) * number)
-        statistics.loc[family.index, "smallest_p_adjusted"] = alone
-        statistics.loc[family.index, "comparisons"] = number
-    statistics["verdict"] = [verdict(row) for _, row in statistics.iterrows()]
-    return statistics
+        rows.loc[family.index, "p_adjusted"] = correct(family["p"].to_numpy(float))
+        rows.loc[family.index, "comparisons"] = len(family)
+    rows["smallest_p_adjusted"] = (rows["smallest_p"] * rows["comparisons"]).clip(upper=1)
+    rows["verdict"] = [verdicts.verdict(row) for _, row in rows.iterrows()]
+    return rows
 
 
-def with_p(table, statistics):
-    """Fill in the test of every row of a table that compares a noise with the baseline.
-
-    A table without environments has averages over all of them: it gets the test over all.
-    """
-    keys = [name for name in KEYS if name in table]
-    scope = "environment" if "environment" in table else "all"
-    tests = statistics[statistics["scope"] == scope].set_index(keys)[["p", "p_adjusted"]]
-    found = tests.reindex(pd.MultiIndex.from_frame(table[keys])).set_index(table.index)
-    for name in ("p", "p_adjusted"):
-        if name in table:
-            table[name] = found[name]
-    return table
-
-
-def family_notes(statistics):
+def family_notes(judged):
     """Say where the number of seeds is too small to show a difference, if corrected."""
     notes = []
-    compared = statistics[statistics["verdict"].notna() & (statistics["verdict"] != ALL_EQUAL)]
+    compared = judged[judged["verdict"].notna() & (judged["verdict"] != ALL_EQUAL)]
     keys = ["comparisons", "smallest_p"]
     for study, rows in compared.groupby(STUDY):
         best = rows.sort_values("smallest_p", kind="stable")
@@ -340,12 +265,12 @@ def family_notes(statistics):
             places = same["environment"].mask(same["scope"] == "all", "all")
             where = f"{study_name(*study)}, {', '.join(places)}"
             seeds = counted(min(same["n"].min(), same["n_baseline"].min()), "seed")
-            if smallest > LEVEL:
+            if smallest > statistics.LEVEL:
                 notes.append(
                     f"{where}: with {seeds} no difference can be significant (smallest possible p: "
                     f"{smallest:.2g})."
                 )
-            elif (needed := ceil(round(size * smallest / LEVEL, 9))) > 1:
+            elif (needed := ceil(round(size * smallest / statistics.LEVEL, 9))) > 1:
                 notes.append(
                     f"{where}: with {seeds} and {size:.0f} comparisons, differences can be "
                     f"significant after the correction only if at least {needed} of them are "
@@ -358,7 +283,7 @@ def family_notes(statistics):
 def all_equal_notes(studies):
     """Say where all tests of all runs have the same result, so that comparisons say nothing."""
     return [
-        f"{study.name} on {environment}: {what_all_runs_do(value, study.metric)} in "
+        f"{study.name} on {environment}: {verdicts.what_all_runs_do(value, study.metric)} in "
         f"{study.steps[-1]:,} steps, so they say nothing about noise."
         for study in studies
         for environment, value in study.all_equal().items()
@@ -367,12 +292,9 @@ def all_equal_notes(studies):
 
 def success_table(studies):
     """Return the table of final success rates as {name: Table}, empty without such studies."""
-    judging = [study for study in studies if study.phase != SEARCH]
-    rows = [row for study in judging for row in summary_rows(study)]
-    if not rows:
-        return {}
-    statistics = frame("statistics", (row for study in judging for row in statistics_rows(study)))
-    return {"success": table_of("success", with_p(frame("success", rows), adjust(statistics)))}
+    rows = judge(study for study in studies if study.phase != SEARCH)
+    rows = rows[rows["scope"] == "environment"]
+    return {"success": table_of("success", rows[COLUMNS["success"]])} if len(rows) else {}
 
 
 # At most two lines in the report; docs/statistics.md says how the numbers are computed.
@@ -422,47 +344,43 @@ def make_tables(studies, paper=None):
 
     `paper` has the paper's tables (read_paper), to be set beside ours.
     """
-    summary = frame("summary", (row for study in studies for row in summary_rows(study)))
+    rows = judge(studies)
+    alone = rows[rows["scope"] == "environment"]
     # The seeds of a search chose the noise, so they cannot judge it.
-    judging = [study for study in studies if study.phase != "search"]
-    judged = summary[summary["phase"] != "search"]
-    best = frame("best", best_rows(judged))
-    consistency = frame("consistency", consistency_rows(judged))
-    early = frame("early_performance", (row for study in studies for row in early_rows(study)))
-    statistics = frame("statistics", (row for study in judging for row in statistics_rows(study)))
-    statistics = adjust(statistics)
-    compared = statistics[statistics["verdict"].notna()]
-    summary, judged, best, consistency = (
-        with_p(table, statistics) for table in (summary, judged, best, consistency)
-    )
+    judging = [study for study in studies if study.phase != SEARCH]
+    judged = rows[rows["phase"] != SEARCH]
+    best = best_rows(judged)
+    consistency = pd.DataFrame(consistency_rows(judged), columns=COLUMNS["consistency"])
     good, bad = split_consistency(consistency)
+    returns = (row for study in studies for row in early_rows(study))
+    early = pd.DataFrame(returns, columns=COLUMNS["early_performance"])
     lucks = {study.key: luck_of_study(study) for study in judging}
-    best = add_luck_of_best(best, lucks)
-    good, bad = add_luck_of_consistent(good, bad, lucks)
-    luck = frame("luck", luck_rows(lucks, best, good, bad))
+    best, good, bad, luck = add_luck(lucks, best, good, bad)
     failing = bad[bad["fails_at_every_rate"] == "yes"][[*STUDY, "noise"]].drop_duplicates()
     failing = "; ".join(f"{noise} ({study_name(*study)})" for *study, noise in failing.values)
     failing = f"Worse at every rate that was tried: {failing or 'none'}."
-    metric = studies[0].metric
-    note = percent_note(judged, metric)
+    note = percent_note(judged, studies[0].metric)
+    compared = judged["verdict"].notna()
+    table = judged.assign(n_baseline=judged["n_baseline"].where(compared))[COLUMNS["statistics"]]
+    shape = {"view": table[compared], "only_csv": STATISTICS_ONLY_CSV, "note": note}
     tables = [
-        table_of("best", best, view=best_view(best, statistics), note=note),
+        table_of("best", best[COLUMNS["best"]], view=best_view(best), note=note),
         table_of("consistent", good, note=note),
         table_of("consistently_worse", bad, note=f"{failing} {note}".strip()),
         table_of("luck", luck, only_csv=LUCK_ONLY_CSV),
-        table_of("statistics", statistics, view=compared, only_csv=STATISTICS_ONLY_CSV, note=note),
+        table_of("statistics", table, **shape),
         table_of("early_performance", early, rates_beside=True),
     ]
-    found = frame("interactions", (row for study in judging for row in interaction_rows(study)))
-    if len(found):
-        tables.append(table_of("interactions", found))
-    for algorithm, table in summary.groupby("algorithm"):
-        more = {"name": f"summary_{algorithm}", "note": percent_note(table, metric)}
-        tables.append(table_of("summary", table, **more))
+    interactions = pd.DataFrame(row for study in judging for row in interaction_rows(study))
+    if len(interactions):
+        tables.append(table_of("interactions", interactions))
+    for algorithm, table in alone.groupby("algorithm"):
+        more = {"name": f"summary_{algorithm}", "note": percent_note(table, studies[0].metric)}
+        tables.append(table_of("summary", table[COLUMNS["summary"]], **more))
     if paper:
         lengths = {study.key: study.steps[-1] for study in studies}
         steps = ", ".join(f"{study_name(*key)} {n:,}" for key, n in lengths.items())
-        ours = judged, best, consistency, good, bad, early
+        ours = alone[alone["phase"] != SEARCH], best, consistency, good, bad, early
         for name, table in compare_tables(paper, lengths, *ours):
             section = name.removeprefix("compare_")
             if section == "luck":
@@ -474,24 +392,15 @@ def make_tables(studies, paper=None):
 
 
 def table_of(kind, frame, name=None, section=None, **more):
-    """Make a Table with the formats and captions of this module; name and section may be kind."""
+    """Make a Table as this module describes its kind; name and section may be kind."""
     return Table(name or kind, frame, CAPTIONS[kind], section or kind, FORMATS, **more)
 
 
-def best_view(best, statistics):
+def best_view(best):
     """Return the best noises as people read them, in nine columns."""
-    tests = statistics[statistics["scope"] == "environment"].set_index(KEYS)
-    tests = tests.loc[list(best[KEYS].itertuples(index=False, name=None))]
-    view = pd.DataFrame(index=best.index)
-    names = [study_name(*key) for key in best[STUDY].itertuples(index=False)]
-    view["algorithm, environment"] = [
-        f"{name}, {environment}"
-        for name, environment in zip(names, best["environment"], strict=True)
-    ]
-    same = ["noise", "noise_rate", "baseline_mean", "baseline_std", "noisy_mean", "noisy_std"]
-    view = view.join(best[same])
-    view["difference"] = [difference(row) for row in tests.itertuples()]
-    view = view.join(best[["p_adjusted", "luck_95"]])
-    view["p_luck_of_best"] = best["p_luck"]
-    view["n"] = [seeds_of(*pair) for pair in best[["n", "n_baseline"]].to_numpy()]
-    return view
+    names = [f"{study_name(*key)}, {env}" for *key, env in best[[*STUDY, "environment"]].values]
+    seeds = [seeds_of(*pair) for pair in best[["n", "n_baseline"]].values]
+    said = [verdicts.difference(row) for row in best.itertuples()]
+    view = best.assign(difference=said, p_luck_of_best=best["p_luck"], n=seeds)
+    view["algorithm, environment"] = names
+    return view[BEST_VIEW]

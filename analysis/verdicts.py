@@ -1,9 +1,4 @@
-"""One plain sentence for each environment and noise: is it better than no noise?
-
-A noise is called better or worse only where the p of its comparison (statistics.compare), corrected
-for all configurations of a study in that environment, is at most 0.05; where only the uncorrected p
-is, it is "perhaps" so.
-"""
+"""One plain sentence for each environment and noise: is it better than no noise?"""
 
 from math import nan
 
@@ -24,7 +19,7 @@ MAX_SEEDS = 1000  # a difference that would take more seeds is said to take more
 
 def verdict(row):
     """Name the verdict of a row of statistics: one of VERDICTS, or NaN without a baseline."""
-    if pd.isna(row["n_baseline"]):
+    if pd.isna(row["smallest_p"]):
         return nan
     if row.get("verdict") == ALL_EQUAL:
         return ALL_EQUAL
@@ -190,11 +185,10 @@ def luck_sentence(best):
     if not (best["difference"] > 0).any():
         return "Nothing that was tried has a higher mean return than no noise."
     tried = set(best["chosen_from"])
-    rivals = f"the best of {max(tried):.0f} useless noises would"
+    number = "as many" if len(tried) > 1 else f"{max(tried):.0f}"
+    rivals = f"the best of {number} useless noises would"
     if tried == {1}:
         rivals = "one useless noise might"
-    elif len(tried) > 1:
-        rivals = "the best of as many useless noises would"
     beyond = best[best["p_luck"] <= LEVEL]
     if beyond.empty:
         where = " in each environment" if len(best) > 1 else ""
@@ -224,11 +218,12 @@ def headlines(statistics, best):
             tried += f", {together} in all environments together"
         if len(rows) > 1:
             tried = f"{counted(len(rows), 'comparison')} ({tried})"
-        counts = [(word, (rows["verdict"] == word).sum()) for word in VERDICTS]
-        counts = [(word, n) for word, n in counts if n or word in CLEAR]
-        luck = ""
-        if (rows["verdict"] != ALL_EQUAL).any():
-            luck = luck_sentence(best[rows_of(best, key)])
+        found = rows["verdict"].value_counts()
+        said = [word for word in VERDICTS if word in CLEAR or word in found]
+        counts = [(word, found.get(word, 0)) for word in said]
+        luck = (
+            "" if set(rows["verdict"]) == {ALL_EQUAL} else luck_sentence(best[rows_of(best, key)])
+        )
         lines.append({"name": study_name(*key), "tried": tried, "counts": counts, "luck": luck})
     return lines
 
@@ -249,11 +244,9 @@ def in_sentences(statistics, unit=""):
     All environments together come before each alone, and clear differences before others.
     """
     compared = statistics[statistics["verdict"].notna()]
-    compared = compared.assign(
-        apart=compared["scope"] != "all",
-        rank=[VERDICTS.index(verdict) for verdict in compared["verdict"]],
-    )
+    sentences = [sentence(row, unit) for _, row in compared.iterrows()]
+    rank = compared["verdict"].map(VERDICTS.index)
+    compared = compared.assign(sentence=sentences, apart=compared["scope"] != "all", rank=rank)
     compared = compared.sort_values([*STUDY, "apart", "environment", "rank", "p"], kind="stable")
-    compared["sentence"] = [sentence(row, unit) for _, row in compared.iterrows()]
     columns = [*STUDY, "scope", "environment", "verdict", "sentence"]
     return compared[columns].reset_index(drop=True)

@@ -367,6 +367,12 @@ def test_seeds_that_are_all_alike_have_an_interval_of_one_point():
     )
 
 
+def test_an_iqm_has_no_percent_of_what_may_be_zero():
+    x, y = np.full((3, 2), 5.0), np.array([[10.0, -1], [11, 1], [12, 2]])
+    assert np.isnan(statistics.bootstrap_iqm(x, y)).all()
+    assert np.isfinite(statistics.bootstrap_iqm(x[:, :1], y[:, :1])).all()
+
+
 def test_the_change_of_an_iqm_is_relative_to_the_baselines_iqm():
     """All returns are positive, so it is above -100 %, whatever the baseline's mean is."""
     x, y = np.full((5, 1), 30.0), np.array([[3000.0], [3000], [3000], [3000], [100]])

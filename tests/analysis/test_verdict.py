@@ -31,9 +31,7 @@ def study(baseline, noisy):
 def judge(baseline, noisy):
     """The statistics table and the sentences of such a study."""
     one = study(baseline, noisy)
-    table = analysis.tables.adjust(
-        analysis.tables.frame("statistics", analysis.tables.statistics_rows(one))
-    )
+    table = analysis.tables.judge([one])
     return table[table["verdict"].notna()], analysis.verdicts.in_sentences(table)
 
 
@@ -62,14 +60,26 @@ def test_better_needs_the_corrected_p():
     )
 
 
+def test_together_are_the_environments_that_can_tell_something():
+    """Those with two seeds of both kinds, and not those where all returns are equal."""
+    baseline = np.array([[1.0, 5, 1, 7], [2, 6, 2, 7], [3, 7, 3, 7]])
+    noisy = baseline + [1, 2, 3, 0]
+    noisy[1:, 2] = np.nan
+    returns = {BASELINE: baseline[None], Configuration((NOISE,), ((1.0, 1.0),)): noisy[None]}
+    one = analysis.runs.Study("PPO", "", "", list("ABCD"), [1, 2, 3], np.array([1000]), returns)
+    table = analysis.tables.judge([one])
+    [environments] = table[table["scope"] == "all"]["environments"]
+    assert environments == 2
+
+
 def test_p_of_exactly_five_percent_is_enough():
-    row = {"n_baseline": 5, "p": 0.05 + 1e-15, "p_adjusted": 0.05, "t": 2.0}
+    row = {"smallest_p": 0.01, "p": 0.05 + 1e-15, "p_adjusted": 0.05, "t": 2.0}
     assert analysis.verdicts.verdict(row) == "better"
     assert analysis.verdicts.verdict(row | {"t": -2.0}) == "worse"
     assert analysis.verdicts.verdict(row | {"p_adjusted": 0.0501}) == "perhaps better"
     assert analysis.verdicts.verdict(row | {"p": 0.0501}) == "no clear difference"
     assert analysis.verdicts.verdict(row | {"p": np.nan}) == "too few seeds"
-    assert pd.isna(analysis.verdicts.verdict(row | {"n_baseline": np.nan}))
+    assert pd.isna(analysis.verdicts.verdict(row | {"smallest_p": np.nan}))
 
 
 def test_few_seeds():
