@@ -12,6 +12,7 @@ in another environment than the training's have a correction of their own. All o
 rate of success instead of the return, in percentage points.
 """
 
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +43,7 @@ from noisy_wrappers import BASELINE, WRAPPERS, Configuration, rounded
 FILES = ("robustness.csv", "robustness.csv.gz")
 CONDITION = ["test_noise", "test_rate"]
 CLEAN = BASELINE  # a condition of a test is a Configuration, too
-RUN_COLUMNS = [*KEYS, "configuration", "seed", *CONDITION, "condition", "mean", "cvar"]
+RUN_COLUMNS = [*KEYS, "configuration", "seed", "condition", "mean", "cvar"]
 COLUMNS = [*KEYS, *CONDITION, "tested_on", "n", "mean", "std", "difference", "change_percent"]
 COLUMNS += ["cvar", "score_percent"]
 _SCORE_COLUMNS = """scope environment noise noise_rate n n_baseline conditions difference
@@ -73,19 +74,18 @@ def read_robustness(runs_dir, runs, metric="return"):
     rows, notes = [], []
     for run in runs[runs["status"] == "finished"].itertuples():
         paths = [Path(runs_dir) / run.run / name for name in FILES]
-        paths = [path for path in paths if path.exists()]
-        if not paths:
+        path = next(filter(Path.exists, paths), None)
+        if path is None:
             continue
         try:
-            episodes = read_episodes(paths[0], metric)
+            tests = read_episodes(path, metric)
         except (OSError, ValueError, EOFError) as error:
-            notes.append(f"{run.run}: {paths[0].name} is left out: {' '.join(str(error).split())}")
+            notes.append(f"{run.run}: {path.name} is left out: {' '.join(str(error).split())}")
             continue
-        keys = {name: getattr(run, name) for name in (*KEYS, "configuration", "seed")}
-        for (condition, elsewhere), returns in episodes.items():
-            keys["environment"] = where_tested(run.environment, elsewhere)
-            texts = condition.noise, condition.noise_rate
-            rows.append((*keys.values(), *texts, condition, returns.mean(), cvar(returns)))
+        row = {name: getattr(run, name) for name in (*KEYS, "configuration", "seed")}
+        for (condition, elsewhere), results in tests.items():
+            row |= {"environment": where_tested(run.environment, elsewhere), "condition": condition}
+            rows.append(row | {"mean": results.mean(), "cvar": cvar(results)})
     return pd.DataFrame(rows, columns=RUN_COLUMNS), notes
 
 
@@ -95,21 +95,19 @@ def read_episodes(path, metric="return"):
     The environment is empty for that of the training. A result is a return, or of success 100 or 0.
     Raises ValueError.
     """
-    text = {"noise": str, "noise_rate": str, "environment": str}
-    table = pd.read_csv(path, dtype=text).fillna(dict.fromkeys(text, ""))
+    keys = ["noise", "noise_rate", "environment"]
+    table = pd.read_csv(path, dtype=dict.fromkeys(keys, str)).fillna(dict.fromkeys(keys, ""))
     known, more = table.columns[: len(ROBUSTNESS_COLUMNS)], table.columns[len(ROBUSTNESS_COLUMNS) :]
     if list(known) != ROBUSTNESS_COLUMNS or not set(more) <= {"success", "environment"}:
         raise ValueError("unexpected header")
-    returns = pd.to_numeric(table["episodic_return"])
-    if not np.isfinite(returns).all() or not len(returns):
+    results = pd.to_numeric(table["episodic_return"])
+    if not np.isfinite(results).all() or not len(results):
         raise ValueError("no episodes, or a return that is not finite")
-    results = returns
     if metric == SUCCESS:
-        results = 100 * pd.to_numeric(table.get("success", returns * np.nan)).dropna()
-    table = table.reindex(columns=[*text], fill_value="").loc[results.index]
-    keys = [table[name] for name in table]
-    found = {}
-    for (noise, rate, environment), group in results.groupby(keys, sort=False):
+        results = 100 * pd.to_numeric(table.get("success", np.nan))
+    table = table.assign(environment=table.get("environment", ""), result=results)
+    table, found = table.dropna(subset="result"), {}
+    for (noise, rate, environment), group in table.groupby(keys, sort=False)["result"]:
         condition = Configuration.parse(noise, rate)
         unknown = [name for name in condition.wrappers if name not in WRAPPERS and ":" not in name]
         if unknown:  # and none of the user's own
@@ -150,118 +148,80 @@ def by_run(runs, config, value):
 
 def condition_rows(runs):
     """Yield one row per training configuration and test condition, in each environment."""
-    for key, group in runs.groupby([*STUDY, "environment"]):
+    for _, group in runs.groupby([*STUDY, "environment"]):
         baseline = by_run(group, BASELINE, "mean")
-        for config in sorted(set(group["configuration"])):
-            means, cvars = by_run(group, config, "mean"), by_run(group, config, "cvar")
-            for condition in sorted(means.columns):
-                mean, std, n = mean_std(means[condition])
-                row = dict(zip(KEYS, (*key, config.noise, config.noise_rate), strict=True))
-                row |= {"test_noise": condition.noise, "test_rate": condition.noise_rate}
-                row |= {"tested_on": tested_on(condition, config), "n": n, "mean": mean, "std": std}
-                row["cvar"] = cvars[condition].mean()
-                if config != BASELINE and condition in baseline:
-                    alone = baseline[condition].to_numpy()
-                    row["difference"] = mean - np.nanmean(alone)
-                    row["change_percent"] = percent_of(row["difference"], alone)
-                if CLEAN in baseline:
-                    clean = baseline[CLEAN].to_numpy()
-                    row["score_percent"] = percent_of(mean - np.nanmean(clean), clean)
-                yield row
-
-
-def environment_scores(runs, config):
-    """Score a configuration and the baseline in one environment, or return None.
-
-    runs: those of one study and environment. The result is a dict: `x` (seeds) and `y` (baseline
-    seeds) are mean returns over the conditions; in percent of the clean return C of the baseline,
-    NaN where that has no percentages, are `percent` (what a difference of 1 is), `scores`,
-    `cvar_scores` (of the worst tenth of the episodes) and `worst_scores` (under each condition),
-    pairs of x and y, and `clean_change`.
-    """
-    x, y = by_run(runs, config, "mean"), by_run(runs, BASELINE, "mean")
-    if x.empty or y.empty or CLEAN not in x or CLEAN not in y:
-        return None
-    shared = x.columns.intersection(y.columns)
-    whole = [c for c in shared if x[c].notna().all() and y[c].notna().all()]
-    conditions = [condition for condition in whole if is_unseen(condition, config)]
-    if not conditions:
-        return None
-    clean, percent = y[CLEAN].mean(), percent_of(1.0, y[CLEAN].to_numpy())
-
-    def scores(tables):
-        return [(table[conditions].mean() - clean) * percent for table in tables]
-
-    cvars = by_run(runs, config, "cvar"), by_run(runs, BASELINE, "cvar")
-    return {
-        "x": x[conditions].mean(axis=1).to_numpy(),
-        "y": y[conditions].mean(axis=1).to_numpy(),
-        "percent": percent,
-        "scores": [score.mean() for score in scores((x, y))],
-        "cvar_scores": [score.mean() for score in scores(cvars)],
-        "worst_scores": scores((x, y)),
-        "clean_change": (x[CLEAN].mean() - clean) * percent,
-    }
+        for (config, condition), tests in group.groupby(["configuration", "condition"]):
+            mean, std, n = mean_std(tests["mean"])
+            row = tests.iloc[0][KEYS].to_dict()
+            row |= {"test_noise": condition.noise, "test_rate": condition.noise_rate}
+            row |= {"tested_on": tested_on(condition, config), "n": n, "mean": mean, "std": std}
+            row["cvar"] = tests["cvar"].mean()
+            if config != BASELINE and condition in baseline:
+                alone = baseline[condition].to_numpy()
+                row["difference"] = mean - np.nanmean(alone)
+                row["change_percent"] = percent_of(row["difference"], alone)
+            if CLEAN in baseline:
+                clean = baseline[CLEAN].to_numpy()
+                row["score_percent"] = percent_of(mean - np.nanmean(clean), clean)
+            yield row
 
 
 def score_rows(runs):
     """Yield the score of every configuration with noise: over all environments, then in each."""
-    for study, group in runs.groupby(STUDY):
-        for config in sorted(set(group["configuration"])):
-            if config == BASELINE:
-                continue
-            scores = {}
-            for environment, same in group.groupby("environment"):
-                found = environment_scores(same, config)
-                if found:
-                    scores[environment] = found
-            at_home = {name: found for name, found in scores.items() if ELSEWHERE not in name}
+    for _, group in runs.groupby(STUDY):
+        for config in sorted({*group["configuration"]} - {BASELINE}):
+            scores = [environment_score(same, config) for _, same in group.groupby("environment")]
+            scores = [score for score in scores if score]
+            at_home = [score for score in scores if ELSEWHERE not in score["environment"]]
             if len(at_home) > 1:
-                yield score_row(study, "all", "", config, at_home)
-            for environment, found in scores.items():
-                yield score_row(study, "environment", environment, config, {environment: found})
+                yield average_score(at_home)
+            yield from scores
 
 
-def score_row(study, scope, environment, config, scores):
-    """Return one row of scores; environments count equally, whatever their number of seeds."""
-    found = list(scores.values())
-    x, y = (stacked(part[name] for part in found) for name in ("x", "y"))
-    comparison = compare(x, y)._asdict()
-    percents = [part["percent"] * (part["x"].mean() - part["y"].mean()) for part in found]
-    worst, worst_of_baseline = {}, []
-    for name, part in scores.items():
-        own, baseline = part["worst_scores"]
-        worst |= {(name, condition): value for condition, value in own.items()}
-        worst_of_baseline.append(baseline.min())
-    worst_place, condition = min(worst, key=worst.get)
-    where = f" on {worst_place}" if scope == "all" else ""
-    known = np.isfinite(percents).all()  # what has no percentages cannot be ranked or averaged
-    score, baseline_score = np.mean([part["scores"] for part in found], axis=0)
-    cvar_score, baseline_cvar_score = np.mean([part["cvar_scores"] for part in found], axis=0)
-    row = dict(zip(STUDY, study, strict=True)) | comparison
-    row |= {"scope": scope, "environment": environment}
-    row |= {"noise": config.noise, "noise_rate": config.noise_rate}
-    return row | {
-        "conditions": min(len(part["worst_scores"][0]) for part in found),
-        "difference_percent": np.mean(percents),
-        "score_percent": score,
-        "baseline_score_percent": baseline_score,
-        "clean_change_percent": np.mean([part["clean_change"] for part in found]),
-        "cvar_score_percent": cvar_score,
-        "baseline_cvar_score_percent": baseline_cvar_score,
-        "worst_score_percent": worst[worst_place, condition] if known else np.nan,
-        "baseline_worst_score_percent": min(worst_of_baseline) if known else np.nan,
-        "worst_condition": f"{condition.noise} at {condition.noise_rate}{where}" if known else "",
-    }
+def environment_score(runs, config):
+    """Score a configuration against the baseline in one environment, or return None.
+
+    runs: those of one study and environment. The result is a row of SCORE_COLUMNS with `x` (seeds)
+    and `y` (baseline seeds), the mean returns over the conditions. What is in percent is relative
+    to the clean return of the baseline, NaN where that has no percentages.
+    """
+    x, y = by_run(runs, config, "mean"), by_run(runs, BASELINE, "mean")
+    if CLEAN not in x or CLEAN not in y:
+        return None
+    complete = pd.concat([x, y]).notna().all()
+    conditions = [name for name in complete.index[complete] if is_unseen(name, config)]
+    if not conditions:
+        return None
+    clean, percent = y[CLEAN].mean(), percent_of(1.0, y[CLEAN].to_numpy())
+    clean_change = (x[CLEAN].mean() - clean) * percent
+    x, y = (side[conditions].mean(axis=1).to_numpy() for side in (x, y))
+    row = runs[runs["configuration"] == config].iloc[0][KEYS].to_dict() | compare(x, y)._asdict()
+    row |= {"scope": "environment", "x": x, "y": y, "conditions": len(conditions)}
+    row |= {"difference_percent": (x.mean() - y.mean()) * percent}
+    row |= {"clean_change_percent": clean_change, "worst_condition": ""}
+    for side, prefix in ((BASELINE, "baseline_"), (config, "")):
+        for value, name in (("cvar", "cvar_score"), ("mean", "score")):
+            scores = (by_run(runs, side, value)[conditions].mean() - clean) * percent
+            row[f"{prefix}{name}_percent"] = scores.mean()
+        row[f"{prefix}worst_score_percent"] = scores.min()
+    if scores.notna().all():  # what has no percentages cannot be ranked
+        worst = scores.idxmin()
+        row["worst_condition"] = f"{worst.noise} at {worst.noise_rate}"
+    return row
 
 
-def stacked(samples):
-    """Put samples of different sizes side by side: (most seeds x samples), padded with NaN."""
-    samples = list(samples)
-    table = np.full((max(map(len, samples)), len(samples)), np.nan)
-    for column, sample in zip(table.T, samples, strict=True):
-        column[: len(sample)] = sample
-    return table
+def average_score(scores):
+    """Return the row of all environments; they count equally, whatever their number of seeds."""
+    table = pd.DataFrame(scores)
+    x, y = (np.array([*zip_longest(*table[name], fillvalue=np.nan)]) for name in ("x", "y"))
+    row = scores[0] | compare(x, y)._asdict()
+    row |= {"scope": "all", "environment": "", "worst_condition": ""}
+    row |= table.filter(like="percent").mean(skipna=False)
+    row |= table[["conditions", *table.filter(like="worst_score")]].min(skipna=False)
+    if pd.notna(row["worst_score_percent"]):
+        place = table.loc[table["worst_score_percent"].idxmin()]
+        row["worst_condition"] = f"{place['worst_condition']} on {place['environment']}"
+    return row
 
 
 def tested_elsewhere(scores):
@@ -275,7 +235,7 @@ def primary(scores):
 
     Tests in another environment are apart: they leave those at home as they are.
     """
-    of_all = (scores["scope"] == "all").astype(bool)
+    of_all = scores["scope"] == "all"
     keys = [scores[name] for name in (*STUDY, "noise", "noise_rate")]
     return of_all | ~of_all.groupby([*keys, tested_elsewhere(scores)]).transform("any")
 
