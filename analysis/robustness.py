@@ -18,7 +18,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from analysis.formatting import P_VALUE, SHARE, WHOLE, Table, in_metric
 from analysis.runs import (
     ELSEWHERE,
     KEYS,
@@ -29,6 +28,7 @@ from analysis.runs import (
     where_tested,
 )
 from analysis.statistics import compare, holm, mean_std, percent_of
+from analysis.tables import table_of
 from analysis.verdicts import (
     borderline,
     counted,
@@ -51,17 +51,6 @@ _SCORE_COLUMNS = """scope environment noise noise_rate n n_baseline conditions d
     baseline_score_percent clean_change_percent cvar_score_percent baseline_cvar_score_percent
     worst_score_percent baseline_worst_score_percent worst_condition t pooled_std smallest_p"""
 SCORE_COLUMNS = [*STUDY, *_SCORE_COLUMNS.split()]
-FORMATS = dict.fromkeys(("n", "n_baseline", "conditions"), WHOLE)
-FORMATS |= dict.fromkeys(("p", "p_holm", "smallest_p"), P_VALUE)
-FORMATS |= dict.fromkeys(("effect_size", "t"), SHARE)
-ONLY_CSV = {"robustness_score": ("t", "pooled_std", "smallest_p"), "robustness": ("score_percent",)}
-CAPTIONS = {  # at most two lines in the report; docs/statistics.md says how they are computed
-    "robustness_score": """Primary figure of robustness: the mean return under noise that was not in
-training, of policies trained with noise and without.""",
-    "robustness": """Return under every test condition: mean \u00b1 standard deviation over n seeds,
-and difference from the policies trained without noise.""",
-}
-NOTES = {"robustness_score": "Scores: relative to the clean return.", "robustness": ""}
 
 
 def read_robustness(runs_dir, runs, metric="return"):
@@ -247,19 +236,25 @@ def robustness_tables(runs, metric="return"):
     table = pd.DataFrame(condition_rows(runs), columns=COLUMNS)
     scores = pd.DataFrame(score_rows(runs), columns=SCORE_COLUMNS)
     judged = scores[primary(scores) & scores["p"].notna()]
-    keys = [judged[name] for name in STUDY]
-    for _, family in judged.groupby([*keys, tested_elsewhere(judged)]):
+    for _, family in judged.groupby([*STUDY, tested_elsewhere(judged)]):
         scores.loc[family.index, "p_holm"] = holm(family["p"].to_numpy(float))
-    tables = {}
-    for name, frame in (("robustness_score", scores), ("robustness", table)):
-        note, caption = NOTES[name], in_metric(" ".join(CAPTIONS[name].split()), metric)
-        if metric == SUCCESS:  # never percent of a rate; the worst tenth of episodes is 0 or 100
-            note = "Rates are in percent of the episodes, differences in percentage points."
-            percents = [column for column in frame if column.endswith("_percent")]
-            frame[frame.columns.intersection([*percents, "cvar", "worst_condition"])] = np.nan
-        shape = {"formats": FORMATS, "only_csv": ONLY_CSV[name], "note": note}
-        tables[name] = Table(name, frame, caption, "robustness", **shape)
-    return tables
+    score_note, note = "Scores: relative to the clean return.", ""
+    if metric == SUCCESS:  # never percent of a rate; the worst tenth of episodes is 0 or 100
+        score_note = note = (
+            "Rates are in percent of the episodes, differences in percentage points."
+        )
+        for frame in (scores, table):
+            frame[frame.filter(regex="_percent$|^cvar$|^worst_condition$").columns] = np.nan
+    return {
+        "robustness_score": table_of(
+            "robustness_score",
+            scores,
+            section="robustness",
+            note=score_note,
+            only_csv=("t", "pooled_std", "smallest_p"),
+        ),
+        "robustness": table_of("robustness", table, note=note, only_csv=("score_percent",)),
+    }
 
 
 def robustness_sentences(scores, unit=""):
