@@ -79,14 +79,16 @@ def verdicts_in_short(results):
 
 def overview_of(runs, studies):
     """Say in words what was analysed."""
-    parts = [f"Finished runs: {(runs['status'] == 'finished').sum():,}."]
-    for study in studies:
-        parts.append(
+    finished = f"Finished runs: {(runs['status'] == 'finished').sum():,}."
+    return " ".join(
+        [finished]
+        + [
             f"{study.name}: {study.steps[-1]:,} steps, seeds: {len(study.seeds)}, "
             f"environments: {len(study.environments)}, "
             f"noise configurations: {len(study.returns) - 1}."
-        )
-    return " ".join(parts)
+            for study in studies
+        ]
+    )
 
 
 def write_results(out, results, latex):
@@ -97,8 +99,7 @@ def write_results(out, results, latex):
     drawn = list(figures(results.studies, results.tables))
     names = {*results.tables}
     for drawing in drawn:
-        write_figure(out, drawing, latex)
-        names |= {drawing.name, drawing.narrow_name}
+        names |= write_figure(out, drawing, latex)
     write_report(out, results, drawn)
     old = sorted({path.stem for path in [*out.glob("*.csv"), *out.glob("*.svg")]} - names)
     if old:

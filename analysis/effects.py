@@ -12,7 +12,6 @@ from analysis.verdicts import seeds_of
 from noisy_wrappers import rate_order
 
 MOST_IN_FOREST = 25  # configurations of a forest plot; more of them are a heatmap
-ENDS = ["difference", "difference_low", "difference_high"]
 
 
 def heatmap_scale(rows):
@@ -96,7 +95,7 @@ def scale_forest(ax, rows, inches):
 
     inches: how wide the panel is, roughly.
     """
-    ends = rows[ENDS].astype(float)
+    ends = rows[["difference", "difference_low", "difference_high"]].astype(float)
     low, high = min(0, ends.min(axis=None)), max(0, ends.max(axis=None))
     wide = (high - low) or 1
     margin = 0.5 / inches  # of the panel's width

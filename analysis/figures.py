@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
+from itertools import groupby, product
 
 import numpy as np
 import pandas as pd
@@ -17,6 +17,7 @@ from analysis.runs import KEYS, STUDY, SUCCESS, rows_of, study_name
 from analysis.verdicts import percent, seeds_of
 from noisy_wrappers import BASELINE, rate_order, rounded
 
+ONE_STD = "\u00b1 one standard deviation"
 RETURN_LABELS = {"return": "test return\n(sum of rewards per episode)"}
 RETURN_LABELS[SUCCESS] = "test success rate (%)"
 
@@ -36,45 +37,36 @@ class Drawing:
         """The name of its files."""
         return f"{self.kind}_{slug(self.label)}"
 
-    @property
-    def narrow_name(self):
-        """The name of the file of the narrow figure."""
-        return f"{self.name}_narrow"
-
 
 def figures(studies, tables):
     """Yield a Drawing for every figure, in the order of the report."""
-    statistics = tables["statistics"].frame
-    alone = statistics[statistics["verdict"].notna() & (statistics["scope"] == "environment")]
     for study in studies:
-        compared = alone[rows_of(alone, study.key)]
-        if len(compared):
-            caption = effects_caption(study, compared)
-            draw = partial(effects_figure, compared, study.metric)
-            yield Drawing("effects", study.name, caption, draw, several_environments(compared))
-        best = tables["best"].frame[KEYS].merge(compared)
-        if len(best) and len(study.returns) > 2:
-            caption = (
-                f"{study.name}: test {study.metric} without noise (black) and with the best noise "
-                "of each environment, mean over n seeds, shaded \u00b1 one standard deviation. "
-                "The best of many looks better than it is."
-            )
-            draw = partial(best_curves_figure, study, best)
-            yield Drawing("best_curves", study.name, caption, draw, several_environments(best))
+        yield from comparison_figures(study, tables["statistics"].frame, tables["best"].frame)
         for noise in sorted({config.noise for config in study.returns} - {""}) or [""]:
             title = f"{study.name}, {noise or 'no noise'}"
-            caption = f"{title}: learning curves, mean over n seeds, shaded \u00b1 one standard "
-            yield Drawing(
-                "curves", title, f"{caption}deviation.", partial(curves_figure, study, noise)
-            )
+            caption = f"{title}: learning curves, mean over n seeds, shaded {ONE_STD}."
+            yield Drawing("curves", title, caption, partial(curves_figure, study, noise))
         yield from ablation_figures(study, tables[f"summary_{study.algorithm}"].frame)
     if "robustness" in tables:
         yield from robustness_figures(tables["robustness"].frame, studies[0].metric)
 
 
-def several_environments(rows):
-    """Tell whether rows are of so many environments that their figure has a narrow form."""
-    return rows["environment"].nunique() > 1
+def comparison_figures(study, statistics, best):
+    """Yield the Drawing of a study's effects, and that of the curves of its best noises."""
+    compared = statistics["verdict"].notna() & (statistics["scope"] == "environment")
+    compared = statistics[rows_of(statistics, study.key) & compared]
+    several = compared["environment"].nunique() > 1
+    if len(compared):
+        draw = partial(effects_figure, compared, study.metric)
+        yield Drawing("effects", study.name, effects_caption(study, compared), draw, several)
+    if len(compared) and len(study.returns) > 2:
+        caption = (
+            f"{study.name}: test {study.metric} without noise (black) and with the best noise of "
+            f"each environment, mean over n seeds, shaded {ONE_STD}. "
+            "The best of many looks better than it is."
+        )
+        draw = partial(best_curves_figure, study, best[KEYS].merge(compared))
+        yield Drawing("best_curves", study.name, caption, draw, several)
 
 
 def span(numbers):
@@ -188,17 +180,15 @@ def curves_figure(study, noise):
 def ablation_figures(study, summary):
     """Yield a Drawing for every wrapper that a study has with several parameters."""
     summary = summary[rows_of(summary, study.key)]
-    noises = {}
-    for config in study.returns:
-        if len(config.noises) == 1:
-            noises.setdefault(config.wrappers[0], set()).add(config.noise)
-    for wrapper, variants in sorted(noises.items()):
-        if len(variants) > 1:
+    single = [config for config in study.returns if len(config.noises) == 1]  # sorted by noise
+    for wrapper, configs in groupby(single, lambda config: config.wrappers[0]):
+        noises = sorted({config.noise for config in configs})
+        if len(noises) > 1:
             caption = (
                 f"{study.name}, {wrapper}: final test {study.metric} by parameters and noise rate. "
-                "Bars: mean over n seeds, whiskers \u00b1 one standard deviation; dotted: no noise."
+                f"Bars: mean over n seeds, whiskers {ONE_STD}; dotted: no noise."
             )
-            draw = partial(ablation_figure, study, summary, sorted(variants))
+            draw = partial(ablation_figure, study, summary, noises)
             yield Drawing("parameters", f"{study.name} {wrapper}", caption, draw)
 
 
@@ -248,9 +238,12 @@ def robustness_figures(table, metric="return"):
             clean = table[rows_of(table, study) & (table["test_noise"] == "")]
             caption = (
                 f"{study_name(*study)}, tested with {noise}: mean {metric} over seeds against the "
-                "rate, shaded \u00b1 one standard deviation; a line for each noise in training."
+                f"rate, shaded {ONE_STD}; a line for each noise in training."
             )
-            label, several = f"curves {study_name(*study)} {noise}", several_environments(rows)
+            label, several = (
+                f"curves {study_name(*study)} {noise}",
+                rows["environment"].nunique() > 1,
+            )
             draw = partial(robustness_curves_figure, rows, clean, metric)
             yield Drawing("robustness", label, caption, draw, several)
 
@@ -299,10 +292,9 @@ def heatmap_figure(name, grid, dots, limit, form, narrow=False):
     fig = Figure(figsize=(width, 1.2 + high), layout="constrained")
     ax = fig.subplots()
     heatmap(ax, grid, limit, form, dots, size)
-    ax.set_xticks(range(len(columns)), columns, fontsize=size, rotation=35, ha="right")
+    place = {"rotation": 35, "ha": "right", "rotation_mode": "anchor"}
+    ax.set_xticks(range(len(columns)), columns, fontsize=size, **place)
     ax.set_yticks(range(len(lines)), lines, fontsize=size)
-    for text in ax.get_xticklabels():
-        text.set_rotation_mode("anchor")
     ax.set(xlabel=grid.columns.name, ylabel=grid.index.name)
     ax.set_title(name, fontsize=9)
     return fig
@@ -313,11 +305,11 @@ def robustness_curves_figure(rows, clean, metric, narrow=False):
 
     rows, clean: those of the table of robustness that were tested with the noise, and with none.
     """
-    configs = configurations(pd.concat([clean, rows]))
-    labels = [f"{name}, {rate}" if name else "no noise" for name, rate in configs]
     environments = sorted(set(rows["environment"]))
     rows = pd.concat([clean, rows])
     rows = rows.assign(rate=rows["test_rate"].astype(float)).sort_values("rate")
+    configs = configurations(rows)
+    labels = [f"{name}, {rate}" if name else "no noise" for name, rate in configs]
     fig, axes, add_legend = panels(environments, labels, metric, narrow)
     for (ax, environment), (i, config) in product(
         zip(axes, environments, strict=True), enumerate(configs)
@@ -335,13 +327,15 @@ def robustness_curves_figure(rows, clean, metric, narrow=False):
 def write_figure(out, drawing, latex=False):
     """Write {name}.svg, with `latex` also .pdf; without dates, so equal figures are equal files.
 
-    A narrow figure is for the report only, so it is no .pdf.
+    A narrow figure is for the report only, so it is no .pdf. Return the names of the files.
     """
-    fig = drawing.draw()
-    fig.savefig(out / f"{drawing.name}.svg", metadata={"Date": None})
-    if latex:
-        fig.set_layout_engine("none")  # the layout is done
-        fig.savefig(out / f"{drawing.name}.pdf", metadata={"CreationDate": None})
+    figures = {drawing.name: drawing.draw()}
     if drawing.has_narrow:
-        narrow = drawing.draw(narrow=True)
-        narrow.savefig(out / f"{drawing.narrow_name}.svg", metadata={"Date": None})
+        figures[f"{drawing.name}_narrow"] = drawing.draw(narrow=True)
+    for name, figure in figures.items():
+        figure.savefig(out / f"{name}.svg", metadata={"Date": None})
+    if latex:
+        figure = figures[drawing.name]
+        figure.set_layout_engine("none")  # the layout is done
+        figure.savefig(out / f"{drawing.name}.pdf", metadata={"CreationDate": None})
+    return figures.keys()

@@ -157,8 +157,6 @@ def shown(table):
 def text_table(table, width):
     """Format a table for a terminal of this width, without the last columns if need be."""
     text = shown(table)
-    if text.empty:
-        return "(empty)"
     while True:
         lines = tabulate(text.values, text.columns, disable_numparse=True)
         if text.shape[1] == 1 or max(map(len, lines.splitlines())) <= width:

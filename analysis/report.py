@@ -34,7 +34,6 @@ SECTIONS = {
 }
 FIGURES_OF = {"best_curves": "early_performance", "curves": "early_performance"}
 FOLDED = ("curves", "parameters")  # where there are several: one for each noise
-MOST_ROWS = 15  # a longer table is folded
 DOCS = Path(__file__).parents[1] / "docs/statistics.md"  # how all numbers are computed
 
 
@@ -64,11 +63,6 @@ def breakable(text):
     return Markup(re.sub("(?<=[a-z0-9])(?=[A-Z(])", "<wbr>", str(escape(text))))
 
 
-def source(path):
-    """Return a picture as a URL that contains it."""
-    return f"data:image/svg+xml;base64,{base64.b64encode(path.read_bytes()).decode()}"
-
-
 def write_report(out, results, drawn):
     """Write report.html: the effects and the verdicts first, then everything else.
 
@@ -85,10 +79,15 @@ def write_report(out, results, drawn):
         several = drawing.kind in FOLDED and number[drawing.kind] > 1
         place = folded if several else figures
         place[FIGURES_OF.get(drawing.kind, drawing.kind)].append(drawing)
+
+    def source(name):  # a URL that contains the figure
+        picture = (out / f"{name}.svg").read_bytes()
+        return f"data:image/svg+xml;base64,{base64.b64encode(picture).decode()}"
+
     pages = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True
     )
-    pages.filters |= {"breakable": breakable, "source": lambda name: source(out / f"{name}.svg")}
+    pages.filters |= {"breakable": breakable, "source": source}
     html = pages.get_template("report.html.jinja").render(
         results=results,
         others_tally=tally(results.others["verdict"]),
@@ -99,6 +98,5 @@ def write_report(out, results, drawn):
         figures=figures,
         folded=folded,
         docs=os.path.relpath(DOCS, out),
-        most_rows=MOST_ROWS,
     )
     (out / "report.html").write_text(html, "utf-8")

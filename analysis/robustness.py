@@ -3,13 +3,10 @@
 evaluate.py writes these files. The unit of replication is the seed: a run's value under a test
 condition is the mean over its episodes there.
 
-The primary figure is the return under noise that was not in training, averaged equally over the
-conditions. A condition counts if it is not clean, none of its wrappers was in training, and none is
-reward noise or early termination, which change no policy's behaviour in a test. It is compared with
-that of the policies trained without noise under the same conditions, by the test of all verdicts
-(statistics.compare), with Holm's correction over the training configurations of an algorithm; tests
-in another environment than the training's have a correction of their own. All of this may be of the
-rate of success instead of the return, in percentage points.
+The primary figure is the mean return over the conditions that count (is_unseen), compared with that
+of the policies trained without noise under the same conditions by the test of all verdicts, with
+Holm's correction; docs/statistics.md has the details. All of this may be of the rate of success
+instead of the return, in percentage points.
 """
 
 from itertools import zip_longest
@@ -18,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from analysis import verdicts
 from analysis.runs import (
     ELSEWHERE,
     KEYS,
@@ -29,15 +27,6 @@ from analysis.runs import (
 )
 from analysis.statistics import compare, holm, mean_std, percent_of
 from analysis.tables import table_of
-from analysis.verdicts import (
-    borderline,
-    counted,
-    difference,
-    p_value,
-    percent,
-    significant,
-    spread_of,
-)
 from noisy_wrappers import BASELINE, WRAPPERS, Configuration, rounded
 
 FILES = ("robustness.csv", "robustness.csv.gz")
@@ -146,12 +135,10 @@ def condition_rows(runs):
             row |= {"tested_on": tested_on(condition, config), "n": n, "mean": mean, "std": std}
             row["cvar"] = tests["cvar"].mean()
             if config != BASELINE and condition in baseline:
-                alone = baseline[condition].to_numpy()
-                row["difference"] = mean - np.nanmean(alone)
-                row["change_percent"] = percent_of(row["difference"], alone)
+                row["difference"] = mean - baseline[condition].mean()
+                row["change_percent"] = percent_of(row["difference"], baseline[condition])
             if CLEAN in baseline:
-                clean = baseline[CLEAN].to_numpy()
-                row["score_percent"] = percent_of(mean - np.nanmean(clean), clean)
+                row["score_percent"] = percent_of(mean - baseline[CLEAN].mean(), baseline[CLEAN])
             yield row
 
 
@@ -181,7 +168,7 @@ def environment_score(runs, config):
     conditions = [name for name in complete.index[complete] if is_unseen(name, config)]
     if not conditions:
         return None
-    clean, percent = y[CLEAN].mean(), percent_of(1.0, y[CLEAN].to_numpy())
+    clean, percent = y[CLEAN].mean(), percent_of(1.0, y[CLEAN])
     clean_change = (x[CLEAN].mean() - clean) * percent
     x, y = (side[conditions].mean(axis=1).to_numpy() for side in (x, y))
     row = runs[runs["configuration"] == config].iloc[0][KEYS].to_dict() | compare(x, y)._asdict()
@@ -238,23 +225,16 @@ def robustness_tables(runs, metric="return"):
     judged = scores[primary(scores) & scores["p"].notna()]
     for _, family in judged.groupby([*STUDY, tested_elsewhere(judged)]):
         scores.loc[family.index, "p_holm"] = holm(family["p"].to_numpy(float))
-    score_note, note = "Scores: relative to the clean return.", ""
+    note, score_note = "", "Scores: relative to the clean return."
     if metric == SUCCESS:  # never percent of a rate; the worst tenth of episodes is 0 or 100
-        score_note = note = (
-            "Rates are in percent of the episodes, differences in percentage points."
-        )
+        note = "Rates are in percent of the episodes, differences in percentage points."
+        score_note = note
         for frame in (scores, table):
             frame[frame.filter(regex="_percent$|^cvar$|^worst_condition$").columns] = np.nan
-    return {
-        "robustness_score": table_of(
-            "robustness_score",
-            scores,
-            section="robustness",
-            note=score_note,
-            only_csv=("t", "pooled_std", "smallest_p"),
-        ),
-        "robustness": table_of("robustness", table, note=note, only_csv=("score_percent",)),
-    }
+    more = {"section": "robustness", "only_csv": ("t", "pooled_std", "smallest_p")}
+    score = table_of("robustness_score", scores, note=score_note, **more)
+    conditions = table_of("robustness", table, note=note, only_csv=("score_percent",))
+    return {"robustness_score": score, "robustness": conditions}
 
 
 def robustness_sentences(scores, unit=""):
@@ -266,21 +246,23 @@ def robustness_sentences(scores, unit=""):
         where = row.environment or "all environments together"
         study = study_name(row.algorithm, row.exp_name, row.phase)
         start = f"{study} on {where}, trained with {row.noise} at rate {row.noise_rate}"
-        evidence, limit = difference(row, unit), ""
+        evidence, limit = verdicts.difference(row, unit), ""
         if pd.isna(row.p):
             shown = "too few seeds for a test of robustness to new noise"
-        elif significant(row.p):
-            more = "more" if row.t > 0 else "less"
-            shown = f"{'' if significant(row.p_holm) else 'perhaps '}{more} robust to new noise"
+        elif verdicts.significant(row.p):
+            shown = f"{'more' if row.t > 0 else 'less'} robust to new noise"
+            if not verdicts.significant(row.p_holm):
+                shown = f"perhaps {shown}"
         else:
             shown = "no clear difference in robustness to new noise"
         if pd.notna(row.p):
-            evidence += f", p {p_value(row.p)}, Holm {p_value(row.p_holm).removeprefix('= ')}"
-        if not significant(row.smallest_p):
-            limit = f"; {counted(row.n, 'seed')} against {row.n_baseline} cannot show any"
-        elif not significant(row.p) and row.detectable > 0:
-            found = rounded(row.detectable, spread_of(row)) + unit
+            corrected = verdicts.p_value(row.p_holm).removeprefix("= ")
+            evidence += f", p {verdicts.p_value(row.p)}, Holm {corrected}"
+        if not verdicts.significant(row.smallest_p):
+            limit = f"; {verdicts.counted(row.n, 'seed')} against {row.n_baseline} cannot show any"
+        elif not verdicts.significant(row.p) and row.detectable > 0:
+            found = rounded(row.detectable, verdicts.spread_of(row)) + unit
             limit = f"; a difference of {found} would have been seen (80 % power)"
         if pd.notna(row.clean_change_percent):
-            evidence += f"; clean return {percent(row.clean_change_percent)}"
-        yield f"{start}: {shown} ({evidence}){limit}.{borderline(row)}"
+            evidence += f"; clean return {verdicts.percent(row.clean_change_percent)}"
+        yield f"{start}: {shown} ({evidence}){limit}.{verdicts.borderline(row)}"
