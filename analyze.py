@@ -28,7 +28,7 @@ from analysis.folders import is_run
 from analysis.formatting import text_table, wrapped, write_table
 from analysis.paper import read_paper
 from analysis.report import Results, write_report
-from analysis.robustness import read_robustness, robustness_sentences, robustness_tables
+from analysis.robustness import analyse_robustness, read_robustness
 from analysis.runs import SUCCESS, left_out, make_studies, read_choice, read_runs, version_notes
 from analysis.tables import all_equal_notes, family_notes, make_tables, success_table, table_of
 from analysis.verdicts import POINTS, clear_first, headlines, in_sentences, tally
@@ -145,7 +145,6 @@ def print_results(out, results):
 def analyse(args, runs, paper, choice):
     """Compute everything that is told of a frame of runs (read_runs); see main."""
     metric = args.metric.replace("_", " ")
-    unit = POINTS if metric == SUCCESS else ""
     missing, number = left_out(runs)
     studies, notes = make_studies(runs, metric)
     if not studies and make_studies(runs)[0]:
@@ -154,8 +153,9 @@ def analyse(args, runs, paper, choice):
         if len(missing):
             print_left_out(table_of("missing", missing), terminal_width())
         no_finished_run(args.runs_dir)
-    robustness, unreadable = read_robustness(args.runs_dir, runs, metric)
-    tables = make_tables(studies, paper) | robustness_tables(robustness, metric)
+    tests, unreadable = read_robustness(args.runs_dir, runs, metric)
+    robustness_tables, robustness = analyse_robustness(tests, metric)
+    tables = make_tables(studies, paper) | robustness_tables
     if metric == SUCCESS:
         for name, table in tables.items():
             tables[name] = replace(table, caption=table.caption.replace("return", metric))
@@ -164,7 +164,8 @@ def analyse(args, runs, paper, choice):
     tables["missing"] = table_of("missing", missing)
     if choice is not None:
         tables["choice"] = table_of("choice", choice)
-    statistics, scores = tables["statistics"].frame, tables.get("robustness_score")
+    statistics = tables["statistics"].frame
+    unit = POINTS if metric == SUCCESS else ""
     clear, others = clear_first(in_sentences(statistics, unit))
     counts = ", ".join(f"{n} {status}" for status, n in number.items())
     return Results(
@@ -173,7 +174,7 @@ def analyse(args, runs, paper, choice):
         headlines=headlines(statistics, tables["best"].frame),
         clear=clear,
         others=others,
-        robustness=list(robustness_sentences(scores.frame, unit)) if scores else [],
+        robustness=robustness,
         overview=overview_of(runs, studies),
         problems=f"Runs left out: {sum(number.values())} ({counts})." if number else "",
         notes=all_equal_notes(studies) + family_notes(statistics) + notes + unreadable,

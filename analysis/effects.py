@@ -90,22 +90,11 @@ def labels_of(rows, is_forest):
     return [re.sub(r"(?<=\w)\((?=.{10})", "\n(", style.broken(label)) for label in labels]
 
 
-def scale_forest(ax, rows, inches):
-    """Set the scale of a panel of a forest plot, with room for n at its right.
+def forest_panel(ax, rows, inches):
+    """Draw one environment's differences with intervals, and n at the side.
 
     inches: how wide the panel is, roughly.
     """
-    ends = rows[["difference", "difference_low", "difference_high"]].astype(float)
-    low, high = min(0, ends.min(axis=None)), max(0, ends.max(axis=None))
-    wide = (high - low) or 1
-    margin = 0.5 / inches  # of the panel's width
-    ax.set_xlim(low - 0.06 * wide, high + wide * (0.06 + margin / (1 - margin)))
-    ticks = MaxNLocator(nbins=max(2, min(6, int(inches / 0.6)))).tick_values(low, high)
-    ax.set_xticks([tick for tick in ticks if low <= tick <= high])
-
-
-def forest_panel(ax, rows, inches):
-    """Draw one environment's differences with intervals, and n at the side."""
     configs = configurations(rows)
     ax.axvline(0, color="black", linewidth=0.8)
     ax.grid(axis="y", color="0.92")
@@ -124,7 +113,13 @@ def forest_panel(ax, rows, inches):
     ax.text(1, 1, "n", color="0.35", fontsize=7, **side)
     ax.tick_params(axis="y", length=0)
     ax.set_ylim(len(configs) - 0.5, -0.5)  # the first noise on top
-    scale_forest(ax, rows, inches)
+    ends = rows[["difference", "difference_low", "difference_high"]].astype(float)
+    low, high = min(0, ends.min(axis=None)), max(0, ends.max(axis=None))
+    wide = (high - low) or 1
+    margin = 0.5 / inches  # of the panel's width, for n
+    ax.set_xlim(low - 0.06 * wide, high + wide * (0.06 + margin / (1 - margin)))
+    ticks = MaxNLocator(nbins=max(2, min(6, int(inches / 0.6)))).tick_values(low, high)
+    ax.set_xticks([tick for tick in ticks if low <= tick <= high])
 
 
 def heat_panel(ax, rows, scale):

@@ -75,10 +75,10 @@ def span(numbers):
     return f"{low}" if low == high else f"{low} to {high}"
 
 
-def panels(environments, labels, metric, narrow=False):
+def panels(environments, labels, metric, below, narrow=False):
     """Make one panel per environment, three in a row, above a legend with as many labels.
 
-    A narrow figure, for a telephone, has one panel in a row.
+    below: the label of all x axes. A narrow figure, for a telephone, has one panel in a row.
     """
     across = 1 if narrow else min(3, len(environments))
     width = style.NARROW_WIDTH if narrow else style.WIDTHS[across - 1]
@@ -92,7 +92,7 @@ def panels(environments, labels, metric, narrow=False):
     fig.subplots_adjust(0.9 / width, bottom, 1 - 0.3 / width, top, wspace=0.25, hspace=0.45)
     axes = [fig.add_subplot(down, across, i + 1) for i in range(len(environments))]
     for ax, env in zip(axes, environments, strict=True):
-        ax.set_title(env)
+        ax.set(title=env, xlabel=below)
         ax.yaxis.get_major_locator().set_params(nbins=5)
         if ax.get_subplotspec().is_first_col():
             ax.set_ylabel(RETURN_LABELS[metric])
@@ -110,22 +110,21 @@ def best_curves_figure(study, best, narrow=False):
     best: the rows of statistics of these noises.
     """
     labels = ["no noise", "best noise, in the colour of its verdict"]
-    fig, axes, _ = panels(list(best["environment"]), labels, study.metric, narrow)
+    steps, below = training_steps(study)
+    fig, axes, _ = panels(list(best["environment"]), labels, study.metric, below, narrow)
     # Three lines of title above each panel
     fig.subplots_adjust(top=1 - 0.6 / fig.get_figheight(), hspace=0.75)
-    steps, axis_label = training_steps(study)
     configs = {(config.noise, config.noise_rate): config for config in study.returns}
     for ax, row in zip(axes, best.itertuples(), strict=True):
         e = study.environments.index(row.environment)
         color = style.COLORS.get(row.verdict, style.UNCLEAR)
         pair = {"black": BASELINE, color: configs[row.noise, row.noise_rate]}
         for color, config in pair.items():
-            mean, std = mean_and_std(study.returns[config][:, :, e])
-            curve(ax, steps, mean, std, 0.12, color=color, linewidth=1.6)
+            curves = study.returns[config][:, :, e]
+            curve(ax, steps, *mean_and_std(curves), 0.12, color=color, linewidth=1.6)
         noise = row.noise if len(row.noise) < 50 else f"{row.noise[:47]}..."
         lines = f"{noise}, {row.noise_rate}\n{row.verdict} (n = {seeds_of(row.n, row.n_baseline)})"
         ax.set_title(f"{row.environment}\n{lines}", fontsize=7.5)
-        ax.set_xlabel(axis_label)
     handles = [axes[0].lines[0], Rectangle((0, 0), 1, 1, color=style.UNCLEAR)]
     fig.legend(handles, labels, loc="lower center", ncols=1 if narrow else 2, frameon=False)
     return fig
@@ -163,16 +162,13 @@ def curves_figure(study, noise):
         name = "no noise" if config.is_baseline else f"rate {config.noise_rate}"
         labels.append(f"{name} (n = {span(n[n > 0])})")  # in the panels that have the line
     environments = [study.environments[e] for e in tried]
-    fig, axes, add_legend = panels(environments, labels, study.metric)
-    steps, axis_label = training_steps(study)
+    steps, below = training_steps(study)
+    fig, axes, add_legend = panels(environments, labels, study.metric, below)
     every = max(1, len(steps) // 8)
     for (e, ax), (i, config) in product(zip(tried, axes, strict=True), enumerate(configs)):
-        mean, std = mean_and_std(study.returns[config][:, :, e])
-        color, line, marker = style.line_style(i, len(configs))
-        look = {"color": color, "linestyle": line, "linewidth": 1.1 if i else 1.8}
-        look |= {"marker": marker, "markevery": (min(i, every - 1), every), "markersize": 4.5}
-        curve(ax, steps, mean, std, label=labels[i], **look)
-        ax.set_xlabel(axis_label)
+        look = style.line_style(i, len(configs)) | {"linewidth": 1.1 if i else 1.8}
+        look |= {"markevery": (min(i, every - 1), every), "markersize": 4.5, "label": labels[i]}
+        curve(ax, steps, *mean_and_std(study.returns[config][:, :, e]), **look)
     add_legend()
     return fig
 
@@ -202,7 +198,7 @@ def ablation_figure(study, summary, noises):
     rates = sorted(set(noisy["noise_rate"]), key=rate_order)
     environments = list(noisy["environment"].unique())
     finals = summary.set_index(["environment", "noise", "noise_rate"])[["mean", "std"]]
-    fig, axes, add_legend = panels(environments, labels, study.metric)
+    fig, axes, add_legend = panels(environments, labels, study.metric, "noise rate")
     width = 0.8 / len(noises)
     for ax, env in zip(axes, environments, strict=True):
         baseline = finals.reindex([(env, BASELINE.noise, BASELINE.noise_rate)])
@@ -212,10 +208,9 @@ def ablation_figure(study, summary, noises):
         for i, noise in enumerate(noises):
             rows = finals.reindex([(env, noise, rate) for rate in rates])
             place = np.arange(len(rates)) + width * (i - (len(noises) - 1) / 2)
-            color, _, _ = style.line_style(i + 1, len(labels))
+            color = style.line_style(i + 1, len(labels))["color"]
             bars(ax, place, rows, width, color=color, label=labels[i + 1])
         ax.set_xticks([-1, *range(len(rates))], ["none", *rates])
-        ax.set_xlabel("noise rate")
     add_legend()
     return fig
 
@@ -235,17 +230,14 @@ def robustness_figures(table, metric="return"):
     for (*study, noise), rows in table.groupby([*STUDY, "test_noise"]):
         of_one_noise = pd.to_numeric(rows["test_rate"], errors="coerce").notna().all()
         if noise and of_one_noise and rows["test_rate"].nunique() >= 3:
-            clean = table[rows_of(table, study) & (table["test_noise"] == "")]
+            clean, name = rows_of(table, study) & (table["test_noise"] == ""), study_name(*study)
             caption = (
-                f"{study_name(*study)}, tested with {noise}: mean {metric} over seeds against the "
-                f"rate, shaded {ONE_STD}; a line for each noise in training."
+                f"{name}, tested with {noise}: mean {metric} over seeds against the rate, shaded "
+                f"{ONE_STD}; a line for each noise in training."
             )
-            label, several = (
-                f"curves {study_name(*study)} {noise}",
-                rows["environment"].nunique() > 1,
-            )
-            draw = partial(robustness_curves_figure, rows, clean, metric)
-            yield Drawing("robustness", label, caption, draw, several)
+            draw = partial(robustness_curves_figure, rows, table[clean], metric)
+            several = rows["environment"].nunique() > 1
+            yield Drawing("robustness", f"curves {name} {noise}", caption, draw, several)
 
 
 def robustness_heatmap(algorithm, environment, rows, clean, metric):
@@ -310,16 +302,15 @@ def robustness_curves_figure(rows, clean, metric, narrow=False):
     rows = rows.assign(rate=rows["test_rate"].astype(float)).sort_values("rate")
     configs = configurations(rows)
     labels = [f"{name}, {rate}" if name else "no noise" for name, rate in configs]
-    fig, axes, add_legend = panels(environments, labels, metric, narrow)
-    for (ax, environment), (i, config) in product(
-        zip(axes, environments, strict=True), enumerate(configs)
-    ):
-        line = rows[(rows["environment"] == environment) & (rows["noise"] == config[0])]
-        line = line[line["noise_rate"] == config[1]]
-        color, dashes, marker = style.line_style(i, len(configs))
-        look = {"color": color, "linestyle": dashes, "marker": marker or ".", "label": labels[i]}
-        curve(ax, line["rate"], line["mean"], line["std"].astype(float).fillna(0), **look)
-        ax.set_xlabel("rate of the noise in the test (0: clean)")
+    below = "rate of the noise in the test (0: clean)"
+    fig, axes, add_legend = panels(environments, labels, metric, below, narrow)
+    for ax, environment in zip(axes, environments, strict=True):
+        for i, (noise, rate) in enumerate(configs):
+            line = rows[(rows["noise"] == noise) & (rows["noise_rate"] == rate)]
+            line = line[line["environment"] == environment]
+            look = style.line_style(i, len(configs)) | {"label": labels[i]}
+            look["marker"] = look["marker"] or "."
+            curve(ax, line["rate"], line["mean"], line["std"].astype(float).fillna(0), **look)
     add_legend()
     return fig
 

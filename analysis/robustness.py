@@ -16,30 +16,21 @@ import numpy as np
 import pandas as pd
 
 from analysis import verdicts
-from analysis.runs import (
-    ELSEWHERE,
-    KEYS,
-    ROBUSTNESS_COLUMNS,
-    STUDY,
-    SUCCESS,
-    study_name,
-    where_tested,
-)
+from analysis.runs import KEYS, ROBUSTNESS_COLUMNS, STUDY, SUCCESS, study_name, where_tested
 from analysis.statistics import compare, holm, mean_std, percent_of
 from analysis.tables import table_of
-from noisy_wrappers import BASELINE, WRAPPERS, Configuration, rounded
+from noisy_wrappers import BASELINE, Configuration, rounded
 
 FILES = ("robustness.csv", "robustness.csv.gz")
-CONDITION = ["test_noise", "test_rate"]
 CLEAN = BASELINE  # a condition of a test is a Configuration, too
-RUN_COLUMNS = [*KEYS, "configuration", "seed", "condition", "mean", "cvar"]
-COLUMNS = [*KEYS, *CONDITION, "tested_on", "n", "mean", "std", "difference", "change_percent"]
-COLUMNS += ["cvar", "score_percent"]
-_SCORE_COLUMNS = """scope environment noise noise_rate n n_baseline conditions difference
+RUN_COLUMNS = [*KEYS, "configuration", "seed", "elsewhere", "condition", "mean", "cvar"]
+COLUMNS = [*KEYS, "test_noise", "test_rate", "tested_on", "n", "mean", "std", "difference"]
+COLUMNS += ["change_percent", "cvar", "score_percent"]
+SCORE_COLUMNS = """scope environment noise noise_rate n n_baseline conditions difference
     difference_low difference_high difference_percent effect_size p p_holm detectable score_percent
     baseline_score_percent clean_change_percent cvar_score_percent baseline_cvar_score_percent
     worst_score_percent baseline_worst_score_percent worst_condition t pooled_std smallest_p"""
-SCORE_COLUMNS = [*STUDY, *_SCORE_COLUMNS.split()]
+SCORE_COLUMNS = [*STUDY, *SCORE_COLUMNS.split()]
 
 
 def read_robustness(runs_dir, runs, metric="return"):
@@ -51,7 +42,7 @@ def read_robustness(runs_dir, runs, metric="return"):
     """
     rows, notes = [], []
     for run in runs[runs["status"] == "finished"].itertuples():
-        paths = [Path(runs_dir) / run.run / name for name in FILES]
+        paths = [runs_dir / run.run / name for name in FILES]
         path = next(filter(Path.exists, paths), None)
         if path is None:
             continue
@@ -62,7 +53,8 @@ def read_robustness(runs_dir, runs, metric="return"):
             continue
         row = {name: getattr(run, name) for name in (*KEYS, "configuration", "seed")}
         for (condition, elsewhere), results in tests.items():
-            row |= {"environment": where_tested(run.environment, elsewhere), "condition": condition}
+            row |= {"condition": condition, "elsewhere": elsewhere}
+            row["environment"] = where_tested(run.environment, elsewhere)
             rows.append(row | {"mean": results.mean(), "cvar": cvar(results)})
     return pd.DataFrame(rows, columns=RUN_COLUMNS), notes
 
@@ -75,8 +67,7 @@ def read_episodes(path, metric="return"):
     """
     keys = ["noise", "noise_rate", "environment"]
     table = pd.read_csv(path, dtype=dict.fromkeys(keys, str)).fillna(dict.fromkeys(keys, ""))
-    known, more = table.columns[: len(ROBUSTNESS_COLUMNS)], table.columns[len(ROBUSTNESS_COLUMNS) :]
-    if list(known) != ROBUSTNESS_COLUMNS or not set(more) <= {"success", "environment"}:
+    if [name for name in table if name not in ("success", "environment")] != ROBUSTNESS_COLUMNS:
         raise ValueError("unexpected header")
     results = pd.to_numeric(table["episodic_return"])
     if not np.isfinite(results).all() or not len(results):
@@ -86,11 +77,7 @@ def read_episodes(path, metric="return"):
     table = table.assign(environment=table.get("environment", ""), result=results)
     table, found = table.dropna(subset="result"), {}
     for (noise, rate, environment), group in table.groupby(keys, sort=False)["result"]:
-        condition = Configuration.parse(noise, rate)
-        unknown = [name for name in condition.wrappers if name not in WRAPPERS and ":" not in name]
-        if unknown:  # and none of the user's own
-            raise ValueError(f"unknown noise {unknown[0]!r}")
-        found[condition, environment] = group.to_numpy(float)
+        found[Configuration.parse(noise, rate), environment] = group.to_numpy(float)
     return found
 
 
@@ -143,15 +130,20 @@ def condition_rows(runs):
 
 
 def score_rows(runs):
-    """Yield the score of every configuration with noise: over all environments, then in each."""
+    """Yield the score of every configuration with noise: over all environments, then in each.
+
+    `primary` are those over all environments, or in the only one. Tests in another environment are
+    apart: they leave those at home as they are.
+    """
     for _, group in runs.groupby(STUDY):
         for config in sorted({*group["configuration"]} - {BASELINE}):
             scores = [environment_score(same, config) for _, same in group.groupby("environment")]
             scores = [score for score in scores if score]
-            at_home = [score for score in scores if ELSEWHERE not in score["environment"]]
+            at_home = [score for score in scores if not score["elsewhere"]]
             if len(at_home) > 1:
-                yield average_score(at_home)
-            yield from scores
+                yield average_score(at_home) | {"primary": True}
+            for score in scores:
+                yield score | {"primary": bool(score["elsewhere"]) or len(at_home) == 1}
 
 
 def environment_score(runs, config):
@@ -171,7 +163,8 @@ def environment_score(runs, config):
     clean, percent = y[CLEAN].mean(), percent_of(1.0, y[CLEAN])
     clean_change = (x[CLEAN].mean() - clean) * percent
     x, y = (side[conditions].mean(axis=1).to_numpy() for side in (x, y))
-    row = runs[runs["configuration"] == config].iloc[0][KEYS].to_dict() | compare(x, y)._asdict()
+    own = runs[runs["configuration"] == config].iloc[0]
+    row = own[[*KEYS, "elsewhere"]].to_dict() | compare(x, y)._asdict()
     row |= {"scope": "environment", "x": x, "y": y, "conditions": len(conditions)}
     row |= {"difference_percent": (x.mean() - y.mean()) * percent}
     row |= {"clean_change_percent": clean_change, "worst_condition": ""}
@@ -200,30 +193,14 @@ def average_score(scores):
     return row
 
 
-def tested_elsewhere(scores):
-    """Return the environment of each row's test where it is not the training's, else ""."""
-    names = [name.partition(ELSEWHERE)[2] for name in scores["environment"]]
-    return pd.Series(names, scores.index, dtype=object)
-
-
-def primary(scores):
-    """Return which rows of scores are primary: of all environments, or of the only one.
-
-    Tests in another environment are apart: they leave those at home as they are.
-    """
-    of_all = scores["scope"] == "all"
-    keys = [scores[name] for name in (*STUDY, "noise", "noise_rate")]
-    return of_all | ~of_all.groupby([*keys, tested_elsewhere(scores)]).transform("any")
-
-
-def robustness_tables(runs, metric="return"):
-    """Compute the tables of robustness from read_robustness's frame: name -> Table."""
+def analyse_robustness(runs, metric="return"):
+    """Return the tables of read_robustness's frame, by name, and the sentences on its scores."""
     if runs.empty:
-        return {}
+        return {}, []
     table = pd.DataFrame(condition_rows(runs), columns=COLUMNS)
-    scores = pd.DataFrame(score_rows(runs), columns=SCORE_COLUMNS)
-    judged = scores[primary(scores) & scores["p"].notna()]
-    for _, family in judged.groupby([*STUDY, tested_elsewhere(judged)]):
+    scores = pd.DataFrame(score_rows(runs), columns=[*SCORE_COLUMNS, "primary", "elsewhere"])
+    primary = scores[scores["primary"].astype(bool)]
+    for _, family in primary[primary["p"].notna()].groupby([*STUDY, "elsewhere"]):
         scores.loc[family.index, "p_holm"] = holm(family["p"].to_numpy(float))
     note, score_note = "", "Scores: relative to the clean return."
     if metric == SUCCESS:  # never percent of a rate; the worst tenth of episodes is 0 or 100
@@ -231,33 +208,30 @@ def robustness_tables(runs, metric="return"):
         score_note = note
         for frame in (scores, table):
             frame[frame.filter(regex="_percent$|^cvar$|^worst_condition$").columns] = np.nan
+    sentences = robustness_sentences(scores.loc[primary.index], metric)
     more = {"section": "robustness", "only_csv": ("t", "pooled_std", "smallest_p")}
-    score = table_of("robustness_score", scores, note=score_note, **more)
+    score = table_of("robustness_score", scores[SCORE_COLUMNS], note=score_note, **more)
     conditions = table_of("robustness", table, note=note, only_csv=("score_percent",))
-    return {"robustness_score": score, "robustness": conditions}
+    return {"robustness_score": score, "robustness": conditions}, list(sentences)
 
 
-def robustness_sentences(scores, unit=""):
-    """Yield one plain sentence for each training configuration: is it more robust?
-
-    unit: of the difference, such as POINTS.
-    """
-    for row in scores[primary(scores)].itertuples():
+def robustness_sentences(scores, metric):
+    """Yield one plain sentence for each training configuration: is it more robust?"""
+    unit = verdicts.POINTS if metric == SUCCESS else ""
+    for row in scores.itertuples():
         where = row.environment or "all environments together"
         study = study_name(row.algorithm, row.exp_name, row.phase)
         start = f"{study} on {where}, trained with {row.noise} at rate {row.noise_rate}"
-        evidence, limit = verdicts.difference(row, unit), ""
+        shown, limit = "no clear difference in robustness to new noise", ""
+        evidence = verdicts.difference(row, unit)
         if pd.isna(row.p):
             shown = "too few seeds for a test of robustness to new noise"
-        elif verdicts.significant(row.p):
-            shown = f"{'more' if row.t > 0 else 'less'} robust to new noise"
-            if not verdicts.significant(row.p_holm):
-                shown = f"perhaps {shown}"
         else:
-            shown = "no clear difference in robustness to new noise"
-        if pd.notna(row.p):
             corrected = verdicts.p_value(row.p_holm).removeprefix("= ")
             evidence += f", p {verdicts.p_value(row.p)}, Holm {corrected}"
+        if verdicts.significant(row.p):
+            perhaps = "" if verdicts.significant(row.p_holm) else "perhaps "
+            shown = f"{perhaps}{'more' if row.t > 0 else 'less'} robust to new noise"
         if not verdicts.significant(row.smallest_p):
             limit = f"; {verdicts.counted(row.n, 'seed')} against {row.n_baseline} cannot show any"
         elif not verdicts.significant(row.p) and row.detectable > 0:

@@ -26,9 +26,10 @@ viridis = matplotlib.colormaps["viridis"]  # ordered by lightness, so it reads i
 
 
 def line_style(i, number):
-    """Return colour, line and marker of line i of so many; the first is the baseline, in black."""
+    """Return the look of line i of so many; the first is the baseline, in black."""
     color = viridis(0.7 * (i - 1) / max(1, number - 2)) if i else "black"
-    return color, ["-", "--", "-.", ":"][i % 4], ["", "o", "s", "^", "D", "v", "P", "X"][i % 8]
+    line, marker = ["-", "--", "-.", ":"][i % 4], ["", "o", "s", "^", "D", "v", "P", "X"][i % 8]
+    return {"color": color, "linestyle": line, "marker": marker}
 
 
 def broken(label):
