@@ -16,6 +16,7 @@ https://arxiv.org/abs/2305.02882; IQM and probability of improvement are those o
 
 import shutil
 import sys
+import textwrap
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -25,7 +26,7 @@ import tyro
 from analysis.errors import fail, take_over_terminal
 from analysis.figures import figures, write_figure
 from analysis.folders import is_run
-from analysis.formatting import text_table, wrapped, write_table
+from analysis.formatting import text_table, write_table
 from analysis.paper import read_paper
 from analysis.report import Results, write_report
 from analysis.robustness import analyse_robustness, read_robustness
@@ -79,16 +80,14 @@ def verdicts_in_short(results):
 
 def overview_of(runs, studies):
     """Say in words what was analysed."""
-    finished = f"Finished runs: {(runs['status'] == 'finished').sum():,}."
-    return " ".join(
-        [finished]
-        + [
-            f"{study.name}: {study.steps[-1]:,} steps, seeds: {len(study.seeds)}, "
+    overview = f"Finished runs: {(runs['status'] == 'finished').sum():,}."
+    for study in studies:
+        overview += (
+            f" {study.name}: {study.steps[-1]:,} steps, seeds: {len(study.seeds)}, "
             f"environments: {len(study.environments)}, "
             f"noise configurations: {len(study.returns) - 1}."
-            for study in studies
-        ]
-    )
+        )
+    return overview
 
 
 def write_results(out, results, latex):
@@ -122,7 +121,8 @@ def print_results(out, results):
     width, tables = terminal_width(), results.tables
 
     def say(text):
-        print(wrapped(text, width))
+        style = {"break_long_words": False, "break_on_hyphens": False, "subsequent_indent": "  "}
+        print(textwrap.fill(text, width, **style))
 
     for line in verdicts_in_short(results):
         say(line)

@@ -1,7 +1,6 @@
 """How results look as text: numbers, and tables in a terminal, in Markdown and in LaTeX."""
 
 import re
-import textwrap
 import zlib
 from dataclasses import dataclass, field
 
@@ -162,12 +161,6 @@ def text_table(table, width):
         if text.shape[1] == 1 or max(map(len, lines.splitlines())) <= width:
             return lines
         text = text.iloc[:, :-1]
-
-
-def wrapped(text, width):
-    """Break a paragraph into lines of this width between words."""
-    style = {"break_long_words": False, "break_on_hyphens": False, "subsequent_indent": "  "}
-    return textwrap.fill(text, width, **style)
 
 
 def write_table(out, table, latex=False):

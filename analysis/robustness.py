@@ -10,7 +10,6 @@ instead of the return, in percentage points.
 """
 
 from itertools import zip_longest
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -21,7 +20,6 @@ from analysis.statistics import compare, holm, mean_std, percent_of
 from analysis.tables import table_of
 from noisy_wrappers import BASELINE, Configuration, rounded
 
-FILES = ("robustness.csv", "robustness.csv.gz")
 CLEAN = BASELINE  # a condition of a test is a Configuration, too
 RUN_COLUMNS = [*KEYS, "configuration", "seed", "elsewhere", "condition", "mean", "cvar"]
 COLUMNS = [*KEYS, "test_noise", "test_rate", "tested_on", "n", "mean", "std", "difference"]
@@ -42,9 +40,10 @@ def read_robustness(runs_dir, runs, metric="return"):
     """
     rows, notes = [], []
     for run in runs[runs["status"] == "finished"].itertuples():
-        paths = [runs_dir / run.run / name for name in FILES]
-        path = next(filter(Path.exists, paths), None)
-        if path is None:
+        path = runs_dir / run.run / "robustness.csv"
+        if not path.exists():
+            path = path.with_suffix(".csv.gz")
+        if not path.exists():
             continue
         try:
             tests = read_episodes(path, metric)
