@@ -20,7 +20,6 @@ import csv
 import fcntl
 import importlib
 import itertools
-import math
 import multiprocessing
 import os
 import signal
@@ -29,11 +28,12 @@ import sys
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from importlib.machinery import PathFinder
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import tyro
 from gymnasium.wrappers import RecordVideo
 from tabulate import tabulate
@@ -58,6 +58,7 @@ from analysis.runs import (
     usual_settings,
     where_tested,
 )
+from analysis.statistics import mean_std
 from noisy_wrappers import (
     BASELINE,
     Configuration,
@@ -101,7 +102,7 @@ class Args:
 
 @dataclass(frozen=True, eq=False)
 class FinishedRun:
-    """A finished run, as analysis.folders.read_config reads it."""
+    """A finished run: what its config.json says of it."""
 
     folder: Path
     algorithm: str
@@ -116,9 +117,15 @@ class FinishedRun:
         """The environment that the policy plays in."""
         return self.elsewhere or self.environment
 
+    @property
+    def runs_dir(self):
+        """The folder of all runs beside it, in both phases of a choice."""
+        folder = self.folder.resolve().parent
+        return folder.parent if folder.name in PHASES else folder
 
-class UnusableError(Exception):
-    """A run cannot be tested; the text says why."""
+    def key(self, condition):
+        """Return what names a condition in robustness.csv: see read_stored."""
+        return *condition.columns, self.elsewhere
 
 
 def find_runs(paths):
@@ -139,7 +146,7 @@ def find_runs(paths):
         try:
             config = read_config(folder) if has_begun(folder) else None
             if config and read_result(folder, config):
-                names = [field.name for field in fields(FinishedRun)][1:-1]
+                names = "algorithm", "exp_name", "environment", "configuration", "settings"
                 runs.append(FinishedRun(folder, *(config[name] for name in names)))
         except DamageError as error:
             damaged[folder] = str(error)
@@ -150,15 +157,15 @@ def find_runs(paths):
 
 
 def read_conditions(args):
-    """Return the configurations to test under: without noise, and every noise at every rate."""
+    """Return the configurations to test under: without noise, and every noise at every rate.
+
+    Raises ValueError.
+    """
     conditions = {BASELINE: None}  # a dictionary keeps each once, in order; a rate of 0 is clean
     for noise, rate in itertools.product(args.noises, args.noise_rates):
-        try:
-            configuration = Configuration.read(split_noises(noise), [rate])
-        except ValueError as error:
-            fail(error)
+        configuration = Configuration.read(split_noises(noise), [rate])
         if any(start != end for start, end in configuration.rates):
-            fail(f"--noise-rates {rate}: policies are tested at constant rates")
+            raise ValueError(f"--noise-rates {rate}: policies are tested at constant rates")
         conditions[configuration] = None
     return list(conditions)
 
@@ -167,15 +174,11 @@ def read_conditions(args):
 def load(run, render_mode=None):
     """Yield a run's clean environment, closed at the end, and its policy, NumPy to NumPy.
 
-    Raises UnusableError.
+    Raises ValueError if a run cannot be tested, besides what its environment raises.
     """
     script = importlib.import_module(script_name(run.algorithm))
-    for environment in dict.fromkeys([run.environment, run.tested_in]):
-        refuse_foreign_module(run, environment)
-        try:
-            canonical_env_id(environment)  # imports its module
-        except ValueError as error:
-            raise UnusableError(error) from None
+    for environment in (run.environment, run.tested_in):
+        canonical_env_id(environment)  # imports its module
     steps = run.settings.get("max_episode_steps")
     drawn = {"render_mode": render_mode} if render_mode else {}  # not every class takes it
     seed_globals(Args.seed)  # as every episode does: the constructor may draw, too
@@ -187,47 +190,38 @@ def load(run, render_mode=None):
             policy = script.load_policy(run.folder, env)
         except Exception as error:  # a damaged file may raise anything
             reason = f"policy.pt is not a policy for {run.tested_in}: {in_words(error)}"
-            raise UnusableError(reason) from None
+            raise ValueError(reason) from None
         yield env, policy
 
 
 def check_spaces(run, trained_in, env):
-    """Raise UnusableError unless both environments have the same spaces."""
+    """Raise ValueError unless both environments have the same spaces."""
     for name in ("observation_space", "action_space"):
         here, there = getattr(trained_in, name), getattr(env, name)
         if here != there:
-            raise UnusableError(
+            raise ValueError(
                 f"--env-id {run.elsewhere}: its {name} is {there}, that of {run.environment} is "
                 f"{here}; a policy needs the same"
             )
 
 
-def folders_of_runs(run):
-    """Return a run's own folder, and the one of all runs beside it."""
-    folder = run.folder.resolve()
-    runs_dir = folder.parent
-    return folder, runs_dir.parent if runs_dir.name in PHASES else runs_dir
-
-
 def refuse_foreign_module(run, name):
-    """Raise UnusableError if an environment or a noise would be imported from a folder of runs.
+    """Raise ValueError if an environment or a noise would be imported from a folder of runs.
 
     Whoever made a folder of runs that somebody downloads chose its modules and their names, too.
     """
     module, colon, _ = name.partition("(")[0].rpartition(":")
     first, *rest = module.strip().split(".")
-    here, project = Path.cwd(), Path(__file__).resolve().parent
     spec = PathFinder.find_spec(first, module_path()) if colon else None  # executes nothing
-    folder, runs_dir = folders_of_runs(run)
+    here, project, folder = Path.cwd(), Path(__file__).resolve().parent, run.folder.resolve()
     for found in (spec.submodule_search_locations or [spec.origin]) if spec else ():
-        entry = Path(found).parent.resolve()
-        top = Path(found).resolve()
+        entry, top = Path(found).parent.resolve(), Path(found).resolve()
         place = Path(top, *rest).resolve()
         # the project's folder may hold the runs, and packages that are on the module path
-        is_own = entry.is_relative_to(runs_dir) and (entry != here or entry == project)
-        beside = place.is_relative_to(runs_dir) and not is_own
-        if beside or place.is_relative_to(folder) or folder.is_relative_to(top):
-            raise UnusableError(
+        is_own = entry.is_relative_to(run.runs_dir) and (entry != here or entry == project)
+        forbidden = folder if is_own else run.runs_dir
+        if place.is_relative_to(forbidden) or folder.is_relative_to(top):
+            raise ValueError(
                 f"{name} would be imported from {place}, in a folder of runs; "
                 "if you trust that module, move it to where your own ones are"
             )
@@ -243,14 +237,13 @@ def check_runs(runs, conditions, bad, storing):
     stored = {}
     for run in runs:
         try:
+            refuse_foreign_module(run, run.environment)
             with load(run) as (env, _):
                 for condition in conditions:
                     condition.wrap(env)
             stored[run] = read_stored(run) if storing else {}
-        except (UnusableError, ValueError) as error:
-            bad[run.folder] = str(error)
-        except Exception as error:  # of the user's environment
-            bad[run.folder] = with_place(error)
+        except Exception as error:  # any but a ValueError is of the user's environment
+            bad[run.folder] = with_place(error, ValueError)
     return stored
 
 
@@ -272,39 +265,38 @@ def play(run, condition, args):
 
 def draw(run, condition, args):
     """Play an episode in a window or into a video: its result, or in words why it cannot."""
+    place = f"__{slug(run.elsewhere)}" if run.elsewhere else ""
+    name = f"{run.folder.name}__{condition.slug or 'clean'}{place}.mp4"
     try:
-        if args.video:
-            return record(run, condition, args)
-        with load(run, "human") as (env, policy):
-            [result] = play_episodes(condition.wrap(env), policy, 1, args.seed)
+        with load(run, "human" if args.render else "rgb_array") as (env, policy):
+            noisy_env = condition.wrap(env)
+            if args.video:
+                [result] = record(noisy_env, policy, args.seed, args.video / name)
+            else:
+                [result] = play_episodes(noisy_env, policy, 1, args.seed)
             return result
     except Exception as error:  # of any library that draws, or of the environment
         return with_place(error)
 
 
-def record(run, condition, args):
-    """Play one episode into a video; return its result."""
-    place = f"__{slug(run.elsewhere)}" if run.elsewhere else ""
-    name = f"{run.folder.name}__{condition.slug or 'clean'}{place}.mp4"
-    with tempfile.TemporaryDirectory(dir=args.video, prefix=".") as temporary:
+def record(env, policy, seed, path):
+    """Play one episode into a video; return what play_episodes does."""
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".") as temporary:
         folder = Path(temporary, "video")  # a new one: RecordVideo warns of one that exists
-        with load(run, "rgb_array") as (env, policy):
-            video = RecordVideo(
-                condition.wrap(env), str(folder), episode_trigger=lambda episode: True
-            )
-            try:
-                [result] = play_episodes(video, policy, 1, args.seed)
-            finally:
-                if video.recording:
-                    video.stop_recording()
-        (folder / "rl-video-episode-0.mp4").replace(args.video / name)
-    return result
+        video = RecordVideo(env, str(folder))  # of the first episode
+        try:
+            results = play_episodes(video, policy, 1, seed)
+        finally:
+            if video.recording:
+                video.stop_recording()
+        (folder / "rl-video-episode-0.mp4").replace(path)
+    return results
 
 
 def play_episodes(env, policy, number, seed):
-    """Play episodes; return [(true return, length), ...].
+    """Play episodes; return [(true return, length, success), ...].
 
-    Where the environment tells success, 1 or 0 follows.
+    Success is 1 or 0, or NaN where the environment does not tell it.
     """
     results = []
     for episode in range(number):
@@ -314,26 +306,24 @@ def play_episodes(env, policy, number, seed):
             while not (terminated or truncated):
                 observation, _, terminated, truncated, info = env.step(policy(observation))
         record = info["episode"]  # the return is a sum of numbers or of arrays
-        success = outcome(info)
-        told = () if math.isnan(success) else (int(success),)
-        results.append((np.asarray(record["r"]).item(), int(record["l"]), *told))
+        results.append((np.asarray(record["r"]).item(), int(record["l"]), outcome(info)))
     return results
 
 
 def play_all(play, tasks, args):
-    """Yield the results of play(run, condition, args) for all tasks, in their order."""
+    """Yield all tasks, (run, condition), in their order, with what play(*task, args) returns."""
     with tqdm(tasks, unit="condition", disable=None) as bar:
         if args.jobs == 1 or args.render:
             for task in bar:
-                yield play(*task, args)
+                yield task, play(*task, args)
             return
         context = multiprocessing.get_context("spawn")  # PyTorch does not survive a fork
         ignore = (signal.SIGINT, signal.SIG_IGN)  # at Ctrl-C they finish what they play
         with ProcessPoolExecutor(args.jobs, context, signal.signal, ignore) as pool:
             futures = [pool.submit(play, *task, args) for task in tasks]
             try:
-                for _, future in zip(bar, futures, strict=True):
-                    yield future.result()
+                for task, future in zip(bar, futures, strict=True):
+                    yield task, future.result()
             finally:
                 pool.shutdown(cancel_futures=True)
 
@@ -341,20 +331,20 @@ def play_all(play, tasks, args):
 def read_stored(run):
     """Read robustness.csv: {(noise, noise rate, environment): what play_episodes returns}.
 
-    The environment is empty for that of the training. Raises UnusableError.
+    The environment is empty for that of the training. Raises DamageError.
     """
     path = run.folder / "robustness.csv"
     stored = {}
     try:
         text = path.read_text("utf-8") if path.exists() else ""
         for row in csv.DictReader(text.splitlines()):
-            told = (int(row["success"]),) if row.get("success") else ()
-            result = (float(row["episodic_return"]), int(row["episodic_length"]), *told)
+            success = float(row.get("success") or "nan")
+            result = float(row["episodic_return"]), int(row["episodic_length"]), success
             key = row["noise"], row["noise_rate"], row.get("environment") or ""
             stored.setdefault(key, []).append(result)
     except (OSError, ValueError, KeyError, TypeError, OverflowError, csv.Error) as error:
         text = f"robustness.csv: {in_words(error)}; delete that file to play everything again"
-        raise UnusableError(text) from None
+        raise DamageError(text) from None
     return stored
 
 
@@ -366,25 +356,24 @@ def store(run, key, results):
             stored = read_stored(run)
             if len(stored.get(key, [])) < len(results):
                 write_stored(run, stored | {key: results})
-    except (OSError, UnusableError) as error:
+    except (OSError, DamageError) as error:
         fail(f"cannot write {run.folder / 'robustness.csv'}: {error}", code=1)
 
 
 def write_stored(run, stored):
     """Write robustness.csv, whole or not at all."""
+    rows = [
+        (*condition, i, *result, environment or None)
+        for (*condition, environment), results in stored.items()
+        for i, result in enumerate(results)
+    ]
+    table = pd.DataFrame(rows, columns=[*ROBUSTNESS_COLUMNS, "success", "environment"])
+    table = table.astype({"success": "Int64"}).dropna(axis="columns", how="all")
     # not *.tmp, which the training command deletes when it is called again
     temporary = run.folder / f".robustness.{os.getpid()}"
     try:
         with open(temporary, "w", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            told = any(len(result) > 2 for results in stored.values() for result in results)
-            elsewhere = any(environment for _, _, environment in stored)
-            columns = [*ROBUSTNESS_COLUMNS, *["success"] * told, *["environment"] * elsewhere]
-            writer.writerow(columns)
-            for (*condition, environment), results in stored.items():
-                for i, result in enumerate(results):
-                    row = [*condition, i, *result, *[""] * (told and len(result) == 2)]
-                    writer.writerow([*row, *[environment] * elsewhere])
+            table.to_csv(file, index=False)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(run.folder / "robustness.csv")
@@ -406,39 +395,38 @@ def names_of(runs):
 
 def print_table(runs, conditions, stored, episodes):
     """Print mean and sample standard deviation over seeds: one table for each noise of the test."""
-    keys, trained = [condition.columns for condition in conditions], {}
+    trained = {}
     for run, name in zip(runs, names_of(runs), strict=True):
         noise = run.configuration.noise or "no noise"
         where = where_tested(run.environment, run.elsewhere)
-        config = (where, name, noise, run.configuration.noise_rate)
-        at_hand = {key[:2]: value for key, value in stored[run].items() if key[2] == run.elsewhere}
-        trained.setdefault(config, []).append(at_hand)
-    noises = dict.fromkeys(noise for noise, _ in keys if noise)
-    for tested_with in noises or [""]:
-        columns = [key for key in keys if key[0] in ("", tested_with)]
+        row = where, name, noise, run.configuration.noise_rate
+        trained.setdefault(row, []).append(run)
+    noises = dict.fromkeys(condition.noise for condition in conditions if condition.noise)
+    for noise in noises or [""]:
+        columns = [condition for condition in conditions if condition.noise in ("", noise)]
         headers = ["environment", "algorithm", "trained with", "at rate", "seeds"]
-        headers += [f"at {rate}" if noise else "clean" for noise, rate in columns]
-        rows = [
-            [*config, len(seeds), *(mean_return(seeds, key, episodes) for key in columns)]
-            for config, seeds in trained.items()
-        ]
-        if tested_with:
-            print(f"\nMean return, tested with {tested_with}")
+        headers += [f"at {column.columns[1]}" if column.noise else "clean" for column in columns]
+        rows = []
+        for row, seeds in trained.items():
+            played = [[stored[run][run.key(column)] for run in seeds] for column in columns]
+            rows.append([*row, len(seeds), *(mean_return(results, episodes) for results in played)])
+        if noise:
+            print(f"\nMean return, tested with {noise}")
         print(tabulate(rows, headers, disable_numparse=True))
 
 
-def mean_return(seeds, key, episodes):
-    """Return the text of a cell: the mean return, its standard deviation, the rate of success."""
-    played = [seed[key][:episodes] for seed in seeds]
-    means = [np.mean([result[0] for result in results]) for results in played]
-    solved = ""
-    if any(len(result) > 2 for results in played for result in results):
-        rates = [np.mean([result[2:] == (1,) for result in results]) for results in played]
-        solved = f", {100 * np.mean(rates):.0f} % solved"
-    if len(means) == 1:
-        return rounded(means[0]) + solved
-    spread = np.std(means, ddof=1)
-    return f"{rounded(np.mean(means), spread)} ± {rounded(spread, spread)}{solved}"
+def mean_return(played, episodes):
+    """Return the text of a cell: the mean return, its standard deviation, the rate of success.
+
+    played: what play_episodes returns, for each run.
+    """
+    results = np.array([results[:episodes] for results in played])
+    mean, spread, n = mean_std(results[..., 0].mean(axis=1))
+    text = rounded(mean, spread)
+    if n > 1:
+        text += f" ± {rounded(spread, spread)}"
+    success = results[..., 2]
+    return text if np.isnan(success).all() else f"{text}, {100 * (success > 0).mean():.0f} % solved"
 
 
 def works(code):
@@ -465,18 +453,15 @@ def draw_without_display():
 
 def show(runs, conditions, args):
     """Play an episode of each condition in a window or into a video; return whether one failed."""
-    tasks = list(itertools.product(runs, conditions))
-    failures = []
-    for (run, condition), result in zip(tasks, play_all(draw, tasks, args), strict=True):
+    failed = False
+    for (run, condition), result in play_all(draw, list(itertools.product(runs, conditions)), args):
         name = f"{run.folder.name}, {condition.slug or 'clean'}"
         if isinstance(result, str):
-            failures.append(f"{name}: {result}")
-            continue
-        episodic_return, length, *_ = result
-        print(f"{name}: return {rounded(episodic_return)}, {length} steps")
-    for failure in failures:
-        print(f"error: cannot draw {failure}", file=sys.stderr)
-    return bool(failures)
+            print(f"error: cannot draw {name}: {result}", file=sys.stderr)
+            failed = True
+        else:
+            print(f"{name}: return {rounded(result[0])}, {result[1]} steps")
+    return failed
 
 
 def main(args):
@@ -494,11 +479,11 @@ def main(args):
     try:
         for run, name in itertools.product(runs, [*named, args.env_id or ""]):
             refuse_foreign_module(run, name)
-    except UnusableError as error:
+        conditions = read_conditions(args)
+    except ValueError as error:
         fail(error)
-    conditions = read_conditions(args)
     here = Path.cwd()  # for what the module of my_envs:MyEnv-v0 imports
-    if not any(here.is_relative_to(runs_dir) for run in runs for runs_dir in folders_of_runs(run)):
+    if not any(here.is_relative_to(run.runs_dir) for run in runs):
         sys.path.append(str(here))
     storing = args.seed == Args.seed
     if args.video:
@@ -532,13 +517,12 @@ def main(args):
     tasks = [
         (run, condition)
         for run, condition in itertools.product(runs, conditions)
-        if len(stored[run].get((*condition.columns, run.elsewhere), [])) < args.episodes
+        if len(stored[run].get(run.key(condition), [])) < args.episodes
     ]
-    for (run, condition), results in zip(tasks, play_all(play, tasks, args), strict=True):
-        key = *condition.columns, run.elsewhere
-        stored[run][key] = results
+    for (run, condition), results in play_all(play, tasks, args):
+        stored[run][run.key(condition)] = results
         if storing:
-            store(run, key, results)
+            store(run, run.key(condition), results)
     print_table(runs, conditions, stored, args.episodes)
     return bool(bad)
 

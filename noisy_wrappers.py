@@ -89,13 +89,11 @@ __all__ = [
     "RewardNoise",
     "SpaceError",
     "canonical_env_id",
-    "canonical_noises",
     "handle_signals",
     "into_space",
     "make_flat",
     "make_noisy",
     "module_path",
-    "noise_slug",
     "noise_statistics",
     "noise_wrappers",
     "note_versions",
@@ -1173,10 +1171,16 @@ class Configuration:
     def read(
         cls, noises: Sequence[str], rates: Sequence[float | str], *, stored: bool = False
     ) -> "Configuration":
-        """Check noises and rates and make them canonical, as :func:`canonical_noises` says.
+        """Check noises and rates and make them canonical.
 
-        ``stored`` are those of a config.json. They are canonical; one of the user's own is taken as
-        it stands, because its module need not be where its runs are analysed.
+        One rate serves all noises; it is a number in [0, 1], or "start:end" of two such numbers,
+        which is a number if they are equal. Noises of rate 0 are dropped (they are the baseline).
+        Dynamics and action noise come first, where :func:`make_noisy` applies them. ``stored`` are
+        those of a config.json. They are canonical; one of the user's own is taken as it stands,
+        because its module need not be where its runs are analysed.
+
+        Raises:
+            ValueError: a bad noise or rate, or neither one rate nor one for each noise.
         """
         noises = _listed("noises", noises, '["RandomNormalNoisyReward(0.1)"]')
         rates = _listed("rates", rates, "[0.5]")
@@ -1328,26 +1332,6 @@ def _place(wrapper: type[NoiseWrapper]) -> int:
     return {"dynamics": 1, "action": 3}.get(wrapper.kind, 4)
 
 
-def canonical_noises(
-    noises: Sequence[str], rates: Sequence[float | str]
-) -> tuple[list[str], list[float | str]]:
-    """Return noises in canonical notation and one rate for each.
-
-    Noises of rate 0 are dropped (they are the baseline). Dynamics and action noise come first,
-    where :func:`make_noisy` applies them. One rate serves all noises. A rate is a number in
-    [0, 1], or "start:end" of two such numbers, which is a number if they are equal.
-
-    >>> canonical_noises(["RandomNormalNoisyReward(1)", "RandomEarlyTermination(50, 50)"], [0.1])
-    (['RandomEarlyTermination(50)', 'RandomNormalNoisyReward(1.0)'], [0.1, 0.1])
-    >>> canonical_noises(["RandomNormalNoisyReward(1)"], ["1:0"])
-    (['RandomNormalNoisyReward(1.0)'], ['1.0:0.0'])
-
-    Raises:
-        ValueError: a bad noise or rate, or neither one rate nor one for each noise.
-    """
-    return Configuration.read(noises, rates).texts
-
-
 def make_noisy(
     env: Env,
     noises: Sequence[str],
@@ -1369,7 +1353,7 @@ def make_noisy(
     <RandomNormalNoisyReward<RecordEpisodeStatistics<CartPoleEnv<CartPole-v1>>>>
 
     Raises:
-        ValueError: as :func:`canonical_noises`, a space that a noise cannot work on, or an
+        ValueError: as :meth:`Configuration.read`, a space that a noise cannot work on, or an
             environment that records its episodes already; if it shows this only when an episode
             ends, by an "episode" in its info, the error comes then.
         TypeError: not a single environment (a vector environment, for example).
@@ -1495,15 +1479,6 @@ def _call_each(env: Any, method: str, *args: Any, **kwargs: Any) -> Sequence[Any
 
 
 # ----------------------------------------------------------------------- names of files and folders
-
-
-def noise_slug(noises: Sequence[str], rates: Sequence[float | str]) -> str:
-    """Return noises as a part of a file's name, "" for none; equal configurations have equal ones.
-
-    >>> noise_slug(["RandomUniformScaleReward(.5, 1.5)"], [0.05])
-    'p0.05_UniformScaleReward_0.5_1.5'
-    """
-    return Configuration.read(noises, rates).slug
 
 
 def run_name(
@@ -1721,8 +1696,8 @@ def _keys(keys: Any) -> Keys | None:
     if keys is None:
         return None
     found = (keys,) if isinstance(keys, str | int) else keys
-    of_one_kind = isinstance(found, tuple | list) and len({*map(type, found)} & {str, int}) == 1
-    if not of_one_kind or len({*map(type, found)}) > 1:
+    kinds = {type(key) for key in found} if isinstance(found, tuple | list) else set()
+    if kinds not in ({str}, {int}):
         raise ValueError(f"keys must be a tuple of names, or of indices of a Tuple, got {keys!r}")
     return tuple(sorted(set(found)))
 
@@ -1883,23 +1858,16 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and check the first observation."""
         self._steps = 0
-        try:
+        with self._calling("reset(seed=..., options=...) must return (observation, info)"):
             observation, info = self.env.reset(seed=seed, options=options)
-        except (TypeError, ValueError) as error:
-            wanted = "reset(seed=..., options=...) must return (observation, info)"
-            self._refuse_old_api(wanted, error)
-            raise
         return self._checked(observation), dict(info or {})
 
     def step(self, action: Any) -> Step:
         """Step the environment and check the observation and the reward."""
         self._steps += 1
-        try:
+        values = "(observation, reward, terminated, truncated, info)"
+        with self._calling(f"step() must return {values}"):
             observation, reward, terminated, truncated, info = self.env.step(copy.copy(action))
-        except (TypeError, ValueError) as error:
-            values = "(observation, reward, terminated, truncated, info)"
-            self._refuse_old_api(f"step() must return {values}", error)
-            raise
         number = math.nan
         if not isinstance(reward, str):
             with contextlib.suppress(TypeError, ValueError):  # of None, or of several numbers
@@ -1932,14 +1900,25 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             parts[path] = part
         return _replaced(observation, parts) if parts else observation
 
-    def _refuse_old_api(self, wanted: str, error: Exception) -> None:
-        """Raise SpaceError if a wrapper, not the environment's code, failed to call or unpack."""
-        *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-        place = frame.f_globals.get("__name__", "")
-        is_old = re.search("unpack|unexpected keyword", str(error))
-        if is_old and place.startswith(("gymnasium.core", "gymnasium.wrappers.", __name__)):
-            at = f"step {self._steps} of an episode"
-            raise SpaceError(f"{at}: the environment's {wanted}: {error}") from error
+    @contextlib.contextmanager
+    def _calling(self, wanted: str) -> Iterator[None]:
+        """Say what is wrong if a wrapper, not the environment's code, failed to call or unpack.
+
+        An exit becomes an error, because a run would seem to have ended well.
+        """
+        at = f"step {self._steps} of an episode: the environment"
+        try:
+            yield
+        except SystemExit as error:
+            text = f"{at} called sys.exit({error.code!r})"
+            raise RuntimeError(text).with_traceback(error.__traceback__) from None
+        except (TypeError, ValueError) as error:
+            *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+            place = frame.f_globals.get("__name__", "")
+            is_old = re.search("unpack|unexpected keyword", str(error))
+            if is_old and place.startswith(("gymnasium.core", "gymnasium.wrappers.", __name__)):
+                raise SpaceError(f"{at}'s {wanted}: {error}") from error
+            raise
 
     def _blame(self, what: str, value: Any, action: Any) -> None:
         """Stop at a value that is not finite, or rather at an action that was not, either."""

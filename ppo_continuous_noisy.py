@@ -447,7 +447,7 @@ def make_envs(args):
         fail("--cuda: PyTorch finds no GPU; leave it out to run on the CPU")
     try:
         env_id = noisy.canonical_env_id(args.env_id)
-        noise, noise_rate = noisy.canonical_noises(args.noise, args.noise_rate)
+        noise, noise_rate = noisy.Configuration.read(args.noise, args.noise_rate).texts
     except ValueError as error:
         fail(error)
     limit = {"max_episode_steps": args.max_episode_steps}
@@ -613,8 +613,8 @@ class Run:
             metrics = "eval/episodic_return_mean", "charts/episodic_return", "eval/success_rate"
             for summary in hparams(columns, dict.fromkeys(metrics, 0))[:2]:
                 self.writer.file_writer.add_summary(summary)
-        self.first_step, self.first_time = step, time.monotonic() - 1e-6
-        self.printed, self.saved_step = self.first_time, step
+        self.begun = step, time.monotonic() - 1e-6
+        self.printed, self.saved_step = self.begun[1], step
         self.learning, self.last_test = None, ""
         total = self.args.total_timesteps
         self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None)
@@ -672,11 +672,12 @@ class Run:
         step = max(step, self.bar.n)  # PPO logs a test under the step at which it fell due
         self.bar.update(step - self.bar.n)
         self.bar.n = step  # update() does nothing where there is no terminal
-        taken = step - self.first_step
-        if self.bar.disable and taken and now - self.printed > 10:
-            total, sps = self.bar.total, taken / (now - self.first_time)
-            eta = tqdm.format_interval((total - step) / sps)
-            # sweep/__main__.py reads this line
+        learned = self.learning and step > self.learning[0]
+        first_step, since = self.learning if learned else self.begun
+        if self.bar.disable and step > first_step and now - self.printed > 10:
+            total, sps = self.bar.total, (step - first_step) / (now - since)
+            eta = tqdm.format_interval((total - step) / sps) if learned else "?"
+            # analysis/folders.py reads this line
             say(f"step={step}/{total} sps={sps:.0f} {self.last_test}eta={eta}")
             self.printed = now
 

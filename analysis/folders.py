@@ -23,7 +23,7 @@ NOT_SETTINGS = {"env_id", "exp_name", "seed", "noise", "noise_rate"} | MAY_DIFFE
 ENV_ID = re.compile(r"(?:\w+(?:\.\w+)*:)?[\w./-]+")  # a module, and what Gymnasium takes for an id
 STOPPED = (129, 130, 138, 143)  # exit statuses of a run that was told to stop, by signal
 END = re.compile(r"# .* exit=(\d+)")  # the last line of run_one in sweep/executors.sh
-PROGRESS = re.compile(r"step=(\d+)/\d+ sps=(\d+)")  # the line of _show_progress in the scripts
+PROGRESS = re.compile(r"step=(\d+)/\d+ sps=(\d+)")  # the line of Run.log in the scripts
 
 
 class DamageError(ValueError):

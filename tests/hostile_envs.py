@@ -10,6 +10,7 @@ import multiprocessing
 import os
 import random
 import signal
+import sys
 
 import gymnasium as gym
 import numpy as np
@@ -98,6 +99,13 @@ class Broken(Hostile):
         return super().step(action)
 
 
+class Exits(Hostile):
+    """Ends the program, as pygame's examples do when their window is closed."""
+
+    def step(self, action):
+        sys.exit()
+
+
 class OfOldAPI(Hostile):
     """Returns four values."""
 
@@ -174,7 +182,7 @@ def register(entry_point, name="", **kwargs):
 
 for entry_point in (Hostile, Refused, Broken, OfOldAPI, ResetOfOldAPI, ResetOfNothing, OtherShape):
     register(entry_point)
-for entry_point in (NoInfo, BadClose, OwnCompiler):
+for entry_point in (NoInfo, BadClose, OwnCompiler, Exits):
     register(entry_point, workers=0)
 register(OwnSignals)
 register(Hostile, "HostileAlone", workers=0)

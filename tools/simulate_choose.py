@@ -42,6 +42,9 @@ def failing(rng, shape):
     return (returns + 4 * 0.3) / np.sqrt(1 + 4**2 * 0.3 * 0.7)
 
 
+DRAWS = {"normal": normal, "high peak": high_peak, "failing": failing}
+
+
 def equal_shares(noises, budget):
     """Return the schedule of Karnin et al., whose rounds share the budget equally."""
     rounds = schedule(noises, budget)
@@ -93,9 +96,9 @@ def simulate(noises, sizes, confirm, gain, draw=normal, spread=1.0, trials=TRIAL
     return good.mean(), (good & claims).mean(), claims.mean()
 
 
-def print_table(*rows):
-    """Print a table in Markdown, the first row being its head."""
-    print(tabulate(rows, "firstrow", "pipe", disable_numparse=True), end="\n\n", flush=True)
+def print_table(head, rows):
+    """Print a table in Markdown."""
+    print(tabulate(rows, head, "pipe", disable_numparse=True), end="\n\n", flush=True)
 
 
 def power(noises, sizes, confirm, draw=normal):
@@ -109,27 +112,21 @@ def main():
     raw = argparse.RawDescriptionHelpFormatter
     argparse.ArgumentParser(description=__doc__, formatter_class=raw).parse_args()
     columns = [f"{what}, +{gain:g} sd" for gain in GAINS for what in ("found", "confirmed")]
-    print_table(
-        ("noises", "returns", *columns),
-        *(
-            (n, draw.__name__.replace("_", " "), *power(n, schedule(n, 3 * n), 25, draw))
-            for n in (20, 90, 10, 4, 1)
-            for draw in (normal, high_peak, failing)
-        ),
-    )
+    rows = [
+        (n, name, *power(n, schedule(n, 3 * n), 25, draw))
+        for n in (20, 90, 10, 4, 1)
+        for name, draw in DRAWS.items()
+    ]
+    print_table(("noises", "returns", *columns), rows)
     rows = []
-    for draw in (normal, high_peak, failing):
+    for name, draw in DRAWS.items():
         claims = [simulate(1, [], 25, 0, draw, spread)[2] for spread in (1, 0.5, 2)]
-        rows.append(
-            (draw.__name__.replace("_", " "), *(f"{100 * share:.1f} %" for share in claims))
-        )
-    print_table(("returns", "same spread", "spread halved", "spread doubled"), *rows)
-    designs = (("equal, 3", equal_shares(90, 270), 10), ("equal, 2", equal_shares(90, 180), 25))
-    designs += (("√noises, 3", schedule(90, 270), 25),)
-    print_table(
-        ("runs of a round", "fresh seeds", *columns),
-        *((name, confirm, *power(90, sizes, confirm)) for name, sizes, confirm in designs),
-    )
+        rows.append((name, *(f"{100 * share:.1f} %" for share in claims)))
+    print_table(("returns", "same spread", "spread halved", "spread doubled"), rows)
+    designs = [("equal, 3", equal_shares(90, 270), 10), ("equal, 2", equal_shares(90, 180), 25)]
+    designs += [("√noises, 3", schedule(90, 270), 25)]
+    rows = [(name, confirm, *power(90, sizes, confirm)) for name, sizes, confirm in designs]
+    print_table(("runs of a round", "fresh seeds", *columns), rows)
 
 
 if __name__ == "__main__":

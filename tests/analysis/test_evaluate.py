@@ -3,6 +3,7 @@
 import csv
 import importlib
 import json
+import math
 import os
 import re
 import shutil
@@ -96,7 +97,7 @@ def test_clean_returns_are_those_of_the_last_evaluation(runs, algorithm):
     with open(run_dir / "eval.csv", newline="") as file:
         last = list(csv.DictReader(file))[-10:]
     rows = [(float(row["episodic_return"]), int(row["episodic_length"])) for row in last]
-    assert played == rows
+    assert [result[:2] for result in played] == rows
     assert len(set(rows)) > 1
 
 
@@ -261,10 +262,22 @@ def test_two_processes_on_one_run_lose_nothing(runs):
 
 def test_the_longer_of_two_results_is_kept(runs):
     [finished], _ = evaluate.find_runs([one(runs, "PPO")])
-    short, long = [(1.0, 1)], [(1.0, 1), (2.0, 2)]
+    short, long = [(1.0, 1, 1.0)], [(1.0, 1, 1.0), (2.0, 2, 0.0)]
     for results in (short, long, short):
         evaluate.store(finished, ("", "0.0", ""), results)
     assert evaluate.read_stored(finished) == {("", "0.0", ""): long}
+
+
+def test_success_that_some_conditions_do_not_tell_is_empty_there(runs):
+    [finished], _ = evaluate.find_runs([one(runs, "PPO")])
+    evaluate.store(finished, ("", "0.0", ""), [(0.1 + 0.2, 1, math.nan)])
+    evaluate.store(finished, ("", "0.0", "Heavy-v0"), [(2.0, 2, 1.0), (-3.0, 3, 0.0)])
+    assert (finished.folder / "robustness.csv").read_text().splitlines() == [
+        "noise,noise_rate,episode,episodic_return,episodic_length,success,environment",
+        ",0.0,0,0.30000000000000004,1,,",
+        ",0.0,0,2.0,2,1,Heavy-v0",
+        ",0.0,1,-3.0,3,0,Heavy-v0",
+    ]
 
 
 def test_training_again_deletes_nothing_of_a_write(runs, monkeypatch):
@@ -316,9 +329,9 @@ def test_the_table_of_known_returns(capsys):
     ]:
         # A third episode is stored and not asked for; the second number is the length.
         seen[a_run(noise, rate)] = {
-            ("", "0.0", ""): [(value, 1) for value in (*clean, 1000)],
-            ("A(1) + B(2)", "0.1 + 0.1", ""): [(value, 1) for value in (*noisy, 1000)],
-            ("C(3)", "0.5", ""): [(-value, 1) for value in (*noisy, 1000)],
+            ("", "0.0", ""): [(value, 1, math.nan) for value in (*clean, 1000)],
+            ("A(1) + B(2)", "0.1 + 0.1", ""): [(value, 1, math.nan) for value in (*noisy, 1000)],
+            ("C(3)", "0.5", ""): [(-value, 1, math.nan) for value in (*noisy, 1000)],
         }
     conditions = [
         BASELINE,
@@ -524,6 +537,7 @@ def test_a_bad_run_is_named_and_the_others_are_tested(runs, capsys, message, mon
     assert main(Args((one(runs, "TD3"), run_dir), episodes=1)) == 1
     out, err = capsys.readouterr()
     assert err.count("\n") == 1 and re.match(f"error: {run_dir}: .*{message}", err), err
+    assert (", line " in err) == (", line " in message)  # only a user's own error has a place
     assert len(stored(one(runs, "TD3"))) == 1 and "TD3" in out and "PPO" not in out
 
 

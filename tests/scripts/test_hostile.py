@@ -10,18 +10,24 @@ import random
 import re
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import commands
 import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from test_scripts import SCRIPTS, arguments, assert_one_line, evaluations, flags, policy, run
+from test_scripts import (
+    SCRIPTS,
+    arguments,
+    assert_one_line,
+    evaluations,
+    flags,
+    policy,
+    real_command,
+    run,
+)
 
 import evaluate
 import ppo_continuous_noisy as ppo
@@ -312,8 +318,10 @@ def test_actions_at_the_bounds_are_inside_the_space(algorithm, dtype, tmp_path):
 
 @pytest.mark.parametrize("name", ["HostileHalf", "HostileDouble"])
 @each_script
-def test_a_run_with_other_floats(algorithm, name, tmp_path):
-    run(algorithm, tmp_path, env_id=f"hostile_envs:{name}-v0")
+def test_a_run_with_other_floats_has_networks_of_float32(algorithm, name, tmp_path):
+    saved = policy(run(algorithm, tmp_path, env_id=f"hostile_envs:{name}-v0"))
+    networks = {name: tensor for name, tensor in saved.items() if "stats" not in name}
+    assert {tensor.dtype for tensor in networks.values()} == {torch.float32}
 
 
 @pytest.mark.parametrize(
@@ -347,12 +355,26 @@ def test_what_is_not_the_api_is_no_traceback(algorithm, tmp_path, log):
     assert_one_line(result.err, "step 1 of an episode: the environment returned an observation of")
 
 
-@pytest.mark.parametrize("name, reward", [("NoReward", "None"), ("TwoRewards", "[1.0, 1.0]")])
+@pytest.mark.parametrize(
+    ("env_id", "reward"),
+    [
+        ("hostile_envs:NoReward-v0", "None"),
+        ("hostile_envs:TwoRewards-v0", "[1.0, 1.0]"),
+        ("toy_envs:TextReward-v0", "'1.0'"),
+    ],
+)
 @one_script
-def test_what_is_no_reward_is_one_line(algorithm, name, reward, tmp_path):
+def test_what_is_no_reward_is_one_line(algorithm, env_id, reward, tmp_path):
     message = f"step 1 of an episode: the environment returned the reward {reward}"
     with pytest.raises(NotFiniteError, match=f"^{re.escape(message)}$"):
-        run(algorithm, tmp_path, env_id=f"hostile_envs:{name}-v0")
+        run(algorithm, tmp_path, env_id=env_id)
+
+
+@one_script
+def test_an_exit_of_the_environment_is_an_error_with_its_place(algorithm, tmp_path):
+    with pytest.raises(RuntimeError, match="^step 1 of an episode: .* sys.exit") as error:
+        run(algorithm, tmp_path, env_id="hostile_envs:Exits-v0")
+    assert Path(error.traceback[-1].path).name == "hostile_envs.py"
 
 
 @one_script
@@ -397,14 +419,6 @@ def test_the_cut_is_at_ten_thousand_steps():
 
 
 # WITHOUT MUJOCO
-
-
-def real_command(algorithm, *words, **environment):
-    path = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
-    line = [sys.executable, SCRIPTS[algorithm].__file__, *words]
-    environment = os.environ | {"PYTHONPATH": path} | environment
-    result = subprocess.run(line, capture_output=True, text=True, env=environment, timeout=240)
-    return SimpleNamespace(code=result.returncode, out=result.stdout, err=result.stderr)
 
 
 @pytest.mark.slow

@@ -64,12 +64,12 @@ def command(algorithm, *options, cwd=ROOT):
     return commands.run(SCRIPTS[algorithm].__file__, options, cwd=cwd)
 
 
-def real_command(algorithm, *options, **kwargs):
+def real_command(algorithm, *options, cwd=None, **environment):
     """Run a script as a user does."""
     path = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
     line = [sys.executable, SCRIPTS[algorithm].__file__, *map(str, options)]
-    env = os.environ | {"PYTHONPATH": path}
-    result = subprocess.run(line, capture_output=True, text=True, env=env, timeout=240, **kwargs)
+    env = os.environ | {"PYTHONPATH": path} | environment
+    result = subprocess.run(line, capture_output=True, text=True, cwd=cwd, env=env, timeout=240)
     return SimpleNamespace(code=result.returncode, out=result.stdout, err=result.stderr)
 
 
@@ -103,29 +103,6 @@ def policy(run_dir):
 
 
 # THE RUN
-
-
-@each_script
-def test_evaluation_does_not_touch_training(algorithm, tmp_path):
-    noise = {"noise": NOISES, "noise_rate": RATES}
-    off = run(algorithm, tmp_path / "off", eval_frequency=0, **noise)
-    on = run(algorithm, tmp_path / "on", eval_frequency=14, eval_episodes=2, **noise)
-    torch.testing.assert_close(policy(on), policy(off), rtol=0, atol=0)
-    assert {row[0] for row in evaluations(off)} == {60}
-    steps = {14, 28, 42, 60} if algorithm == "PPO" else {14, 28, 42, 56, 60}
-    assert {row[0] for row in evaluations(on)} == steps
-
-
-@each_script
-def test_a_seed_gives_one_eval_csv(algorithm, tmp_path):
-    noise = {"noise": NOISES, "noise_rate": RATES}
-    first, again, other = (
-        run(algorithm, tmp_path / name, seed=seed, **noise)
-        for name, seed in (("first", 1), ("again", 1), ("other", 2))
-    )
-    assert (first / "eval.csv").read_bytes() == (again / "eval.csv").read_bytes()
-    assert (first / "eval.csv").read_bytes() != (other / "eval.csv").read_bytes()
-    torch.testing.assert_close(policy(first), policy(again), rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("algorithm", ["SAC", "TD3"])
@@ -171,25 +148,8 @@ def test_the_test_environment_is_clean(algorithm, tmp_path):
 
 
 @one_script
-def test_evaluate(algorithm):
-    def policy(observation):
-        seen.append(observation)
-        return np.float32([0.1, 0.1])
-
-    script, seen = SCRIPTS[algorithm], []
-    env = script.make_env("toy_envs:Tiny-v0")
-    results = script.evaluate(policy, env, 4)
-    assert results.shape == (4, 3) and np.isnan(results[:, 2]).all()
-    assert results[:, 1].sum() == len(seen)
-    starts = [seen[int(i)] for i in (0, *results[:-1, 1].cumsum())]
-    expected = [env.reset(seed=1_000_000 + episode)[0] for episode in range(4)]
-    np.testing.assert_array_equal(starts, expected)
-    np.testing.assert_array_equal(script.evaluate(policy, env, 4), results)
-
-
-@pytest.mark.parametrize("env_id", ["toy_envs:IsSuccess-v0", "toy_envs:Success-v0"])
-@one_script
-def test_success_is_an_outcome(algorithm, env_id, tmp_path, capsys):
+def test_success_is_an_outcome(algorithm, tmp_path, capsys):
+    env_id = "toy_envs:IsSuccess-v0"
     run_dir = run(algorithm, tmp_path, env_id=env_id)
     env, solved = SCRIPTS[algorithm].make_env(env_id), []
     for episode in range(3):
@@ -311,28 +271,11 @@ def test_run_folder(algorithm, tmp_path, capsys):
     assert all(after[path] == before[path] for path in before.keys() - {lock})
 
 
-@one_script
-def test_other_arguments_need_overwrite(algorithm, tmp_path, capsys):
-    run_dir = run(algorithm, tmp_path)
-    before = (run_dir / "result.json").read_text()
-    with pytest.raises(SystemExit) as stopped:
-        run(algorithm, tmp_path, gamma=0.5)
-    message = capsys.readouterr().err
-    assert stopped.value.code == 2
-    assert message.count("\n") == 1 and message.startswith("error: ")
-    assert "gamma 0.99, not 0.5" in message
-    assert message.index("--exp-name") < message.index("--runs-dir") < message.index("--overwrite")
-    assert (run_dir / "result.json").read_text() == before
-    run(algorithm, tmp_path, gamma=0.5, overwrite=True)
-    assert json.loads((run_dir / "config.json").read_text())["args"]["gamma"] == 0.5
-    assert len(list(run_dir.glob("events*"))) == 1
-    assert len(evaluations(run_dir)) == 9
-
-
 @each_script
 def test_ten_tests_at_least_and_a_run_keeps_its_frequency(algorithm, tmp_path):
     script, short = SCRIPTS[algorithm], {"eval_frequency": None, "eval_episodes": 1}
     assert script.Args.eval_frequency is None
+    assert (50_000 if algorithm == "PPO" else 10_000) == script.EVAL_FREQUENCY  # at most
     folder = run(algorithm, tmp_path / "short", **short)
     made_with = json.loads((folder / "config.json").read_text())["args"]["eval_frequency"]
     assert made_with == 6  # a tenth of 60 steps; PPO tests once in 12 steps, a rollout
@@ -346,11 +289,6 @@ def test_ten_tests_at_least_and_a_run_keeps_its_frequency(algorithm, tmp_path):
     assert not script.train(args, stop=lambda: next(stops))
     again = run(algorithm, tmp_path / "stopped", **short)
     assert (again / "eval.csv").read_bytes() == (folder / "eval.csv").read_bytes()
-
-
-@each_script
-def test_the_default_frequency_of_a_long_run_is_that_of_the_paper(algorithm):
-    assert (50_000 if algorithm == "PPO" else 10_000) == SCRIPTS[algorithm].EVAL_FREQUENCY
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[]", '{"final_return_mean": 1'])
@@ -412,35 +350,6 @@ def test_observations_of_any_box_and_module_names(algorithm, tmp_path):
     assert env.observation_space.shape == (4,)
     act = SCRIPTS[algorithm].load_policy(run_dir, env)
     assert env.action_space.contains(act(env.reset()[0]))
-
-
-@each_script
-def test_networks_are_float32_where_actions_are_float64(algorithm, tmp_path):
-    saved = policy(run(algorithm, tmp_path, env_id="toy_envs:DoubleAction-v0"))
-    networks = {name: x for name, x in saved.items() if "stats" not in name}
-    assert {x.dtype for x in networks.values()} == {torch.float32}
-
-
-@pytest.mark.parametrize(
-    ("env_id", "observations", "actions", "horizon"),
-    [
-        ("HalfCheetah-v5", 17, 6, 1000),
-        ("Hopper-v5", 11, 3, 1000),
-        ("Humanoid-v5", 348, 17, 1000),
-        ("Pusher-v5", 23, 7, 100),
-        ("Walker2d-v5", 17, 6, 1000),
-    ],
-)
-def test_environments(env_id, observations, actions, horizon):
-    for script in SCRIPTS.values():
-        env = script.make_env(env_id)
-        assert env.observation_space.shape == (observations,)
-        assert env.action_space.shape == (actions,)
-        assert env.spec.max_episode_steps == horizon
-    if env_id in ("HalfCheetah-v5", "Pusher-v5"):  # the others fall over
-        zero = np.zeros(actions, np.float32)
-        lengths = script.evaluate(lambda observation: zero, env, 1)[:, 1]
-        assert lengths == [horizon]
 
 
 # THE THREE FILES
@@ -608,8 +517,6 @@ def test_a_time_limit_of_ones_own(algorithm, tmp_path, capsys):
     note = "RandomEarlyTermination(6) never acts: episodes have at most 5 steps"
     assert said.out.splitlines()[0] == note and "time limit" not in said.out and not said.err
     assert json.loads((run_dir / "config.json").read_text())["args"]["max_episode_steps"] == 5
-    run(algorithm, tmp_path / "none", env_id="toy_envs:NoLimit-v0")
-    assert capsys.readouterr().out.count("toy_envs:NoLimit-v0 declares no time limit") == 1
 
 
 @one_script
@@ -672,23 +579,16 @@ def test_a_rate_that_changes_follows_the_steps(algorithm, tmp_path):
 
 # BAD INPUT
 
-OFF_POLICY_ONLY = ("SAC", "TD3")
-BAD = [  # arguments, what the message names, of which scripts
-    ({"env_id": "NoSuchEnv-v0"}, "NoSuchEnv", SCRIPTS),
-    ({"env_id": "no_such_module:Env-v0"}, "no_such_module", SCRIPTS),
-    ({"env_id": ""}, "there is no environment ''", SCRIPTS),
-    ({"env_id": "Ant-v1"}, "Ant-v1", SCRIPTS),
-    ({"env_id": "no_such_package.module:Env-v0"}, "no_such_package", SCRIPTS),
-    ({"env_id": ".toy_envs:Tiny-v0"}, "'.toy_envs' is not a module name", SCRIPTS),
-    ({"env_id": "Hopper-v2"}, "moved to the gymnasium-robotics project", SCRIPTS),
-    ({"env_id": "Pusher-v4"}, "only supported on `mujoco<3`", SCRIPTS),
-    ({"exp_name": ""}, "--exp-name must be a name, not ''", SCRIPTS),
-    ({"exp_name": ".."}, "--exp-name must be a name, not '..'", SCRIPTS),
-    ({"env_id": "CartPole-v1"}, "Discrete(2)", SCRIPTS),
-    ({"env_id": "toy_envs:DiscreteAction-v0"}, "needs Box actions", SCRIPTS),
-    ({"env_id": "toy_envs:SequenceObservation-v0"}, "needs Box observations", SCRIPTS),
-    ({"env_id": "toy_envs:IntegerAction-v0"}, "needs Box actions of floats", SCRIPTS),
-    ({"env_id": "toy_envs:BooleanObservation-v0"}, "needs Box observations", SCRIPTS),
+BAD = [  # arguments, what the message names
+    ({"env_id": "NoSuchEnv-v0"}, "NoSuchEnv"),
+    ({"env_id": "no_such_module:Env-v0"}, "no_such_module"),
+    ({"env_id": "Hopper-v2"}, "moved to the gymnasium-robotics project"),
+    ({"env_id": "Pusher-v4"}, "only supported on `mujoco<3`"),
+    ({"env_id": "CartPole-v1"}, "needs Box actions of floats in one dimension; CartPole-v1 has"),
+    ({"exp_name": ".."}, "--exp-name must be a name, not '..'"),
+    ({"noise": ("RandomNoise(1)",), "noise_rate": (0.1,)}, "RandomMixupObservation"),
+    ({"noise": NOISES, "noise_rate": (0.1, 1.1)}, "1.1"),
+    ({"noise": NOISES}, "noise without a noise rate"),
     (
         {
             "env_id": "toy_envs:OneHotObservation-v0",
@@ -696,64 +596,28 @@ BAD = [  # arguments, what the message names, of which scripts
             "noise_rate": (0.1,),
         },
         "RandomDropoutObservation cannot perturb categories",
-        SCRIPTS,
     ),
-    ({"env_id": "toy_envs:Unbounded-v0"}, "bounded actions", OFF_POLICY_ONLY),
-    ({"noise": ("RandomNoise(1)",), "noise_rate": (0.1,)}, "RandomMixupObservation", SCRIPTS),
-    ({"noise": ("RandomUniformScaleReward(0.5)",), "noise_rate": (0.1,)}, "high", SCRIPTS),
-    ({"noise": ("RandomNormalNoisyReward(1, 2)",), "noise_rate": (0.1,)}, "scale", SCRIPTS),
-    ({"noise": ("RandomNormalNoisyReward(-1)",), "noise_rate": (0.1,)}, "scale", SCRIPTS),
-    ({"noise": ("__import__('os')",), "noise_rate": (0.1,)}, "unknown name", SCRIPTS),
-    ({"noise": NOISES, "noise_rate": (0.1, 1.1)}, "1.1", SCRIPTS),
-    ({"noise": NOISES, "noise_rate": (-0.1,)}, "-0.1", SCRIPTS),
-    ({"noise": NOISES, "noise_rate": (math.nan,)}, "nan", SCRIPTS),
-    ({"noise": NOISES, "noise_rate": (0.1, 0.2, 0.3)}, "noise rates: 3", SCRIPTS),
-    ({"noise": NOISES}, "noise without a noise rate", SCRIPTS),
-    ({"noise_rate": (0.1,)}, "a noise rate without noise", SCRIPTS),
-    ({"noise": NOISES, "noise_rate": ("1:2",)}, "1:2", SCRIPTS),
-    ({"noise": NOISES, "noise_rate": ("0.5:",)}, "0.5:", SCRIPTS),
-    ({"noise": NOISES, "noise_rate": ("a:b",)}, "a:b", SCRIPTS),
-    ({"max_episode_steps": 0}, "--max-episode-steps", SCRIPTS),
-    ({"torch_threads": 100_000}, "--torch-threads", SCRIPTS),
-    ({"torch_threads": 2**70}, "--torch-threads", SCRIPTS),
-    ({"target_kl": math.nan}, "--target-kl", ("PPO",)),
-    ({"env_id": "toy_envs:MatrixAction-v0"}, "in one dimension", SCRIPTS),
-    ({"seed": -1}, "--seed must be at least 0, not -1\n", SCRIPTS),
-    ({"seed": 2**64}, "--seed must be at most 9223372036854775807", SCRIPTS),
-    ({"gamma": 1.1}, "--gamma must be at most 1, not 1.1\n", SCRIPTS),
-    ({"gamma": -0.1}, "--gamma", SCRIPTS),
-    ({"gamma": math.nan}, "--gamma must be at least 0, not nan\n", SCRIPTS),
-    ({"total_timesteps": 0}, "--total-timesteps must be at least 1, not 0\n", SCRIPTS),
-    ({"total_timesteps": -5}, "--total-timesteps", SCRIPTS),
-    ({"eval_episodes": 0}, "--eval-episodes", SCRIPTS),
-    ({"eval_episodes": -1}, "--eval-episodes", SCRIPTS),
-    ({"eval_frequency": -1}, "--eval-frequency", SCRIPTS),
-    ({"checkpoint_frequency": 0}, "--checkpoint-frequency", SCRIPTS),
-    ({"torch_threads": 0}, "--torch-threads", SCRIPTS),
-    ({"torch_threads": -1}, "--torch-threads", SCRIPTS),
-    ({"batch_size": 0}, "--batch-size", OFF_POLICY_ONLY),
-    ({"batch_size": -1}, "--batch-size", OFF_POLICY_ONLY),
-    ({"buffer_size": 0}, "--buffer-size", OFF_POLICY_ONLY),
-    ({"buffer_size": -1}, "--buffer-size", OFF_POLICY_ONLY),
-    ({"learning_starts": -1}, "--learning-starts", OFF_POLICY_ONLY),
-    ({"policy_frequency": 0}, "--policy-frequency", OFF_POLICY_ONLY),
-    ({"tau": 1.5}, "--tau", OFF_POLICY_ONLY),
-    ({"target_network_frequency": 0}, "--target-network-frequency", ("SAC",)),
-    ({"alpha": -1.0}, "--alpha", ("SAC",)),
-    ({"q_lr": -1.0}, "--q-lr", ("SAC",)),
-    ({"q_lr": math.inf}, "--q-lr", ("SAC",)),
-    ({"learning_rate": -1.0}, "--learning-rate", ("TD3", "PPO")),
-    ({"noise_clip": -1.0}, "--noise-clip", ("TD3",)),
-    ({"num_steps": 0}, "--num-steps", ("PPO",)),
-    ({"num_steps": -1}, "--num-steps", ("PPO",)),
-    ({"num_steps": 61}, "--num-steps must be from 2 * --num-minibatches (6) to", ("PPO",)),
-    ({"num_minibatches": 0}, "--num-minibatches", ("PPO",)),
-    ({"num_minibatches": 13}, "--num-minibatches", ("PPO",)),
-    ({"update_epochs": 0}, "--update-epochs", ("PPO",)),
-    ({"gae_lambda": 1.1}, "--gae-lambda", ("PPO",)),
-    ({"clip_coef": -0.1}, "--clip-coef", ("PPO",)),
+    ({"max_episode_steps": 0}, "--max-episode-steps must be at least 1, not 0"),
+    ({"torch_threads": 100_000}, "--torch-threads must be at most"),
+    ({"seed": -1}, "--seed must be at least 0, not -1\n"),
+    ({"seed": 2**64}, "--seed must be at most 9223372036854775807"),
+    ({"total_timesteps": 0}, "--total-timesteps must be at least 1, not 0\n"),
+    ({"eval_frequency": -1}, "--eval-frequency must be at least 0"),
+    ({"gamma": 1.1}, "--gamma must be at most 1, not 1.1\n"),
+    ({"gamma": math.nan}, "--gamma must be at least 0, not nan\n"),
+    ({"gae_lambda": 1.1}, "--gae-lambda must be at most 1"),
+    ({"clip_coef": -0.1}, "--clip-coef must be at least 0"),
+    ({"target_kl": math.nan}, "--target-kl must be at least 0, not nan"),
+    ({"num_steps": 61}, "--num-steps must be from 2 * --num-minibatches (6) to"),
+    ({"num_minibatches": 13}, "--num-minibatches"),
 ]
-BAD_CASES = [pytest.param(*case, a) for *case, of in BAD for a in of]
+BAD_OF_OTHERS = [
+    ({"env_id": "toy_envs:Unbounded-v0"}, "SAC needs bounded actions", "SAC"),
+    ({"env_id": "toy_envs:Unbounded-v0"}, "TD3 needs bounded actions", "TD3"),
+    ({"learning_starts": -1}, "--learning-starts must be at least 0", "SAC"),
+    ({"tau": 1.5}, "--tau must be at most 1", "TD3"),
+]
+BAD_CASES = [*((*case, "PPO") for case in BAD), *BAD_OF_OTHERS]
 
 
 def assert_one_line(stderr, word):
@@ -805,10 +669,7 @@ def test_cuda_without_a_gpu(algorithm, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("algorithm", "options", "word"),
     [
-        ("SAC", ["--env-id", "NoSuchEnv-v0"], "NoSuchEnv"),
-        ("TD3", ["--env-id", "CartPole-v1"], "Discrete(2)"),
         ("PPO", ["--noise", "RandomUniformScaleReward(0.5)", "--noise-rate", "0.1"], "high"),
-        ("PPO", ["--gamma", "2"], "--gamma"),
         ("SAC", ["--runs-dir", __file__], "--runs-dir"),
     ],
 )
@@ -934,29 +795,13 @@ def test_a_bug_of_an_environment_is_shown(algorithm, env_id, error, note, tmp_pa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("source", "last_line"),
-    [
-        ("x = ][", "SyntaxError: "),
-        ("undefined_name", "NameError: "),
-        ("import no_such_module_at_all", "ModuleNotFoundError: "),
-    ],
-)
-def test_a_bug_of_an_environments_module_is_shown(source, last_line, tmp_path):
-    (tmp_path / "buggy_module.py").write_text(source)
+def test_a_bug_of_an_environments_module_is_shown(tmp_path):
+    (tmp_path / "buggy_module.py").write_text("undefined_name")
     result = command("PPO", "--env-id", "buggy_module:Env-v0", cwd=tmp_path)
     *traceback, error, note = result.err.splitlines()
     assert result.code == 1 and traceback[0] == "Traceback (most recent call last):"
-    assert error.startswith(last_line) and note == "(training stopped)"
+    assert error.startswith("NameError: ") and note == "(training stopped)"
     assert any("buggy_module.py" in line for line in traceback)
-
-
-@pytest.mark.slow
-def test_a_bug_in_a_step_is_shown_by_a_command(tmp_path):
-    result = command("PPO", "--env-id", "toy_envs:BuggyStep-v0", "--no-compile", cwd=tmp_path)
-    *traceback, error, note = result.err.splitlines()
-    assert (result.code, error, note) == (1, "KeyError: 'missing'", "(training stopped)")
-    assert traceback[0] == "Traceback (most recent call last):"
 
 
 # DIVERGENCE
@@ -981,12 +826,6 @@ def test_nan_at_the_end_is_no_result(algorithm, tmp_path):
         run(algorithm, tmp_path, eval_frequency=0, **late)
     [run_dir] = tmp_path.iterdir()
     assert not (run_dir / "result.json").exists()
-
-
-@one_script
-def test_a_reward_that_is_a_text_stops_the_run(algorithm, tmp_path):
-    with pytest.raises(NotFiniteError, match="step 1 of an episode: .* the reward '1.0'"):
-        run(algorithm, tmp_path, env_id="toy_envs:TextReward-v0")
 
 
 @each_script

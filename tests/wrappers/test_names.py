@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from noisy_wrappers import (
     WRAPPERS,
+    Configuration,
     canonical_env_id,
-    canonical_noises,
     reason,
     refusals,
     run_name,
@@ -99,9 +99,9 @@ def configurations(draw):
 @given(configurations(), configurations())
 def test_names_are_equal_exactly_if_the_configurations_are(one, two):
     names = [run_name("Hopper-v5", "sac", *configuration, 1) for configuration in (one, two)]
-    assert (names[0] == names[1]) == (canonical_noises(*one) == canonical_noises(*two))
+    assert (names[0] == names[1]) == (Configuration.read(*one) == Configuration.read(*two))
     assert all(re.fullmatch(r"[A-Za-z0-9._=+-]+", name) for name in names)
-    assert run_name("Hopper-v5", "sac", *canonical_noises(*one), 1) == names[0]
+    assert run_name("Hopper-v5", "sac", *Configuration.read(*one).texts, 1) == names[0]
 
 
 def test_canonical_env_id():

@@ -10,14 +10,13 @@ from gymnasium.wrappers import RecordEpisodeStatistics
 
 from noisy_wrappers import (
     WRAPPERS,
+    Configuration,
     NoiseWrapper,
     RandomEarlyTermination,
     RandomNormalNoisyObservation,
     RandomNormalNoisyReward,
     RandomUniformScaleReward,
-    canonical_noises,
     make_noisy,
-    noise_slug,
     noise_statistics,
     noise_wrappers,
     parse_noise,
@@ -157,25 +156,30 @@ def test_the_registry_is_complete():
     assert {text.split("(")[0] for text in NOISES} == set(WRAPPERS)
 
 
-def test_canonical_noises():
-    assert canonical_noises([], []) == ([], [])
-    assert canonical_noises([A], [0.5]) == (["RandomNormalNoisyReward(1.0)"], [0.5])
+def canonical(noises, rates):
+    """Return noises and rates as config.json holds them."""
+    return Configuration.read(noises, rates).texts
+
+
+def test_canonical_notation():
+    assert canonical([], []) == ([], [])
+    assert canonical([A], [0.5]) == (["RandomNormalNoisyReward(1.0)"], [0.5])
     names = ["RandomEarlyTermination(9)", "RandomNormalNoisyReward(1.0)"]
-    assert canonical_noises([A, C], [0.5]) == (names, [0.5, 0.5])  # dynamics noise comes first
-    assert canonical_noises([A, B, C], [0.5, 0, 1]) == (names, [1.0, 0.5])
-    assert canonical_noises([A, B], [0]) == ([], [])
-    assert canonical_noises([A, B], ["0:0", 0.0]) == ([], [])
-    assert canonical_noises([A, C], ["1:0", "0:.5"]) == (names, ["0.0:0.5", "1.0:0.0"])
-    assert canonical_noises([A], ["-0.0:0"]) == ([], [])
-    assert canonical_noises([A], ["0.50:.5"]) == (names[1:], [0.5])
-    assert canonical_noises([A, A], ["1:0"])[1] == ["1.0:0.0", "1.0:0.0"]
+    assert canonical([A, C], [0.5]) == (names, [0.5, 0.5])  # dynamics noise comes first
+    assert canonical([A, B, C], [0.5, 0, 1]) == (names, [1.0, 0.5])
+    assert canonical([A, B], [0]) == ([], [])
+    assert canonical([A, B], ["0:0", 0.0]) == ([], [])
+    assert canonical([A, C], ["1:0", "0:.5"]) == (names, ["0.0:0.5", "1.0:0.0"])
+    assert canonical([A], ["-0.0:0"]) == ([], [])
+    assert canonical([A], ["0.50:.5"]) == (names[1:], [0.5])
+    assert canonical([A, A], ["1:0"])[1] == ["1.0:0.0", "1.0:0.0"]
     action = "RandomNormalNoisyAction(1.0)"
-    assert canonical_noises([A, action, C], [0.1, 0.2, 0.3]) == (
+    assert canonical([A, action, C], [0.1, 0.2, 0.3]) == (
         ["RandomEarlyTermination(9)", action, "RandomNormalNoisyReward(1.0)"],
         [0.3, 0.2, 0.1],
     )
-    again = canonical_noises([B, A, C], [0.1, 0.2, 0.3])
-    assert canonical_noises(*again) == again
+    again = canonical([B, A, C], [0.1, 0.2, 0.3])
+    assert canonical(*again) == again
     for rate in again[1]:
         assert type(rate) is float
 
@@ -203,7 +207,7 @@ def test_canonical_noises():
 )
 def test_bad_noises_and_rates(noises, rates):
     for function in (
-        lambda: canonical_noises(noises, rates),
+        lambda: canonical(noises, rates),
         lambda: make_noisy(constant_env(), noises, rates),
         lambda: run_name("E", "x", noises, rates, 1),
     ):
@@ -214,7 +218,7 @@ def test_bad_noises_and_rates(noises, rates):
         assert lines[1:] == (signatures() if "Nothing" in str(noises) else [])
 
 
-@pytest.mark.parametrize("function", [canonical_noises, noise_slug, make_noisy])
+@pytest.mark.parametrize("function", [canonical, make_noisy])
 def test_noises_and_rates_are_lists(function):
     first = [constant_env()] if function is make_noisy else []
     for noises, rates, name in [(A, [0.5], "noises"), ([A], 0.5, "rates"), ([A], "1:0", "rates")]:
@@ -226,8 +230,8 @@ def test_noises_and_rates_are_lists(function):
 
 def test_numbers_and_arrays_of_numpy():
     rates = np.array([0.5, 0.0])
-    assert canonical_noises(np.array([A, B]), rates) == canonical_noises([A, B], [0.5, 0.0])
-    assert canonical_noises(np.array([A]), np.array([0.0])) == ([], [])
+    assert canonical(np.array([A, B]), rates) == canonical([A, B], [0.5, 0.0])
+    assert canonical(np.array([A]), np.array([0.0])) == ([], [])
     for half in (np.float64(0.5), np.float32(0.5), np.array(0.5)):
         env = RandomNormalNoisyReward(constant_env(), half, half, loc=half)
         assert (env.noise_rate, env.scale, env.loc) == (0.5, 0.5, 0.5)

@@ -11,13 +11,13 @@ from gymnasium.utils.env_checker import check_env
 
 from noisy_wrappers import (
     WRAPPERS,
+    Configuration,
     RandomDropoutObservation,
     RandomEarlyTermination,
     RandomMixupObservation,
     RandomNormalNoisyObservation,
     RandomNormalNoisyReward,
     RandomUniformNoisyReward,
-    canonical_noises,
     make_noisy,
     parse_noise,
     run_name,
@@ -114,7 +114,7 @@ def test_a_scale_for_each_dimension():
     for spec in (env.spec, gym.envs.registration.EnvSpec.from_json(env.spec.to_json())):
         assert spec.make().scale == env.scale
     check_env(env, skip_render_check=True)
-    noises, rates = canonical_noises([SCALES], [0.5])
+    noises, rates = Configuration.read([SCALES], [0.5]).texts
     assert noises == [SCALES]
     name = "p0.5_s1_NormalNoisyObservation_0.1_0.2_0.0_loc=1.0__E__x"
     assert run_name("E", "x", noises, rates, 1) == name
