@@ -838,7 +838,8 @@ def test_effects_of_many_configurations_are_a_heatmap(tmp_path):
     for seed in range(1, 8):
         write_run(tmp_path, [100], seed=seed)
         for i, rate in enumerate(rates):
-            write_run(tmp_path, [100 + (30 + seed) * (i == 0)], seed=seed, noise=SCALE, rate=rate)
+            effect = {0: 30 + seed, 1: -30 - seed}.get(i, 0)
+            write_run(tmp_path, [100 + effect], seed=seed, noise=SCALE, rate=rate)
     drawing = drawn_of(tmp_path)["effects_SAC"]
     figure, caption = drawing.draw(), drawing.caption
     [image] = figure.axes[0].images
@@ -846,7 +847,7 @@ def test_effects_of_many_configurations_are_a_heatmap(tmp_path):
     assert image.cmap(0.5)[:3] == pytest.approx((1, 1, 1), abs=0.01)  # white at zero
     assert "end at \u00b1 34 %" in caption
     dots = [line.get_xdata()[0] for line in figure.axes[0].lines]
-    assert [round(x - 0.36) for x in dots] == [0]
+    assert [round(x - 0.36) for x in dots] == [0, 1]  # better, worse
 
 
 def test_odd_sweeps_are_analysed_too(tmp_path):
@@ -986,6 +987,16 @@ def test_markdown_and_latex_tables(sweep):
     assert latex.count(r"\begin{longtable}") == latex.count(r"\end{longtable}") == 1
     body = re.sub(r"\\[%&_#]", "", latex)
     assert "%" not in body and "_" not in body and latex.isascii()
+
+
+def test_numbers_that_are_shown_as_one_have_the_digits_of_their_spread():
+    """That is half of an interval, or else a standard deviation."""
+    numbers = {"difference": [12.345, 12.345, NAN], "difference_low": [11.111, NAN, NAN]}
+    numbers |= {"difference_high": [13.579, NAN, NAN], "pooled_std": [0.1, 123.0, NAN]}
+    numbers |= {"baseline_mean": [12.345, 12.345, NAN], "baseline_std": [0.123, NAN, NAN]}
+    text = analysis.formatting.shown(analysis.formatting.Table("", pd.DataFrame(numbers), "", ""))
+    assert list(text["difference"]) == ["12.3 [11.1, 13.6]", "12", "\u2013"]
+    assert list(text["no noise"]) == ["12.35 \u00b1 0.12", "12.35 \u00b1 \u2013", "\u2013"]
 
 
 @pytest.mark.parametrize("number, width", [(1, 5.2), (2, 8), (3, 10), (5, 10)])

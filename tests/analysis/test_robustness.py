@@ -328,6 +328,7 @@ def test_a_clean_return_of_zero_is_compared_in_units_of_the_return(tmp_path, cap
     assert push.loc["", "p"] == pytest.approx(2 / 70**2)
     scores = push.filter(regex="percent$")
     assert scores.loc[["", "Maze-v0"]].isna().all(axis=None)
+    assert push.loc[["", "Maze-v0"], "worst_condition"].isna().all()
     assert scores.loc["Hopper-v5"].notna().all()
     text = capsys.readouterr().out
     assert f"all environments together, trained with {PUSH} at rate 1.00: more robust" in text
