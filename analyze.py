@@ -16,6 +16,7 @@ https://arxiv.org/abs/2305.02882; IQM and probability of improvement are those o
 
 import shutil
 import sys
+import textwrap
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -23,12 +24,12 @@ from typing import Literal
 import tyro
 
 from analysis.errors import fail, take_over_terminal
-from analysis.figures import figures, reword, write_figure
+from analysis.figures import figures, write_figure
 from analysis.folders import is_run
-from analysis.formatting import in_metric, text_table, wrapped, write_table
+from analysis.formatting import text_table, write_table
 from analysis.paper import read_paper
 from analysis.report import Results, write_report
-from analysis.robustness import read_robustness, robustness_sentences, robustness_tables
+from analysis.robustness import analyse_robustness, read_robustness
 from analysis.runs import SUCCESS, left_out, make_studies, read_choice, read_runs, version_notes
 from analysis.tables import all_equal_notes, family_notes, make_tables, success_table, table_of
 from analysis.verdicts import POINTS, clear_first, headlines, in_sentences, tally
@@ -59,62 +60,55 @@ class Args:
 def no_finished_run(runs_dir):
     """End with an error that says where there are finished runs, if that is below `runs_dir`."""
     paths = [*runs_dir.glob("*/*/result.json"), *runs_dir.glob("*/*/*/result.json")]
-    folders = sorted({path.parent.parent for path in paths if is_run(path.parent)})
-    if not folders:
-        fail(f"no finished run in {runs_dir}")
-    found = ", ".join(str(folder) for folder in folders)
-    fail(f"no finished run in {runs_dir}; there are some in {found}: name it with --runs-dir")
+    folders = sorted({str(path.parent.parent) for path in paths if is_run(path.parent)})
+    where = f"; there are some in {', '.join(folders)}: name it with --runs-dir" if folders else ""
+    fail(f"no finished run in {runs_dir}{where}")
 
 
 def verdicts_in_short(results):
     """Yield the tally of each study, then the sentences of clear verdicts."""
-    lines = headlines(results.tables["statistics"].frame, results.tables["best"].frame)
-    if not lines:
+    if not results.headlines:
         yield "There is no noise to compare with a baseline yet."
-    for line in lines:
+    for line in results.headlines:
         counts = ", ".join(f"{count} {word}" for word, count in line["counts"])
         yield f"{line['name']}: {line['tried']}: {counts}. {line['luck']}".strip()
-    first, rest = clear_first(results.sentences)
-    yield from first["sentence"]
-    if len(first) and len(rest):
-        yield f"Not shown here, but in the report: {tally(rest['verdict'])}."
+    yield from results.clear["sentence"]
+    if len(results.clear) and len(results.others):
+        yield f"Not shown here, but in the report: {tally(results.others['verdict'])}."
     yield from results.robustness
 
 
 def overview_of(runs, studies):
     """Say in words what was analysed."""
-    parts = [f"Finished runs: {(runs['status'] == 'finished').sum():,}."]
+    overview = f"Finished runs: {(runs['status'] == 'finished').sum():,}."
     for study in studies:
-        parts.append(
-            f"{study.name}: {study.steps[-1]:,} steps, seeds: {len(study.seeds)}, "
+        overview += (
+            f" {study.name}: {study.steps[-1]:,} steps, seeds: {len(study.seeds)}, "
             f"environments: {len(study.environments)}, "
             f"noise configurations: {len(study.returns) - 1}."
         )
-    return " ".join(parts)
+    return overview
 
 
 def write_results(out, results, latex):
-    """Write all tables, all figures and the report; return the names of tables and figures."""
+    """Write all tables, all figures and the report; note which others there are in `out`."""
     out.mkdir(parents=True, exist_ok=True)
     for table in results.tables.values():
         write_table(out, table, latex)
     drawn = list(figures(results.studies, results.tables))
     names = {*results.tables}
     for drawing in drawn:
-        write_figure(out, reword(drawing, results.studies[0].metric), latex)
-        names |= {drawing.name, drawing.narrow_name}
+        names |= write_figure(out, drawing, latex)
     write_report(out, results, drawn)
-    return names
-
-
-def left_by_others(out, names):
-    """Return the tables and figures in `out` that this analysis, with its names, did not write."""
-    return sorted({path.stem for path in [*out.glob("*.csv"), *out.glob("*.svg")]} - names)
+    old = sorted({path.stem for path in [*out.glob("*.csv"), *out.glob("*.svg")]} - names)
+    if old:
+        told = f"{out} also holds files that this analysis did not write: {', '.join(old)}"
+        results.notes.append(told)
 
 
 def terminal_width():
-    """Return the number of columns of the terminal, or 0 for a file or a pipe."""
-    return shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
+    """Return the number of columns of the terminal; a file or a pipe has no end."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
 
 
 def print_left_out(missing, width):
@@ -127,7 +121,8 @@ def print_results(out, results):
     width, tables = terminal_width(), results.tables
 
     def say(text):
-        print(wrapped(text, width))
+        style = {"break_long_words": False, "break_on_hyphens": False, "subsequent_indent": "  "}
+        print(textwrap.fill(text, width, **style))
 
     for line in verdicts_in_short(results):
         say(line)
@@ -150,7 +145,6 @@ def print_results(out, results):
 def analyse(args, runs, paper, choice):
     """Compute everything that is told of a frame of runs (read_runs); see main."""
     metric = args.metric.replace("_", " ")
-    unit = POINTS if metric == SUCCESS else ""
     missing, number = left_out(runs)
     studies, notes = make_studies(runs, metric)
     if not studies and make_studies(runs)[0]:
@@ -159,27 +153,28 @@ def analyse(args, runs, paper, choice):
         if len(missing):
             print_left_out(table_of("missing", missing), terminal_width())
         no_finished_run(args.runs_dir)
-    robustness, unreadable = read_robustness(args.runs_dir, runs, metric)
-    tables = {
-        name: replace(table, caption=in_metric(table.caption, metric))
-        for name, table in make_tables(studies, paper).items()
-    }
-    statistics = tables["statistics"].frame
-    if metric != SUCCESS:
+    tests, unreadable = read_robustness(args.runs_dir, runs, metric)
+    robustness_tables, robustness = analyse_robustness(tests, metric)
+    tables = make_tables(studies, paper) | robustness_tables
+    if metric == SUCCESS:
+        for name, table in tables.items():
+            tables[name] = replace(table, caption=table.caption.replace("return", metric))
+    else:
         tables |= success_table(make_studies(runs, SUCCESS)[0])
-    tables |= robustness_tables(robustness, metric)
     tables["missing"] = table_of("missing", missing)
     if choice is not None:
         tables["choice"] = table_of("choice", choice)
+    statistics = tables["statistics"].frame
+    unit = POINTS if metric == SUCCESS else ""
+    clear, others = clear_first(in_sentences(statistics, unit))
     counts = ", ".join(f"{n} {status}" for status, n in number.items())
-    robust = ()
-    if "robustness_score" in tables:
-        robust = robustness_sentences(tables["robustness_score"].frame, unit)
     return Results(
         studies=studies,
         tables=tables,
-        sentences=in_sentences(statistics, unit),
-        robustness=list(robust),
+        headlines=headlines(statistics, tables["best"].frame),
+        clear=clear,
+        others=others,
+        robustness=robustness,
         overview=overview_of(runs, studies),
         problems=f"Runs left out: {sum(number.values())} ({counts})." if number else "",
         notes=all_equal_notes(studies) + family_notes(statistics) + notes + unreadable,
@@ -205,13 +200,9 @@ def main(args):
     runs = read_runs(args.runs_dir)
     results = analyse(args, runs, paper, choice)
     try:
-        names = write_results(out, results, args.latex)
+        write_results(out, results, args.latex)
     except OSError as error:
         fail(f"--out: {error}")
-    old = left_by_others(out, names)
-    if old:
-        told = f"{out} also holds files that this analysis did not write: {', '.join(old)}"
-        results.notes.append(told)
     print_results(out, results)
     return int((runs["status"] == "corrupt").any())
 

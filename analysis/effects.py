@@ -7,28 +7,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from analysis.style import (
-    COLORS,
-    DIVERGING,
-    NARROW_WIDTH,
-    UNCLEAR,
-    WIDTH,
-    WIDTHS,
-    broken,
-    color_limit,
-    ink_on,
-)
+from analysis import style
 from analysis.verdicts import seeds_of
 from noisy_wrappers import rate_order
 
 MOST_IN_FOREST = 25  # configurations of a forest plot; more of them are a heatmap
-ENDS = ["difference", "difference_low", "difference_high"]
-LABEL = "difference from no noise in mean return"
-
-
-def of_environments(statistics):
-    """Keep the rows of single environments that have a difference from no noise."""
-    return statistics[statistics["difference"].notna() & (statistics["scope"] == "environment")]
 
 
 def heatmap_scale(rows):
@@ -37,21 +20,20 @@ def heatmap_scale(rows):
     All environments share a scale: percent, or standard deviations where one has no percent.
     """
     if rows["difference_percent"].notna().all():
-        return "difference_percent", "%", color_limit(rows["difference_percent"], 100)
-    return "effect_size", "standard deviations", color_limit(rows["effect_size"], 5)
+        return "difference_percent", "%", style.color_limit(rows["difference_percent"], 100)
+    return "effect_size", "standard deviations", style.color_limit(rows["effect_size"], 5)
 
 
-def effects_caption(study, statistics):
+def effects_caption(study, rows):
     """Say what effects_figure shows."""
-    rows = of_environments(statistics)
-    clear = rows["verdict"].isin(COLORS).any()
+    clear = rows["verdict"].isin(style.COLORS).any()
+    text = f"{study.name}: difference from no noise in mean final {study.metric}"
     if len(configurations(rows)) > MOST_IN_FOREST:
         _, unit, limit = heatmap_scale(rows)
-        text = f"{study.name}: difference from no noise in mean final return ({unit}). "
-        text += "A dot marks a clear verdict. " if clear else "No verdict is clear. "
-        return f"{text}The colours end at \u00b1 {limit:.3g} {unit}."
-    text = f"{study.name}: difference from no noise in mean final return, with its 95 % interval "
-    text += "from five seeds on, by noise and rate; every environment has its own scale. "
+        dots = "A dot marks a clear verdict." if clear else "No verdict is clear."
+        return f"{text} ({unit}). {dots} The colours end at \u00b1 {limit:.3g} {unit}."
+    text += ", with its 95 % interval from five seeds on, by noise and rate; every environment has "
+    text += "its own scale. "
     text += "Filled marks are clear verdicts" if clear else "No verdict is clear"
     return f"{text}. n: seeds (with / without noise)."
 
@@ -62,76 +44,67 @@ def configurations(rows):
     return sorted(configs, key=lambda config: (config[0], rate_order(config[1])))
 
 
-def effects_figure(statistics, narrow=False):
+def effects_figure(rows, metric, narrow=False):
     """Draw the effect of every noise, a panel for each environment with what was tried there.
 
-    statistics: the tested rows of one study. Up to MOST_IN_FOREST noises and rates are a forest
-    plot; more are heatmaps of noises by rates. The panels stand below each other if the figure
-    shall be narrow, otherwise in two columns.
+    rows: those of statistics in which environments of one study were compared. Up to MOST_IN_FOREST
+    noises and rates are a forest plot; more are heatmaps of noises by rates. The panels stand below
+    each other if the figure shall be narrow, otherwise in two columns.
     """
-    rows = of_environments(statistics)
-    draw = heat_panel if len(configurations(rows)) > MOST_IN_FOREST else forest_panel
-    panels = dict(list(rows.groupby("environment")))
+    is_forest = len(configurations(rows)) <= MOST_IN_FOREST
+    scale = column, unit, limit = heatmap_scale(rows)
+    panels = list(rows.groupby("environment"))
+    labels = [labels_of(panel, is_forest) for _, panel in panels]
     across = 1 if narrow else min(2, len(panels))
-    width = NARROW_WIDTH if narrow else WIDTHS[0] if across == 1 else WIDTH
-    lines = [len("\n".join(labels_of(panel, draw)).split("\n")) for panel in panels.values()]
+    width = style.WIDTH if across == 2 else style.WIDTHS[0]
+    width = style.NARROW_WIDTH if narrow else width
+    lines = [len("\n".join(names).split("\n")) for names in labels]
     lines = [max(lines[i : i + across]) for i in range(0, len(lines), across)]
     heights = [0.75 + (0.18 if narrow else 0.22) * number for number in lines]
     fig = Figure(figsize=(width, 0.4 + sum(heights)), layout="constrained")
-    axes = fig.subplots(len(heights), across, squeeze=False, height_ratios=heights).ravel()
-    for ax in axes[len(panels) :]:
-        ax.remove()
-    for ax, (environment, panel) in zip(axes, panels.items(), strict=False):
-        image = draw(ax, panel, heatmap_scale(rows), (width - 2 * across) / across)
-        labels = labels_of(panel, draw)
-        ax.set_yticks(range(len(labels)), labels, fontsize=6.5 if narrow else 8)
+    grid = fig.add_gridspec(len(heights), across, height_ratios=heights)
+    axes = [fig.add_subplot(grid[i]) for i in range(len(panels))]
+    for ax, (environment, panel), names in zip(axes, panels, labels, strict=True):
+        if is_forest:
+            forest_panel(ax, panel, (width - 2 * across) / across)
+        else:
+            image = heat_panel(ax, panel, scale)
+        ax.set_yticks(range(len(names)), names, fontsize=6.5 if narrow else 8)
         ax.set_title(environment, fontsize=9)
-    write_below = fig.supxlabel if across > 1 else axes[len(panels) - 1].set_xlabel
-    write_below(LABEL if draw is forest_panel else "noise rate", fontsize=9)
-    if draw is forest_panel:
-        return fig
-    column, unit, limit = heatmap_scale(rows)
-    beyond = "both" if rows[column].abs().max() > limit else "neither"
-    place = {"location": "bottom", "fraction": 0.05} if narrow else {"fraction": 0.02}
-    text = {"extend": beyond, "label": f"{LABEL} ({unit})"}
-    fig.colorbar(image, ax=list(axes[: len(panels)]), pad=0.01, **text, **place)
+    write_below = fig.supxlabel if across > 1 else axes[-1].set_xlabel
+    quantity = f"difference from no noise in mean {metric}"
+    write_below(quantity if is_forest else "noise rate", fontsize=9)
+    if not is_forest:
+        place = {"location": "bottom", "fraction": 0.05} if narrow else {"fraction": 0.02}
+        place["extend"] = "both" if rows[column].abs().max() > limit else "neither"
+        fig.colorbar(image, ax=axes, pad=0.01, label=f"{quantity} ({unit})", **place)
     return fig
 
 
-def labels_of(rows, draw):
+def labels_of(rows, is_forest):
     """Return what stands beside the lines of a panel, broken where it is long."""
-    labels = [f"{broken(noise)}, {broken(rate)}" for noise, rate in configurations(rows)]
-    if draw is heat_panel:
-        labels = [broken(noise) for noise in sorted(set(rows["noise"]))]
-    return [re.sub(r"(?<=\w)\((?=.{10})", "\n(", label) for label in labels]
+    if is_forest:
+        labels = [f"{noise}, {rate}" for noise, rate in configurations(rows)]
+    else:
+        labels = sorted(set(rows["noise"]))
+    return [re.sub(r"(?<=\w)\((?=.{10})", "\n(", style.broken(label)) for label in labels]
 
 
-def scale_forest(ax, rows, inches):
-    """Set the scale of a panel of a forest plot, with room for n at its right.
+def forest_panel(ax, rows, inches):
+    """Draw one environment's differences with intervals, and n at the side.
 
     inches: how wide the panel is, roughly.
     """
-    ends = rows[ENDS].astype(float)
-    low, high = min(0, ends.min(axis=None)), max(0, ends.max(axis=None))
-    wide = (high - low) or 1
-    margin = 0.5 / inches  # of the panel's width
-    ax.set_xlim(low - 0.06 * wide, high + wide * (0.06 + margin / (1 - margin)))
-    ticks = MaxNLocator(nbins=max(2, min(6, int(inches / 0.6)))).tick_values(low, high)
-    ax.set_xticks([tick for tick in ticks if low <= tick <= high])
-
-
-def forest_panel(ax, rows, _, inches):
-    """Draw one environment's differences with intervals, and n at the side."""
     configs = configurations(rows)
     ax.axvline(0, color="black", linewidth=0.8)
     ax.grid(axis="y", color="0.92")
     ax.set_axisbelow(True)
     for row in rows.itertuples():
         y = configs.index((row.noise, row.noise_rate))
-        color = COLORS.get(row.verdict, UNCLEAR)
+        color = style.COLORS.get(row.verdict, style.UNCLEAR)
         if pd.notna(row.difference_low):
             ax.hlines(y, row.difference_low, row.difference_high, color=color, linewidth=1.5)
-        face = color if row.verdict in COLORS else "white"
+        face = color if row.verdict in style.COLORS else "white"
         look = {"color": color, "markerfacecolor": face, "markersize": 6, "zorder": 3}
         ax.plot(row.difference, y, "o", **look)
         side = {"transform": ax.get_yaxis_transform(), "ha": "right", "va": "center"}
@@ -140,25 +113,27 @@ def forest_panel(ax, rows, _, inches):
     ax.text(1, 1, "n", color="0.35", fontsize=7, **side)
     ax.tick_params(axis="y", length=0)
     ax.set_ylim(len(configs) - 0.5, -0.5)  # the first noise on top
-    scale_forest(ax, rows, inches)
+    ends = rows[["difference", "difference_low", "difference_high"]].astype(float)
+    low, high = min(0, ends.min(axis=None)), max(0, ends.max(axis=None))
+    wide = (high - low) or 1
+    margin = 0.5 / inches  # of the panel's width, for n
+    ax.set_xlim(low - 0.06 * wide, high + wide * (0.06 + margin / (1 - margin)))
+    ticks = MaxNLocator(nbins=max(2, min(6, int(inches / 0.6)))).tick_values(low, high)
+    ax.set_xticks([tick for tick in ticks if low <= tick <= high])
 
 
-def heat_panel(ax, rows, scale, _):
+def heat_panel(ax, rows, scale):
     """Draw one environment's differences, noises by rates, dots where the verdict is clear."""
     column, unit, limit = scale
-    noises = sorted(set(rows["noise"]))
     rates = sorted(set(rows["noise_rate"]), key=rate_order)
-
-    def table(values):
-        found = rows.assign(value=values).pivot(index="noise", columns="noise_rate", values="value")
-        return found.reindex(index=noises, columns=rates)
+    grid = rows.pivot(index="noise", columns="noise_rate", values=[column, "verdict"])
 
     def number(value):
         text = f"{value:+z.{0 if unit == '%' else 1}f}" if abs(value) < 1000 else f"{value:+.0e}"
         return text if len(rates) <= 8 else ""  # there is no room
 
-    dots = table(rows["verdict"].isin(COLORS)).eq(True)
-    image = heatmap(ax, table(rows[column].astype(float)), limit, number, dots, 6)
+    dots = grid["verdict"][rates].isin([*style.COLORS])
+    image = heatmap(ax, grid[column][rates].astype(float), limit, number, dots, 6)
     ax.tick_params(axis="x", labelsize=7, rotation=90 if len(rates) > 4 else 0)
     return image
 
@@ -168,11 +143,11 @@ def heatmap(ax, grid, limit, number, dots, size):
 
     The colours end at \u00b1 limit. dots: as grid, of bool; size: of the numbers, in points.
     """
-    image = ax.imshow(grid, cmap=DIVERGING, vmin=-limit, vmax=limit, aspect="auto")
+    image = ax.imshow(grid, cmap=style.DIVERGING, vmin=-limit, vmax=limit, aspect="auto")
     for (i, j), value in np.ndenumerate(grid.to_numpy()):
         if np.isfinite(value):
-            look = {"ha": "center", "va": "center", "color": ink_on(value, limit)}
-            ax.text(j, i, number(value), fontsize=size, **look)
+            ink = "white" if value > 0.7 * limit else "black"  # only the blue is dark
+            ax.text(j, i, number(value), fontsize=size, ha="center", va="center", color=ink)
         if dots.iat[i, j]:
             ax.plot(j + 0.36, i - 0.28, "o", color="black", markersize=2.5)
     ax.set_xticks(range(len(grid.columns)), grid.columns)

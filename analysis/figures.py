@@ -1,34 +1,25 @@
 """The figures of analyze.py."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import product
+from functools import partial
+from itertools import groupby, product
 
-import matplotlib
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from matplotlib.text import Text
 
+from analysis import style
 from analysis.effects import configurations, effects_caption, effects_figure, heatmap
-from analysis.formatting import in_metric, slug
-from analysis.runs import STUDY, SUCCESS, rows_of, study_name
-from analysis.style import (
-    COLORS,
-    HEIGHT,
-    NARROW_WIDTH,
-    STYLE,
-    UNCLEAR,
-    WIDTH,
-    WIDTHS,
-    broken,
-    color_limit,
-    line_style,
-)
+from analysis.formatting import slug
+from analysis.runs import KEYS, STUDY, SUCCESS, rows_of, study_name
 from analysis.verdicts import percent, seeds_of
 from noisy_wrappers import BASELINE, rate_order, rounded
 
-matplotlib.rcParams.update(STYLE)
+ONE_STD = "\u00b1 one standard deviation"
+RETURN_LABELS = {"return": "test return\n(sum of rewards per episode)"}
+RETURN_LABELS[SUCCESS] = "test success rate (%)"
 
 
 @dataclass
@@ -37,64 +28,45 @@ class Drawing:
 
     kind: str  # effects, best_curves, curves, parameters or robustness
     label: str  # what sets it apart from others of its kind
-    figure: Figure
     caption: str
-    narrow: Figure | None = None  # the same for narrow windows, where there are many panels
+    draw: Callable[..., Figure]  # draw(), or draw(narrow=True) for a telephone
+    has_narrow: bool = False  # where there are many panels
 
     @property
     def name(self):
         """The name of its files."""
         return f"{self.kind}_{slug(self.label)}"
 
-    @property
-    def narrow_name(self):
-        """The name of the file of the narrow figure."""
-        return f"{self.name}_narrow"
-
 
 def figures(studies, tables):
     """Yield a Drawing for every figure, in the order of the report."""
-    statistics = tables["statistics"].frame
     for study in studies:
-        compared = statistics[rows_of(statistics, study.key) & statistics["verdict"].notna()]
-        summary = tables[f"summary_{study.algorithm}"].frame
-        summary = summary[rows_of(summary, study.key)]
-        if len(compared):
-            drawing = Drawing("effects", study.name, None, effects_caption(study, compared))
-            yield in_both_widths(drawing, compared["environment"], effects_figure, compared)
-        best = tables["best"].frame
-        best = best[rows_of(best, study.key)]
-        noises = sorted({config.noise for config in study.returns if not config.is_baseline})
-        if len(best) and len(study.returns) > 2:
-            drawing = Drawing("best_curves", study.name, None, best_curves_caption(study))
-            what = best_curves_figure, study, best, compared
-            yield in_both_widths(drawing, best["environment"], *what)
-        for noise in noises or [""]:
-            yield curves_figure(study, noise)
-        single = [config for config in study.returns if len(config.noises) == 1]
-        for wrapper in sorted({config.wrappers[0] for config in single}):
-            variants = sorted({config.noise for config in single if config.wrappers == [wrapper]})
-            if len(variants) > 1:
-                yield ablation_figure(study, summary, wrapper, variants)
+        yield from comparison_figures(study, tables["statistics"].frame, tables["best"].frame)
+        for noise in sorted({config.noise for config in study.returns} - {""}) or [""]:
+            title = f"{study.name}, {noise or 'no noise'}"
+            caption = f"{title}: learning curves, mean over n seeds, shaded {ONE_STD}."
+            yield Drawing("curves", title, caption, partial(curves_figure, study, noise))
+        yield from ablation_figures(study, tables[f"summary_{study.algorithm}"].frame)
     if "robustness" in tables:
         yield from robustness_figures(tables["robustness"].frame, studies[0].metric)
 
 
-def reword(drawing, metric):
-    """Write of success rates, if they are the metric of a Study."""
-    drawing.caption = in_metric(drawing.caption, metric)
-    for figure in filter(None, (drawing.figure, drawing.narrow)):
-        for text in figure.findobj(Text):
-            text.set_text(in_metric(text.get_text(), metric))
-    return drawing
-
-
-def in_both_widths(drawing, environments, draw, *what):
-    """Complete a Drawing with draw(*what), narrow as well if there are several environments."""
-    drawing.figure = draw(*what)
-    if environments.nunique() > 1:
-        drawing.narrow = draw(*what, narrow=True)
-    return drawing
+def comparison_figures(study, statistics, best):
+    """Yield the Drawing of a study's effects, and that of the curves of its best noises."""
+    compared = statistics["verdict"].notna() & (statistics["scope"] == "environment")
+    compared = statistics[rows_of(statistics, study.key) & compared]
+    several = compared["environment"].nunique() > 1
+    if len(compared):
+        draw = partial(effects_figure, compared, study.metric)
+        yield Drawing("effects", study.name, effects_caption(study, compared), draw, several)
+    if len(compared) and len(study.returns) > 2:
+        caption = (
+            f"{study.name}: test {study.metric} without noise (black) and with the best noise of "
+            f"each environment, mean over n seeds, shaded {ONE_STD}. "
+            "The best of many looks better than it is."
+        )
+        draw = partial(best_curves_figure, study, best[KEYS].merge(compared))
+        yield Drawing("best_curves", study.name, caption, draw, several)
 
 
 def span(numbers):
@@ -103,30 +75,27 @@ def span(numbers):
     return f"{low}" if low == high else f"{low} to {high}"
 
 
-def panels(environments, labels, narrow=False):
+def panels(environments, labels, metric, below, narrow=False):
     """Make one panel per environment, three in a row, above a legend with as many labels.
 
-    A narrow figure, for a telephone, has one panel in a row.
+    below: the label of all x axes. A narrow figure, for a telephone, has one panel in a row.
     """
     across = 1 if narrow else min(3, len(environments))
-    width = NARROW_WIDTH if narrow else WIDTHS[across - 1]
+    width = style.NARROW_WIDTH if narrow else style.WIDTHS[across - 1]
     down = -(-len(environments) // across)
     columns = max(1, min(4, int(13 * width / max(map(len, labels)))))
     legend = 0.2 + 0.2 * -(-len(labels) // columns)
-    height = max(HEIGHT, 2.4 * down + legend)
+    height = max(style.HEIGHT, 2.4 * down + legend)
     fig = Figure(figsize=(width, height))
     # Placed by hand: matplotlib's automatic layouts take as long as the drawing itself.
     bottom, top = (legend + 0.45) / height, 1 - 0.3 / height
     fig.subplots_adjust(0.9 / width, bottom, 1 - 0.3 / width, top, wspace=0.25, hspace=0.45)
-    axes = fig.subplots(down, across, squeeze=False).ravel()
-    for ax in axes[len(environments) :]:
-        ax.remove()
-    for ax, env in zip(axes, environments, strict=False):
-        ax.set_title(env)
+    axes = [fig.add_subplot(down, across, i + 1) for i in range(len(environments))]
+    for ax, env in zip(axes, environments, strict=True):
+        ax.set(title=env, xlabel=below)
         ax.yaxis.get_major_locator().set_params(nbins=5)
         if ax.get_subplotspec().is_first_col():
-            ax.set_ylabel("test return\n(sum of rewards per episode)")
-    axes = axes[: len(environments)]
+            ax.set_ylabel(RETURN_LABELS[metric])
 
     def add_legend():
         handles = axes[0].get_legend_handles_labels()[0]
@@ -135,60 +104,48 @@ def panels(environments, labels, narrow=False):
     return fig, axes, add_legend
 
 
-def best_curves_caption(study):
-    """Say what best_curves_figure shows."""
-    return (
-        f"{study.name}: test return without noise (black) and with the best noise of each "
-        "environment, mean over n seeds, shaded \u00b1 one standard deviation. "
-        "The best of many looks better than it is."
-    )
+def best_curves_figure(study, best, narrow=False):
+    """Draw no noise against the best noise of each environment: means and standard deviations.
 
-
-def best_curves_figure(study, best, statistics, narrow=False):
-    """Draw no noise against the best noise of each environment: means and standard deviations."""
+    best: the rows of statistics of these noises.
+    """
     labels = ["no noise", "best noise, in the colour of its verdict"]
-    environments = list(best["environment"])
-    fig, axes, _ = panels(environments, labels, narrow)
+    steps, below = training_steps(study)
+    fig, axes, _ = panels(list(best["environment"]), labels, study.metric, below, narrow)
     # Three lines of title above each panel
     fig.subplots_adjust(top=1 - 0.6 / fig.get_figheight(), hspace=0.75)
-    unit, word = time_unit(study)
     configs = {(config.noise, config.noise_rate): config for config in study.returns}
-    verdicts = statistics[statistics["scope"] == "environment"]
-    verdicts = verdicts.set_index(["environment", "noise", "noise_rate"])["verdict"]
     for ax, row in zip(axes, best.itertuples(), strict=True):
         e = study.environments.index(row.environment)
-        verdict = verdicts.get((row.environment, row.noise, row.noise_rate), "")
-        pair = {"black": BASELINE, COLORS.get(verdict, UNCLEAR): configs[row.noise, row.noise_rate]}
+        color = style.COLORS.get(row.verdict, style.UNCLEAR)
+        pair = {"black": BASELINE, color: configs[row.noise, row.noise_rate]}
         for color, config in pair.items():
-            mean, std = mean_and_std(study.returns[config][:, :, e])
-            ax.plot(study.steps / unit, mean, color=color, linewidth=1.6)
-            shade(ax, study.steps / unit, mean, std, color, 0.12)
+            curves = study.returns[config][:, :, e]
+            curve(ax, steps, *mean_and_std(curves), 0.12, color=color, linewidth=1.6)
         noise = row.noise if len(row.noise) < 50 else f"{row.noise[:47]}..."
-        lines = f"{noise}, {row.noise_rate}\n{verdict} (n = {seeds_of(row.n, row.n_baseline)})"
+        lines = f"{noise}, {row.noise_rate}\n{row.verdict} (n = {seeds_of(row.n, row.n_baseline)})"
         ax.set_title(f"{row.environment}\n{lines}", fontsize=7.5)
-        ax.set_xlabel(f"training steps ({word})")
-    handles = [axes[0].lines[0], Rectangle((0, 0), 1, 1, color=UNCLEAR)]
-    for handle, label in zip(handles, labels, strict=True):
-        handle.set_label(label)
+    handles = [axes[0].lines[0], Rectangle((0, 0), 1, 1, color=style.UNCLEAR)]
     fig.legend(handles, labels, loc="lower center", ncols=1 if narrow else 2, frameon=False)
     return fig
 
 
-def time_unit(study):
-    """Return the unit of the axis of training steps, and its name."""
-    return (1e6, "millions") if study.steps[-1] >= 1e6 else (1e3, "thousands")
+def training_steps(study):
+    """Return the steps of the tests in thousands or millions, and the label of their axis."""
+    unit, word = (1e6, "millions") if study.steps[-1] >= 1e6 else (1e3, "thousands")
+    return study.steps / unit, f"training steps ({word})"
 
 
 def mean_and_std(curves):
     """Return mean and sample standard deviation (steps,) of the runs there are (steps x seeds)."""
-    curves = curves[:, np.isfinite(curves[-1])]
-    mean = curves.mean(axis=1) if curves.size else np.full(len(curves), np.nan)
-    return mean, curves.std(axis=1, ddof=1) if curves.shape[1] > 1 else 0
+    curves = pd.DataFrame(curves)
+    return curves.mean(axis=1), curves.std(axis=1).fillna(0)
 
 
-def shade(ax, x, mean, std, color, alpha=0.07):
-    """Shade one standard deviation around a line."""
-    ax.fill_between(x, mean - std, mean + std, color=color, alpha=alpha, linewidth=0)
+def curve(ax, x, mean, std, alpha=0.07, **look):
+    """Draw a line, and shade one standard deviation around it."""
+    ax.plot(x, mean, **look)
+    ax.fill_between(x, mean - std, mean + std, color=look["color"], alpha=alpha, linewidth=0)
 
 
 def curves_figure(study, noise):
@@ -204,52 +161,58 @@ def curves_figure(study, noise):
     for config, n in zip(configs, counts[:, tried], strict=True):
         name = "no noise" if config.is_baseline else f"rate {config.noise_rate}"
         labels.append(f"{name} (n = {span(n[n > 0])})")  # in the panels that have the line
-    fig, axes, add_legend = panels([study.environments[e] for e in tried], labels)
-    unit, word = time_unit(study)
-    x, every = study.steps / unit, max(1, len(study.steps) // 8)
+    environments = [study.environments[e] for e in tried]
+    steps, below = training_steps(study)
+    fig, axes, add_legend = panels(environments, labels, study.metric, below)
+    every = max(1, len(steps) // 8)
     for (e, ax), (i, config) in product(zip(tried, axes, strict=True), enumerate(configs)):
-        mean, std = mean_and_std(study.returns[config][:, :, e])
-        color, line, marker = line_style(i, len(configs))
-        width = 1.8 if config == BASELINE else 1.1
-        marks = {"marker": marker, "markevery": (min(i, every - 1), every), "markersize": 4.5}
-        ax.plot(x, mean, line, color=color, linewidth=width, label=config.noise_rate, **marks)
-        shade(ax, x, mean, std, color)
-        ax.set_xlabel(f"training steps ({word})")
+        look = style.line_style(i, len(configs)) | {"linewidth": 1.1 if i else 1.8}
+        look |= {"markevery": (min(i, every - 1), every), "markersize": 4.5, "label": labels[i]}
+        curve(ax, steps, *mean_and_std(study.returns[config][:, :, e]), **look)
     add_legend()
-    title = f"{study.name}, {noise or 'no noise'}"
-    caption = f"{title}: learning curves, mean over n seeds, shaded \u00b1 one standard deviation."
-    return Drawing("curves", title, fig, caption)
+    return fig
 
 
-def ablation_figure(study, summary, wrapper, noises):
+def ablation_figures(study, summary):
+    """Yield a Drawing for every wrapper that a study has with several parameters."""
+    summary = summary[rows_of(summary, study.key)]
+    single = [config for config in study.returns if len(config.noises) == 1]  # sorted by noise
+    for wrapper, configs in groupby(single, lambda config: config.wrappers[0]):
+        noises = sorted({config.noise for config in configs})
+        if len(noises) > 1:
+            caption = (
+                f"{study.name}, {wrapper}: final test {study.metric} by parameters and noise rate. "
+                f"Bars: mean over n seeds, whiskers {ONE_STD}; dotted: no noise."
+            )
+            draw = partial(ablation_figure, study, summary, noises)
+            yield Drawing("parameters", f"{study.name} {wrapper}", caption, draw)
+
+
+def ablation_figure(study, summary, noises):
     """Draw bars of the final return: a wrapper's parameters side by side, grouped by noise rate."""
-    baseline = summary[summary["noise"] == ""]
-    groups = [summary[summary["noise"] == noise] for noise in noises]
-    rates = sorted({rate for group in groups for rate in group["noise_rate"]}, key=rate_order)
-    labels = [f"no noise (n = {span(baseline['n'])})"]
-    for noise, group in zip(noises, groups, strict=True):
-        labels.append(f"{noise} (n = {span(group['n'])})")
-    tried = set().union(*(group["environment"] for group in groups))
-    environments = [env for env in study.environments if env in tried]
-    fig, axes, add_legend = panels(environments, labels)
+    labels = []
+    for noise in ["", *noises]:
+        n = summary.loc[summary["noise"] == noise, "n"]
+        labels.append(f"{noise or 'no noise'} (n = {span(n)})")
+    noisy = summary[summary["noise"].isin(noises)]
+    rates = sorted(set(noisy["noise_rate"]), key=rate_order)
+    environments = list(noisy["environment"].unique())
+    finals = summary.set_index(["environment", "noise", "noise_rate"])[["mean", "std"]]
+    fig, axes, add_legend = panels(environments, labels, study.metric, "noise rate")
     width = 0.8 / len(noises)
     for ax, env in zip(axes, environments, strict=True):
-        rows = baseline[baseline["environment"] == env].set_index("noise_rate")
-        rows = rows.reindex([BASELINE.noise_rate])
-        bars(ax, [-1], rows, 0.6, color="white", label=labels[0])
-        ax.axhline(rows["mean"].iloc[0], color="black", linewidth=0.6, linestyle=":")
+        baseline = finals.reindex([(env, BASELINE.noise, BASELINE.noise_rate)])
+        bars(ax, [-1], baseline, 0.6, color="white", label=labels[0])
+        ax.axhline(baseline["mean"].iloc[0], color="black", linewidth=0.6, linestyle=":")
         ax.axhline(0, color="black", linewidth=0.6)
-        for i, group in enumerate(groups):
-            rows = group[group["environment"] == env].set_index("noise_rate").reindex(rates)
+        for i, noise in enumerate(noises):
+            rows = finals.reindex([(env, noise, rate) for rate in rates])
             place = np.arange(len(rates)) + width * (i - (len(noises) - 1) / 2)
-            color, _, _ = line_style(i + 1, len(labels))
+            color = style.line_style(i + 1, len(labels))["color"]
             bars(ax, place, rows, width, color=color, label=labels[i + 1])
         ax.set_xticks([-1, *range(len(rates))], ["none", *rates])
-        ax.set_xlabel("noise rate")
     add_legend()
-    caption = f"{study.name}, {wrapper}: final test return by parameters and noise rate. "
-    caption += "Bars: mean over n seeds, whiskers \u00b1 one standard deviation; dotted: no noise."
-    return Drawing("parameters", f"{study.name} {wrapper}", fig, caption)
+    return fig
 
 
 def bars(ax, place, rows, width, **look):
@@ -267,12 +230,14 @@ def robustness_figures(table, metric="return"):
     for (*study, noise), rows in table.groupby([*STUDY, "test_noise"]):
         of_one_noise = pd.to_numeric(rows["test_rate"], errors="coerce").notna().all()
         if noise and of_one_noise and rows["test_rate"].nunique() >= 3:
-            clean = rows_of(table, study) & (table["test_noise"] == "")
-            both = pd.concat([table[clean], rows])
-            text = f"{study_name(*study)}, tested with {noise}: mean return over seeds against the "
-            text += "rate, shaded \u00b1 one standard deviation; a line for each noise in training."
-            drawing = Drawing("robustness", f"curves {study_name(*study)} {noise}", None, text)
-            yield in_both_widths(drawing, rows["environment"], robustness_curves, both, noise)
+            clean, name = rows_of(table, study) & (table["test_noise"] == ""), study_name(*study)
+            caption = (
+                f"{name}, tested with {noise}: mean {metric} over seeds against the rate, shaded "
+                f"{ONE_STD}; a line for each noise in training."
+            )
+            draw = partial(robustness_curves_figure, rows, table[clean], metric)
+            several = rows["environment"].nunique() > 1
+            yield Drawing("robustness", f"curves {name} {noise}", caption, draw, several)
 
 
 def robustness_heatmap(algorithm, environment, rows, clean, metric):
@@ -284,68 +249,68 @@ def robustness_heatmap(algorithm, environment, rows, clean, metric):
     unit = "percent of that"
     if not in_percent:
         unit = "percentage points" if metric == SUCCESS else "units of the return"
-    grid = by_condition(rows, rows["score_percent"] if in_percent else rows["mean"] - clean)
-    limit = color_limit(grid, 100 if in_percent else np.inf)
+    values = rows["score_percent"] if in_percent else rows["mean"] - clean
+    trained = names_of(rows["noise"], rows["noise_rate"], "no noise")
+    tested = names_of(rows["test_noise"], rows["test_rate"], "clean")
+    grid = pd.DataFrame({"trained with": trained, "tested with": tested, "value": values})
+    grid["dot"] = rows["tested_on"] == "the same noise"
+    grid = grid.pivot(index="trained with", columns="tested with").loc[trained.unique()]
+    values, dots = (grid[name][tested.unique()] for name in ("value", "dot"))
+    limit = style.color_limit(values, 100 if in_percent else np.inf)
     name = f"{algorithm} on {environment}"
     caption = (
-        f"{name} (seeds: {span(rows['n'])}): mean return of policies by training and test, as its "
-        f"difference from the clean return of policies trained without noise, in {unit}. "
+        f"{name} (seeds: {span(rows['n'])}): mean {metric} of policies by training and test, as "
+        f"its difference from the clean {metric} of policies trained without noise, in {unit}. "
         f"A dot marks a test on the noise of training. The colours end at \u00b1 {limit:.3g}."
     )
-    same = by_condition(rows, rows["tested_on"] == "the same noise").eq(True)
     form = (lambda value: percent(value).removesuffix(" %")) if in_percent else rounded
-    drawing = Drawing("robustness", f"heatmap {algorithm} {environment}", None, caption)
-    drawing.figure = heatmap_figure(grid, limit, form, same, name)
-    drawing.narrow = heatmap_figure(grid.T, limit, form, same.T, name, narrow=True)
-    return drawing
+    draw = partial(heatmap_figure, name, values.astype(float), dots.eq(True), limit, form)
+    return Drawing("robustness", f"heatmap {algorithm} {environment}", caption, draw, True)
 
 
-def by_condition(rows, values):
-    """Arrange values of rows of robustness as a frame: training x test, in the rows' order."""
-    trained = rows["noise"].where(rows["noise"] != "", "no noise") + ", " + rows["noise_rate"]
-    tested = rows["test_noise"].where(rows["test_noise"] != "", "clean") + ", " + rows["test_rate"]
-    trained = trained.str.replace("no noise, 0.00", "no noise")
-    tested = tested.str.replace("clean, 0.00", "clean")
-    table = pd.DataFrame({"trained with": trained, "tested with": tested, "value": values})
-    table = table.pivot(index="trained with", columns="tested with", values="value")
-    return table.reindex(index=trained.unique(), columns=tested.unique())
+def names_of(noises, rates, none):
+    """Name configurations in training, or conditions of a test; `none` is that without noise."""
+    return (noises + ", " + rates).where(noises != "", none)
 
 
-def heatmap_figure(grid, limit, form, dots, name, narrow=False):
-    """Draw a figure of one heatmap; see effects.heatmap."""
+def heatmap_figure(name, grid, dots, limit, form, narrow=False):
+    """Draw a figure of one heatmap, a narrow one the other way round; see effects.heatmap."""
+    if narrow:
+        grid, dots = grid.T, dots.T
     size = 6 if narrow else 8
-    lines, columns = ([broken(label) for label in labels] for labels in (grid.index, grid.columns))
+    lines, columns = (list(map(style.broken, labels)) for labels in (grid.index, grid.columns))
     high = 0.25 * sum(line.count("\n") + 1 for line in lines) + 0.05 * max(map(len, columns))
-    width = NARROW_WIDTH if narrow else min(WIDTH, 4 + 0.9 * len(columns))
+    width = style.NARROW_WIDTH if narrow else min(style.WIDTH, 4 + 0.9 * len(columns))
     fig = Figure(figsize=(width, 1.2 + high), layout="constrained")
     ax = fig.subplots()
     heatmap(ax, grid, limit, form, dots, size)
-    ax.set_xticks(range(len(columns)), columns, fontsize=size, rotation=35, ha="right")
+    place = {"rotation": 35, "ha": "right", "rotation_mode": "anchor"}
+    ax.set_xticks(range(len(columns)), columns, fontsize=size, **place)
     ax.set_yticks(range(len(lines)), lines, fontsize=size)
-    for text in ax.get_xticklabels():
-        text.set_rotation_mode("anchor")
     ax.set(xlabel=grid.columns.name, ylabel=grid.index.name)
     ax.set_title(name, fontsize=9)
     return fig
 
 
-def robustness_curves(rows, noise, narrow=False):
-    """Draw the return against the rate of a test noise: one line per training configuration."""
+def robustness_curves_figure(rows, clean, metric, narrow=False):
+    """Draw the return against the rate of a test noise: one line per training configuration.
+
+    rows, clean: those of the table of robustness that were tested with the noise, and with none.
+    """
+    environments = sorted(set(rows["environment"]))
+    rows = pd.concat([clean, rows])
+    rows = rows.assign(rate=rows["test_rate"].astype(float)).sort_values("rate")
     configs = configurations(rows)
     labels = [f"{name}, {rate}" if name else "no noise" for name, rate in configs]
-    environments = sorted(set(rows[rows["test_noise"] == noise]["environment"]))
-    fig, axes, add_legend = panels(environments, labels, narrow)
-    for (ax, environment), (i, config) in product(
-        zip(axes, environments, strict=True), enumerate(configs)
-    ):
-        mine = (rows["noise"] == config[0]) & (rows["noise_rate"] == config[1])
-        line = rows[mine & (rows["environment"] == environment)]
-        line = line.assign(rate=line["test_rate"].astype(float)).sort_values("rate")
-        color, dashes, marker = line_style(i, len(configs))
-        look = {"color": color, "marker": marker or ".", "label": labels[i]}
-        ax.plot(line["rate"], line["mean"], dashes, **look)
-        shade(ax, line["rate"], line["mean"], line["std"].astype(float).fillna(0), color)
-        ax.set_xlabel("rate of the noise in the test (0: clean)")
+    below = "rate of the noise in the test (0: clean)"
+    fig, axes, add_legend = panels(environments, labels, metric, below, narrow)
+    for ax, environment in zip(axes, environments, strict=True):
+        for i, (noise, rate) in enumerate(configs):
+            line = rows[(rows["noise"] == noise) & (rows["noise_rate"] == rate)]
+            line = line[line["environment"] == environment]
+            look = style.line_style(i, len(configs)) | {"label": labels[i]}
+            look["marker"] = look["marker"] or "."
+            curve(ax, line["rate"], line["mean"], line["std"].astype(float).fillna(0), **look)
     add_legend()
     return fig
 
@@ -353,12 +318,15 @@ def robustness_curves(rows, noise, narrow=False):
 def write_figure(out, drawing, latex=False):
     """Write {name}.svg, with `latex` also .pdf; without dates, so equal figures are equal files.
 
-    A narrow figure is for the report only, so it is no .pdf.
+    A narrow figure is for the report only, so it is no .pdf. Return the names of the files.
     """
-    fig = drawing.figure
-    fig.savefig(out / f"{drawing.name}.svg", metadata={"Date": None})
+    figures = {drawing.name: drawing.draw()}
+    if drawing.has_narrow:
+        figures[f"{drawing.name}_narrow"] = drawing.draw(narrow=True)
+    for name, figure in figures.items():
+        figure.savefig(out / f"{name}.svg", metadata={"Date": None})
     if latex:
-        fig.set_layout_engine("none")  # the layout is done
-        fig.savefig(out / f"{drawing.name}.pdf", metadata={"CreationDate": None})
-    if drawing.narrow:
-        drawing.narrow.savefig(out / f"{drawing.narrow_name}.svg", metadata={"Date": None})
+        figure = figures[drawing.name]
+        figure.set_layout_engine("none")  # the layout is done
+        figure.savefig(out / f"{drawing.name}.pdf", metadata={"CreationDate": None})
+    return figures.keys()

@@ -1,7 +1,6 @@
 """How results look as text: numbers, and tables in a terminal, in Markdown and in LaTeX."""
 
 import re
-import textwrap
 import zlib
 from dataclasses import dataclass, field
 
@@ -9,11 +8,12 @@ import numpy as np
 import pandas as pd
 from tabulate import tabulate
 
-from analysis.runs import SUCCESS, script_name
+from analysis.runs import script_name
 from analysis.verdicts import percent
 from noisy_wrappers import rate_order, rounded
 
 # Formats of numbers that have no spread. z: no "-0"
+DASH = "\u2013"  # of what does not exist
 TENTH, WHOLE, PLAIN, SHARE, P_VALUE = "z,.1f", "z,.0f", "g", "z.2f", ".2g"
 
 
@@ -32,52 +32,50 @@ class Table:
     rates_beside: bool = False  # a column for each noise rate, with mean, std and n in its cells
 
 
-def in_metric(text, metric):
-    """Write of success rates what was written of returns, if they are the metric of a Study."""
-    if metric != SUCCESS:
-        return text
-    text = text.replace("test return\n(sum of rewards per episode)", "test success rate (%)")
-    return text.replace("return", "success rate")
-
-
 def slug(text):
     """Turn a label or a noise into a part of a file name; a long one is cut and keeps a hash."""
     name = re.sub(r"[^A-Za-z0-9._=+-]+", "_", text).strip("_")
     return name if len(name) <= 150 else f"{name[:140]}_{zlib.crc32(name.encode()):08x}"
 
 
-# Columns that are shown as one: "mean ± std", "estimate [low, high]" or "ours (the baseline's)".
+# Columns that are shown as one, which begins with the number: its spread is the standard deviation
+# behind ±, or half of the interval.
 MERGED = {
-    "no noise": ("baseline_mean", "baseline_std"),
-    "with noise": ("noisy_mean", "noisy_std"),
-    "mean": ("mean", "std"),
-    "average improvement %": ("average_improvement_percent", "std_improvement_percent"),
-    "IQM": ("iqm", "iqm_low", "iqm_high"),
-    "IQM change %": ("iqm_change_percent", "iqm_change_low", "iqm_change_high"),
-    "interaction": ("interaction", "interaction_low", "interaction_high"),
-    "interaction %": ("interaction_percent", "percent_low", "percent_high"),
-    "difference": ("difference", "difference_low", "difference_high"),
-    "P(improvement)": ("probability_of_improvement", "probability_low", "probability_high"),
-    "luck 95 % (p)": ("luck_95", "p_luck_of_best"),
+    "no noise": "{baseline_mean} ± {baseline_std}",
+    "with noise": "{noisy_mean} ± {noisy_std}",
+    "mean": "{mean} ± {std}",
+    "average improvement %": "{average_improvement_percent} ± {std_improvement_percent}",
+    "paper: mean": "{paper_mean} ± {paper_std}",
+    "paper: average improvement %": (
+        "{paper_average_improvement_percent} ± {paper_std_improvement_percent}"
+    ),
+    "IQM": "{iqm} [{iqm_low}, {iqm_high}]",
+    "IQM change %": "{iqm_change_percent} [{iqm_change_low}, {iqm_change_high}]",
+    "interaction": "{interaction} [{interaction_low}, {interaction_high}]",
+    "interaction %": "{interaction_percent} [{percent_low}, {percent_high}]",
+    "difference": "{difference} [{difference_low}, {difference_high}]",
+    "P(improvement)": "{probability_of_improvement} [{probability_low}, {probability_high}]",
+    "luck 95 % (p)": "{luck_95} ({p_luck_of_best})",
+    "score % (baseline)": "{score_percent} ({baseline_score_percent})",
+    "worst_score % (baseline)": "{worst_score_percent} ({baseline_worst_score_percent})",
+    "cvar_score % (baseline)": "{cvar_score_percent} ({baseline_cvar_score_percent})",
 }
-for _name in ("score", "worst_score", "cvar_score"):
-    MERGED[f"{_name} % (baseline)"] = (f"{_name}_percent", f"baseline_{_name}_percent")
-for _name in ("mean", "average improvement %"):
-    MERGED[f"paper: {_name}"] = tuple(f"paper_{column}" for column in MERGED[_name])
 
 
 def spreads(frame):
     """Return what each number of a table may be off by: column -> Series, where that is known."""
     found = {}
-    for name, parts in MERGED.items():
-        if parts[-1] in frame and not name.endswith(")"):
-            numbers = frame[list(parts)].astype(float)
-            spread = numbers[parts[1]]
-            if len(parts) == 3:
-                spread = (numbers[parts[2]] - numbers[parts[1]]) / 2
-            if name == "difference" and "pooled_std" in frame:
-                spread = spread.fillna(frame["pooled_std"])
-            found |= dict.fromkeys(parts, spread)
+    for name, template in MERGED.items():
+        parts = re.findall(r"\w+", template)
+        if parts[-1] not in frame or "(" in template:
+            continue
+        numbers = frame[parts].astype(float)
+        spread = numbers[parts[1]]
+        if "[" in template:
+            spread = (numbers[parts[2]] - numbers[parts[1]]) / 2
+        if name == "difference" and "pooled_std" in frame:
+            spread = spread.fillna(frame["pooled_std"])
+        found |= dict.fromkeys(parts, spread)
     if "difference" in found:
         found["detectable"] = found["difference"]
     if "baseline_std" in found and "noisy_std" in found:
@@ -92,9 +90,9 @@ def text_of(name, value, form, spread=None):
     deserves.
     """
     if pd.isna(value):
-        return "\u2013"
+        return DASH
     if isinstance(value, str):
-        return value or ("no noise" if name == "noise" else "\u2013")
+        return value or ("no noise" if name == "noise" else DASH)
     if form or name.startswith("paper_"):
         return f"{value:{form or TENTH}}"
     if name.endswith("_percent") and spread is None:
@@ -102,32 +100,27 @@ def text_of(name, value, form, spread=None):
     return rounded(value, spread)
 
 
-def merged(name, parts, table, text):
-    """Return one column of text for the columns `parts`; a value that does not exist is a dash."""
-    columns = [text[name] for name in parts]
-    if len(parts) == 3:
-        interval = columns[0] + " [" + columns[1] + ", " + columns[2] + "]"
-        result = interval.where(table[parts[1]].notna(), columns[0])
-    elif name.endswith(")"):
-        result = columns[0] + " (" + columns[1] + ")"
-    else:
-        result = columns[0] + " \u00b1 " + columns[1]
-    return result.where(table[parts[0]].notna(), "\u2013")
+def merged(template, cells):
+    """Fill in a template of MERGED; a number that does not exist is a dash, without any interval.
+
+    cells: the text of each of its columns.
+    """
+    number, other, *_ = cells.values()
+    if number == DASH or ("[" in template and other == DASH):
+        return number
+    return template.format(**cells)
 
 
 def title(column):
     """Spell the name of a column for people."""
-    for word, spelling in (("_", " "), ("percent", "%"), ("adjusted", "corrected")):
-        column = column.replace(word, spelling)
-    return column
+    return column.replace("_", " ").replace("percent", "%").replace("adjusted", "corrected")
 
 
 def shown(table):
     """Return a table as a person reads it: all text, related columns in one.
 
     The phase and environments without percent are shown where a row has any, and exp_name where one
-    is not its script's; a row of all
-    environments says so.
+    is not its script's; a row of all environments says so.
     """
     frame = table.frame if table.view is None else table.view
     frame = frame.reset_index(drop=True).drop(columns=list(table.only_csv))
@@ -136,9 +129,8 @@ def shown(table):
     if "exp_name" in frame:
         names = [script_name(str(algorithm)) for algorithm in frame["algorithm"]]
         frame["exp_name"] = frame["exp_name"].mask(frame["exp_name"] == names, "")
-    for name in ("exp_name", "phase", "without_percent"):
-        if name in frame and (frame[name].isna() | frame[name].eq("")).all():
-            frame = frame.drop(columns=name)
+    empty = frame.columns[(frame.isna() | frame.eq("")).all()]
+    frame = frame.drop(columns=empty.intersection(["exp_name", "phase", "without_percent"]))
     known, cells = spreads(frame), {}
     for name in frame:
         pairs = zip(frame[name], known.get(name, [None] * len(frame)), strict=True)
@@ -148,36 +140,27 @@ def shown(table):
     if "n_baseline_most" in text:  # over several environments: "10 to 50"
         most = text.pop("n_baseline_most")
         text["n_baseline"] += (" to " + most).where(most != text["n_baseline"], "")
-    for name, parts in MERGED.items():
+    for name, template in MERGED.items():
+        first, *others = parts = re.findall(r"\w+", template)
         if parts[-1] in text:
-            text[parts[0]] = merged(name, parts, frame, text)
-            text = text.drop(columns=list(parts[1:])).rename(columns={parts[0]: name})
+            text[first] = [merged(template, cells) for cells in text[parts].to_dict("records")]
+            text = text.drop(columns=others).rename(columns={first: name})
     if table.rates_beside and len(text):
         text["mean"] += " (" + text.pop("n") + ")"
         keys = [name for name in text if name not in ("noise_rate", "mean")]
-        text = text.pivot(index=keys, columns="noise_rate", values="mean").fillna("\u2013")
+        text = text.pivot(index=keys, columns="noise_rate", values="mean").fillna(DASH)
         text = text[sorted(text.columns, key=rate_order)].reset_index()
     return text.rename(columns=title)
 
 
-def text_table(table, width=0):
-    """Format a table for a terminal of this width (0: any), without the last columns if need be."""
+def text_table(table, width):
+    """Format a table for a terminal of this width, without the last columns if need be."""
     text = shown(table)
-    if text.empty:
-        return "(empty)"
     while True:
         lines = tabulate(text.values, text.columns, disable_numparse=True)
-        if not width or text.shape[1] == 1 or max(map(len, lines.splitlines())) <= width:
+        if text.shape[1] == 1 or max(map(len, lines.splitlines())) <= width:
             return lines
         text = text.iloc[:, :-1]
-
-
-def wrapped(text, width=0):
-    """Break a paragraph into lines of this width (0: any) between words."""
-    if not width:
-        return text
-    style = {"break_long_words": False, "break_on_hyphens": False, "subsequent_indent": "  "}
-    return textwrap.fill(text, width, **style)
 
 
 def write_table(out, table, latex=False):
@@ -193,9 +176,8 @@ def write_table(out, table, latex=False):
     note = f"\n{table.note}\n" if table.note else ""
     (out / f"{table.name}.md").write_text(f"{table.caption}\n\n{markdown}\n{note}", "utf-8")
     lines = tabulate(text.values, text.columns, tablefmt="latex_longtable", disable_numparse=True)
-    escaped = re.sub(r"([%&_#])", r"\\\1", table.caption)
-    escaped = escaped.replace("|", r"\textbar{}").replace("\n", " ")
-    lines = lines.replace("\n", f"\n\\caption{{{escaped}}}\\\\\n", 1)
+    caption = table.caption.replace("%", r"\%")
+    lines = lines.replace("\n", f"\n\\caption{{{caption}}}\\\\\n", 1)
     for sign, command in (("\u00b1", r"$\pm$"), ("\u2013", "--"), (" < ", " $<$ ")):
         lines = lines.replace(sign, command)
     (out / f"{table.name}.tex").write_text(lines + "\n", "utf-8")

@@ -6,6 +6,7 @@ Figures that the page shows folded are files beside it; all else is in the page.
 import base64
 import os
 import re
+from collections import Counter, defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,8 +14,8 @@ import jinja2
 import pandas as pd
 from markupsafe import Markup, escape
 
-from analysis.formatting import shown
-from analysis.verdicts import clear_first, headlines, tally
+from analysis.formatting import DASH, shown
+from analysis.verdicts import tally
 
 SECTIONS = {
     "choice": "Choice of a noise",
@@ -33,7 +34,6 @@ SECTIONS = {
 }
 FIGURES_OF = {"best_curves": "early_performance", "curves": "early_performance"}
 FOLDED = ("curves", "parameters")  # where there are several: one for each noise
-MOST_ROWS = 15  # a longer table is folded
 DOCS = Path(__file__).parents[1] / "docs/statistics.md"  # how all numbers are computed
 
 
@@ -43,7 +43,9 @@ class Results:
 
     studies: list
     tables: dict  # name -> Table
-    sentences: pd.DataFrame  # see verdicts.in_sentences
+    headlines: list  # see verdicts.headlines
+    clear: pd.DataFrame  # see verdicts.clear_first
+    others: pd.DataFrame
     robustness: list  # sentences
     overview: str
     problems: str  # runs that were left out, or ""
@@ -61,62 +63,40 @@ def breakable(text):
     return Markup(re.sub("(?<=[a-z0-9])(?=[A-Z(])", "<wbr>", str(escape(text))))
 
 
-def source(path):
-    """Return a picture as a URL that contains it."""
-    return f"data:image/svg+xml;base64,{base64.b64encode(path.read_bytes()).decode()}"
+def write_report(out, results, drawn):
+    """Write report.html: the effects and the verdicts first, then everything else.
 
-
-def sections_of(out, results, drawn):
-    """Arrange the tables and figures as the page shows them; a section without any is left out.
-
-    drawn: every Drawing. Return the figures of the effects, which are in no section, and a list of
-    dicts.
+    drawn: every Drawing. A section without tables and figures is left out.
     """
-    sections = {
-        key: {"id": key, "title": title, "said": [], "tables": [], "figures": [], "folded": []}
-        for key, title in SECTIONS.items()
-    }
-    effects = []
+    tables, figures, folded = defaultdict(list), defaultdict(list), defaultdict(list)
     for table in results.tables.values():
         text = shown(table)
         if len(text):
-            text = text.loc[:, (text != "\u2013").any()]  # a column of dashes says nothing
-            entry = {"name": table.name, "caption": table.caption, "note": table.note}
-            entry |= {"columns": text.columns, "rows": text.values.tolist()}
-            sections[table.section]["tables"].append(entry)
-    sections["robustness"]["said"] = results.robustness
-    kinds = [drawing.kind for drawing in drawn]
+            text = text.loc[:, (text != DASH).any()]  # a column of dashes says nothing
+            tables[table.section].append((table, text))
+    number = Counter(drawing.kind for drawing in drawn)
     for drawing in drawn:
-        section = sections.get(FIGURES_OF.get(drawing.kind, drawing.kind))
-        file, caption = f"{drawing.name}.svg", drawing.caption
-        if drawing.kind in FOLDED and kinds.count(drawing.kind) > 1:
-            section["folded"].append({"src": file, "caption": caption})
-            continue
-        entry = {"src": source(out / file), "caption": caption}
-        if drawing.narrow:
-            entry["narrow"] = source(out / f"{drawing.narrow_name}.svg")
-        (effects if section is None else section["figures"]).append(entry)
-    shown_ones = [s for s in sections.values() if s["tables"] or s["figures"] or s["folded"]]
-    return effects, shown_ones
+        several = drawing.kind in FOLDED and number[drawing.kind] > 1
+        place = folded if several else figures
+        place[FIGURES_OF.get(drawing.kind, drawing.kind)].append(drawing)
 
+    def source(name):  # a URL that contains the figure
+        picture = (out / f"{name}.svg").read_bytes()
+        return f"data:image/svg+xml;base64,{base64.b64encode(picture).decode()}"
 
-def write_report(out, results, drawn):
-    """Write report.html: the effects and the verdicts first, then everything else."""
     pages = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True
     )
-    pages.filters["breakable"] = breakable
-    effects, sections = sections_of(out, results, drawn)
-    first, rest = clear_first(results.sentences)
+    pages.filters |= {"breakable": breakable, "source": source}
     html = pages.get_template("report.html.jinja").render(
         results=results,
-        effects=effects,
-        headlines=headlines(results.tables["statistics"].frame, results.tables["best"].frame),
-        first=first.to_dict("records"),
-        rest=rest.to_dict("records"),
-        rest_tally=tally(rest["verdict"]),
-        sections=sections,
+        others_tally=tally(results.others["verdict"]),
+        sections={
+            key: SECTIONS[key] for key in SECTIONS if tables[key] or figures[key] or folded[key]
+        },
+        tables=tables,
+        figures=figures,
+        folded=folded,
         docs=os.path.relpath(DOCS, out),
-        most_rows=MOST_ROWS,
     )
     (out / "report.html").write_text(html, "utf-8")

@@ -3,64 +3,32 @@
 evaluate.py writes these files. The unit of replication is the seed: a run's value under a test
 condition is the mean over its episodes there.
 
-The primary figure is the return under noise that was not in training, averaged equally over the
-conditions. A condition counts if it is not clean, none of its wrappers was in training, and none is
-reward noise or early termination, which change no policy's behaviour in a test. It is compared with
-that of the policies trained without noise under the same conditions, by the test of all verdicts
-(statistics.compare), with Holm's correction over the training configurations of an algorithm; tests
-in another environment than the training's have a correction of their own. All of this may be of the
-rate of success instead of the return, in percentage points.
+The primary figure is the mean return over the conditions that count (is_unseen), compared with that
+of the policies trained without noise under the same conditions by the test of all verdicts, with
+Holm's correction; docs/statistics.md has the details. All of this may be of the rate of success
+instead of the return, in percentage points.
 """
 
-from pathlib import Path
+from itertools import zip_longest
 
 import numpy as np
 import pandas as pd
 
-from analysis.formatting import P_VALUE, SHARE, WHOLE, Table, in_metric
-from analysis.runs import (
-    ELSEWHERE,
-    KEYS,
-    ROBUSTNESS_COLUMNS,
-    STUDY,
-    SUCCESS,
-    study_name,
-    where_tested,
-)
+from analysis import verdicts
+from analysis.runs import KEYS, ROBUSTNESS_COLUMNS, STUDY, SUCCESS, study_name, where_tested
 from analysis.statistics import compare, holm, mean_std, percent_of
-from analysis.verdicts import (
-    borderline,
-    counted,
-    difference,
-    p_value,
-    percent,
-    significant,
-    spread_of,
-)
-from noisy_wrappers import BASELINE, WRAPPERS, Configuration, rounded
+from analysis.tables import table_of
+from noisy_wrappers import BASELINE, Configuration, rounded
 
-FILES = ("robustness.csv", "robustness.csv.gz")
-CONDITION = ["test_noise", "test_rate"]
 CLEAN = BASELINE  # a condition of a test is a Configuration, too
-RUN_COLUMNS = [*KEYS, "configuration", "seed", *CONDITION, "condition", "mean", "cvar"]
-COLUMNS = [*KEYS, *CONDITION, "tested_on", "n", "mean", "std", "difference", "change_percent"]
-COLUMNS += ["cvar", "score_percent"]
-_SCORE_COLUMNS = """scope environment noise noise_rate n n_baseline conditions difference
+RUN_COLUMNS = [*KEYS, "configuration", "seed", "elsewhere", "condition", "mean", "cvar"]
+COLUMNS = [*KEYS, "test_noise", "test_rate", "tested_on", "n", "mean", "std", "difference"]
+COLUMNS += ["change_percent", "cvar", "score_percent"]
+SCORE_COLUMNS = """scope environment noise noise_rate n n_baseline conditions difference
     difference_low difference_high difference_percent effect_size p p_holm detectable score_percent
     baseline_score_percent clean_change_percent cvar_score_percent baseline_cvar_score_percent
     worst_score_percent baseline_worst_score_percent worst_condition t pooled_std smallest_p"""
-SCORE_COLUMNS = [*STUDY, *_SCORE_COLUMNS.split()]
-FORMATS = dict.fromkeys(("n", "n_baseline", "conditions"), WHOLE)
-FORMATS |= dict.fromkeys(("p", "p_holm", "smallest_p"), P_VALUE)
-FORMATS |= dict.fromkeys(("effect_size", "t"), SHARE)
-ONLY_CSV = {"robustness_score": ("t", "pooled_std", "smallest_p"), "robustness": ("score_percent",)}
-CAPTIONS = {  # at most two lines in the report; docs/statistics.md says how they are computed
-    "robustness_score": """Primary figure of robustness: the mean return under noise that was not in
-training, of policies trained with noise and without.""",
-    "robustness": """Return under every test condition: mean \u00b1 standard deviation over n seeds,
-and difference from the policies trained without noise.""",
-}
-NOTES = {"robustness_score": "Scores: relative to the clean return.", "robustness": ""}
+SCORE_COLUMNS = [*STUDY, *SCORE_COLUMNS.split()]
 
 
 def read_robustness(runs_dir, runs, metric="return"):
@@ -72,20 +40,21 @@ def read_robustness(runs_dir, runs, metric="return"):
     """
     rows, notes = [], []
     for run in runs[runs["status"] == "finished"].itertuples():
-        paths = [Path(runs_dir) / run.run / name for name in FILES]
-        paths = [path for path in paths if path.exists()]
-        if not paths:
+        path = runs_dir / run.run / "robustness.csv"
+        if not path.exists():
+            path = path.with_suffix(".csv.gz")
+        if not path.exists():
             continue
         try:
-            episodes = read_episodes(paths[0], metric)
+            tests = read_episodes(path, metric)
         except (OSError, ValueError, EOFError) as error:
-            notes.append(f"{run.run}: {paths[0].name} is left out: {' '.join(str(error).split())}")
+            notes.append(f"{run.run}: {path.name} is left out: {' '.join(str(error).split())}")
             continue
-        keys = {name: getattr(run, name) for name in (*KEYS, "configuration", "seed")}
-        for (condition, elsewhere), returns in episodes.items():
-            keys["environment"] = where_tested(run.environment, elsewhere)
-            texts = condition.noise, condition.noise_rate
-            rows.append((*keys.values(), *texts, condition, returns.mean(), cvar(returns)))
+        row = {name: getattr(run, name) for name in (*KEYS, "configuration", "seed")}
+        for (condition, elsewhere), results in tests.items():
+            row |= {"condition": condition, "elsewhere": elsewhere}
+            row["environment"] = where_tested(run.environment, elsewhere)
+            rows.append(row | {"mean": results.mean(), "cvar": cvar(results)})
     return pd.DataFrame(rows, columns=RUN_COLUMNS), notes
 
 
@@ -95,26 +64,19 @@ def read_episodes(path, metric="return"):
     The environment is empty for that of the training. A result is a return, or of success 100 or 0.
     Raises ValueError.
     """
-    text = {"noise": str, "noise_rate": str, "environment": str}
-    table = pd.read_csv(path, dtype=text).fillna(dict.fromkeys(text, ""))
-    known, more = table.columns[: len(ROBUSTNESS_COLUMNS)], table.columns[len(ROBUSTNESS_COLUMNS) :]
-    if list(known) != ROBUSTNESS_COLUMNS or not set(more) <= {"success", "environment"}:
+    keys = ["noise", "noise_rate", "environment"]
+    table = pd.read_csv(path, dtype=dict.fromkeys(keys, str)).fillna(dict.fromkeys(keys, ""))
+    if [name for name in table if name not in ("success", "environment")] != ROBUSTNESS_COLUMNS:
         raise ValueError("unexpected header")
-    returns = pd.to_numeric(table["episodic_return"])
-    if not np.isfinite(returns).all() or not len(returns):
+    results = pd.to_numeric(table["episodic_return"])
+    if not np.isfinite(results).all() or not len(results):
         raise ValueError("no episodes, or a return that is not finite")
-    results = returns
     if metric == SUCCESS:
-        results = 100 * pd.to_numeric(table.get("success", returns * np.nan)).dropna()
-    table = table.reindex(columns=[*text], fill_value="").loc[results.index]
-    keys = [table[name] for name in table]
-    found = {}
-    for (noise, rate, environment), group in results.groupby(keys, sort=False):
-        condition = Configuration.parse(noise, rate)
-        unknown = [name for name in condition.wrappers if name not in WRAPPERS and ":" not in name]
-        if unknown:  # and none of the user's own
-            raise ValueError(f"unknown noise {unknown[0]!r}")
-        found[condition, environment] = group.to_numpy(float)
+        results = 100 * pd.to_numeric(table.get("success", np.nan))
+    table = table.assign(environment=table.get("environment", ""), result=results)
+    table, found = table.dropna(subset="result"), {}
+    for (noise, rate, environment), group in table.groupby(keys, sort=False)["result"]:
+        found[Configuration.parse(noise, rate), environment] = group.to_numpy(float)
     return found
 
 
@@ -150,182 +112,130 @@ def by_run(runs, config, value):
 
 def condition_rows(runs):
     """Yield one row per training configuration and test condition, in each environment."""
-    for key, group in runs.groupby([*STUDY, "environment"]):
+    for _, group in runs.groupby([*STUDY, "environment"]):
         baseline = by_run(group, BASELINE, "mean")
-        for config in sorted(set(group["configuration"])):
-            means, cvars = by_run(group, config, "mean"), by_run(group, config, "cvar")
-            for condition in sorted(means.columns):
-                mean, std, n = mean_std(means[condition])
-                row = dict(zip(KEYS, (*key, config.noise, config.noise_rate), strict=True))
-                row |= {"test_noise": condition.noise, "test_rate": condition.noise_rate}
-                row |= {"tested_on": tested_on(condition, config), "n": n, "mean": mean, "std": std}
-                row["cvar"] = cvars[condition].mean()
-                if config != BASELINE and condition in baseline:
-                    alone = baseline[condition].to_numpy()
-                    row["difference"] = mean - np.nanmean(alone)
-                    row["change_percent"] = percent_of(row["difference"], alone)
-                if CLEAN in baseline:
-                    clean = baseline[CLEAN].to_numpy()
-                    row["score_percent"] = percent_of(mean - np.nanmean(clean), clean)
-                yield row
-
-
-def environment_scores(runs, config):
-    """Score a configuration and the baseline in one environment, or return None.
-
-    runs: those of one study and environment. The result is a dict: `x` (seeds) and `y` (baseline
-    seeds) are mean returns over the conditions; in percent of the clean return C of the baseline,
-    NaN where that has no percentages, are `percent` (what a difference of 1 is), `scores`,
-    `cvar_scores` (of the worst tenth of the episodes) and `worst_scores` (under each condition),
-    pairs of x and y, and `clean_change`.
-    """
-    x, y = by_run(runs, config, "mean"), by_run(runs, BASELINE, "mean")
-    if x.empty or y.empty or CLEAN not in x or CLEAN not in y:
-        return None
-    shared = x.columns.intersection(y.columns)
-    whole = [c for c in shared if x[c].notna().all() and y[c].notna().all()]
-    conditions = [condition for condition in whole if is_unseen(condition, config)]
-    if not conditions:
-        return None
-    clean, percent = y[CLEAN].mean(), percent_of(1.0, y[CLEAN].to_numpy())
-
-    def scores(tables):
-        return [(table[conditions].mean() - clean) * percent for table in tables]
-
-    cvars = by_run(runs, config, "cvar"), by_run(runs, BASELINE, "cvar")
-    return {
-        "x": x[conditions].mean(axis=1).to_numpy(),
-        "y": y[conditions].mean(axis=1).to_numpy(),
-        "percent": percent,
-        "scores": [score.mean() for score in scores((x, y))],
-        "cvar_scores": [score.mean() for score in scores(cvars)],
-        "worst_scores": scores((x, y)),
-        "clean_change": (x[CLEAN].mean() - clean) * percent,
-    }
+        for (config, condition), tests in group.groupby(["configuration", "condition"]):
+            mean, std, n = mean_std(tests["mean"])
+            row = tests.iloc[0][KEYS].to_dict()
+            row |= {"test_noise": condition.noise, "test_rate": condition.noise_rate}
+            row |= {"tested_on": tested_on(condition, config), "n": n, "mean": mean, "std": std}
+            row["cvar"] = tests["cvar"].mean()
+            if config != BASELINE and condition in baseline:
+                row["difference"] = mean - baseline[condition].mean()
+                row["change_percent"] = percent_of(row["difference"], baseline[condition])
+            if CLEAN in baseline:
+                row["score_percent"] = percent_of(mean - baseline[CLEAN].mean(), baseline[CLEAN])
+            yield row
 
 
 def score_rows(runs):
-    """Yield the score of every configuration with noise: over all environments, then in each."""
-    for study, group in runs.groupby(STUDY):
-        for config in sorted(set(group["configuration"])):
-            if config == BASELINE:
-                continue
-            scores = {}
-            for environment, same in group.groupby("environment"):
-                found = environment_scores(same, config)
-                if found:
-                    scores[environment] = found
-            at_home = {name: found for name, found in scores.items() if ELSEWHERE not in name}
+    """Yield the score of every configuration with noise: over all environments, then in each.
+
+    `primary` are those over all environments, or in the only one. Tests in another environment are
+    apart: they leave those at home as they are.
+    """
+    for _, group in runs.groupby(STUDY):
+        for config in sorted({*group["configuration"]} - {BASELINE}):
+            scores = [environment_score(same, config) for _, same in group.groupby("environment")]
+            scores = [score for score in scores if score]
+            at_home = [score for score in scores if not score["elsewhere"]]
             if len(at_home) > 1:
-                yield score_row(study, "all", "", config, at_home)
-            for environment, found in scores.items():
-                yield score_row(study, "environment", environment, config, {environment: found})
+                yield average_score(at_home) | {"primary": True}
+            for score in scores:
+                yield score | {"primary": bool(score["elsewhere"]) or len(at_home) == 1}
 
 
-def score_row(study, scope, environment, config, scores):
-    """Return one row of scores; environments count equally, whatever their number of seeds."""
-    found = list(scores.values())
-    x, y = (stacked(part[name] for part in found) for name in ("x", "y"))
-    comparison = compare(x, y)._asdict()
-    percents = [part["percent"] * (part["x"].mean() - part["y"].mean()) for part in found]
-    worst, worst_of_baseline = {}, []
-    for name, part in scores.items():
-        own, baseline = part["worst_scores"]
-        worst |= {(name, condition): value for condition, value in own.items()}
-        worst_of_baseline.append(baseline.min())
-    worst_place, condition = min(worst, key=worst.get)
-    where = f" on {worst_place}" if scope == "all" else ""
-    known = np.isfinite(percents).all()  # what has no percentages cannot be ranked or averaged
-    score, baseline_score = np.mean([part["scores"] for part in found], axis=0)
-    cvar_score, baseline_cvar_score = np.mean([part["cvar_scores"] for part in found], axis=0)
-    row = dict(zip(STUDY, study, strict=True)) | comparison
-    row |= {"scope": scope, "environment": environment}
-    row |= {"noise": config.noise, "noise_rate": config.noise_rate}
-    return row | {
-        "conditions": min(len(part["worst_scores"][0]) for part in found),
-        "difference_percent": np.mean(percents),
-        "score_percent": score,
-        "baseline_score_percent": baseline_score,
-        "clean_change_percent": np.mean([part["clean_change"] for part in found]),
-        "cvar_score_percent": cvar_score,
-        "baseline_cvar_score_percent": baseline_cvar_score,
-        "worst_score_percent": worst[worst_place, condition] if known else np.nan,
-        "baseline_worst_score_percent": min(worst_of_baseline) if known else np.nan,
-        "worst_condition": f"{condition.noise} at {condition.noise_rate}{where}" if known else "",
-    }
+def environment_score(runs, config):
+    """Score a configuration against the baseline in one environment, or return None.
 
-
-def stacked(samples):
-    """Put samples of different sizes side by side: (most seeds x samples), padded with NaN."""
-    samples = list(samples)
-    table = np.full((max(map(len, samples)), len(samples)), np.nan)
-    for column, sample in zip(table.T, samples, strict=True):
-        column[: len(sample)] = sample
-    return table
-
-
-def tested_elsewhere(scores):
-    """Return the environment of each row's test where it is not the training's, else ""."""
-    names = [name.partition(ELSEWHERE)[2] for name in scores["environment"]]
-    return pd.Series(names, scores.index, dtype=object)
-
-
-def primary(scores):
-    """Return which rows of scores are primary: of all environments, or of the only one.
-
-    Tests in another environment are apart: they leave those at home as they are.
+    runs: those of one study and environment. The result is a row of SCORE_COLUMNS with `x` (seeds)
+    and `y` (baseline seeds), the mean returns over the conditions. What is in percent is relative
+    to the clean return of the baseline, NaN where that has no percentages.
     """
-    of_all = (scores["scope"] == "all").astype(bool)
-    keys = [scores[name] for name in (*STUDY, "noise", "noise_rate")]
-    return of_all | ~of_all.groupby([*keys, tested_elsewhere(scores)]).transform("any")
+    x, y = by_run(runs, config, "mean"), by_run(runs, BASELINE, "mean")
+    if CLEAN not in x or CLEAN not in y:
+        return None
+    complete = pd.concat([x, y]).notna().all()
+    conditions = [name for name in complete.index[complete] if is_unseen(name, config)]
+    if not conditions:
+        return None
+    clean, percent = y[CLEAN].mean(), percent_of(1.0, y[CLEAN])
+    clean_change = (x[CLEAN].mean() - clean) * percent
+    x, y = (side[conditions].mean(axis=1).to_numpy() for side in (x, y))
+    own = runs[runs["configuration"] == config].iloc[0]
+    row = own[[*KEYS, "elsewhere"]].to_dict() | compare(x, y)._asdict()
+    row |= {"scope": "environment", "x": x, "y": y, "conditions": len(conditions)}
+    row |= {"difference_percent": (x.mean() - y.mean()) * percent}
+    row |= {"clean_change_percent": clean_change, "worst_condition": ""}
+    for side, prefix in ((BASELINE, "baseline_"), (config, "")):
+        for value, name in (("cvar", "cvar_score"), ("mean", "score")):
+            scores = (by_run(runs, side, value)[conditions].mean() - clean) * percent
+            row[f"{prefix}{name}_percent"] = scores.mean()
+        row[f"{prefix}worst_score_percent"] = scores.min()
+    if scores.notna().all():  # what has no percentages cannot be ranked
+        worst = scores.idxmin()
+        row["worst_condition"] = f"{worst.noise} at {worst.noise_rate}"
+    return row
 
 
-def robustness_tables(runs, metric="return"):
-    """Compute the tables of robustness from read_robustness's frame: name -> Table."""
+def average_score(scores):
+    """Return the row of all environments; they count equally, whatever their number of seeds."""
+    table = pd.DataFrame(scores)
+    x, y = (np.array([*zip_longest(*table[name], fillvalue=np.nan)]) for name in ("x", "y"))
+    row = scores[0] | compare(x, y)._asdict()
+    row |= {"scope": "all", "environment": "", "worst_condition": ""}
+    row |= table.filter(like="percent").mean(skipna=False)
+    row |= table[["conditions", *table.filter(like="worst_score")]].min(skipna=False)
+    if pd.notna(row["worst_score_percent"]):
+        place = table.loc[table["worst_score_percent"].idxmin()]
+        row["worst_condition"] = f"{place['worst_condition']} on {place['environment']}"
+    return row
+
+
+def analyse_robustness(runs, metric="return"):
+    """Return the tables of read_robustness's frame, by name, and the sentences on its scores."""
     if runs.empty:
-        return {}
+        return {}, []
     table = pd.DataFrame(condition_rows(runs), columns=COLUMNS)
-    scores = pd.DataFrame(score_rows(runs), columns=SCORE_COLUMNS)
-    judged = scores[primary(scores) & scores["p"].notna()]
-    keys = [judged[name] for name in STUDY]
-    for _, family in judged.groupby([*keys, tested_elsewhere(judged)]):
+    scores = pd.DataFrame(score_rows(runs), columns=[*SCORE_COLUMNS, "primary", "elsewhere"])
+    primary = scores[scores["primary"].astype(bool)]
+    for _, family in primary[primary["p"].notna()].groupby([*STUDY, "elsewhere"]):
         scores.loc[family.index, "p_holm"] = holm(family["p"].to_numpy(float))
-    tables = {}
-    for name, frame in (("robustness_score", scores), ("robustness", table)):
-        note, caption = NOTES[name], in_metric(" ".join(CAPTIONS[name].split()), metric)
-        if metric == SUCCESS:  # never percent of a rate; the worst tenth of episodes is 0 or 100
-            note = "Rates are in percent of the episodes, differences in percentage points."
-            percents = [column for column in frame if column.endswith("_percent")]
-            frame[frame.columns.intersection([*percents, "cvar", "worst_condition"])] = np.nan
-        shape = {"formats": FORMATS, "only_csv": ONLY_CSV[name], "note": note}
-        tables[name] = Table(name, frame, caption, "robustness", **shape)
-    return tables
+    note, score_note = "", "Scores: relative to the clean return."
+    if metric == SUCCESS:  # never percent of a rate; the worst tenth of episodes is 0 or 100
+        note = "Rates are in percent of the episodes, differences in percentage points."
+        score_note = note
+        for frame in (scores, table):
+            frame[frame.filter(regex="_percent$|^cvar$|^worst_condition$").columns] = np.nan
+    sentences = robustness_sentences(scores.loc[primary.index], metric)
+    more = {"section": "robustness", "only_csv": ("t", "pooled_std", "smallest_p")}
+    score = table_of("robustness_score", scores[SCORE_COLUMNS], note=score_note, **more)
+    conditions = table_of("robustness", table, note=note, only_csv=("score_percent",))
+    return {"robustness_score": score, "robustness": conditions}, list(sentences)
 
 
-def robustness_sentences(scores, unit=""):
-    """Yield one plain sentence for each training configuration: is it more robust?
-
-    unit: of the difference, such as POINTS.
-    """
-    for row in scores[primary(scores)].itertuples():
+def robustness_sentences(scores, metric):
+    """Yield one plain sentence for each training configuration: is it more robust?"""
+    unit = verdicts.POINTS if metric == SUCCESS else ""
+    for row in scores.itertuples():
         where = row.environment or "all environments together"
         study = study_name(row.algorithm, row.exp_name, row.phase)
         start = f"{study} on {where}, trained with {row.noise} at rate {row.noise_rate}"
-        evidence, limit = difference(row, unit), ""
+        shown, limit = "no clear difference in robustness to new noise", ""
+        evidence = verdicts.difference(row, unit)
         if pd.isna(row.p):
             shown = "too few seeds for a test of robustness to new noise"
-        elif significant(row.p):
-            more = "more" if row.t > 0 else "less"
-            shown = f"{'' if significant(row.p_holm) else 'perhaps '}{more} robust to new noise"
         else:
-            shown = "no clear difference in robustness to new noise"
-        if pd.notna(row.p):
-            evidence += f", p {p_value(row.p)}, Holm {p_value(row.p_holm).removeprefix('= ')}"
-        if not significant(row.smallest_p):
-            limit = f"; {counted(row.n, 'seed')} against {row.n_baseline} cannot show any"
-        elif not significant(row.p) and row.detectable > 0:
-            found = rounded(row.detectable, spread_of(row)) + unit
+            corrected = verdicts.p_value(row.p_holm).removeprefix("= ")
+            evidence += f", p {verdicts.p_value(row.p)}, Holm {corrected}"
+        if verdicts.significant(row.p):
+            perhaps = "" if verdicts.significant(row.p_holm) else "perhaps "
+            shown = f"{perhaps}{'more' if row.t > 0 else 'less'} robust to new noise"
+        if not verdicts.significant(row.smallest_p):
+            limit = f"; {verdicts.counted(row.n, 'seed')} against {row.n_baseline} cannot show any"
+        elif not verdicts.significant(row.p) and row.detectable > 0:
+            found = rounded(row.detectable, verdicts.spread_of(row)) + unit
             limit = f"; a difference of {found} would have been seen (80 % power)"
         if pd.notna(row.clean_change_percent):
-            evidence += f"; clean return {percent(row.clean_change_percent)}"
-        yield f"{start}: {shown} ({evidence}){limit}.{borderline(row)}"
+            evidence += f"; clean return {verdicts.percent(row.clean_change_percent)}"
+        yield f"{start}: {shown} ({evidence}){limit}.{verdicts.borderline(row)}"

@@ -46,11 +46,11 @@ _COLUMNS = {
 COLUMNS = {name: [*STUDY, *text.split()] for name, text in _COLUMNS.items()}
 COLUMNS["judged"] = [*dict.fromkeys(COLUMNS["summary"] + COLUMNS["statistics"])]
 _COLUMNS_WITH = {
-    WHOLE: """n n_baseline n_baseline_most environments chosen_from configurations seeds
-        seeds_needed steps_to_baseline percent_of_environments best_beyond_luck consistent
+    WHOLE: """n n_baseline n_baseline_most environments conditions chosen_from configurations
+        seeds seeds_needed steps_to_baseline percent_of_environments best_beyond_luck consistent
         consistent_beyond_luck consistently_worse consistently_worse_beyond_luck""",
-    P_VALUE: """p p_adjusted smallest_p smallest_p_adjusted p_luck p_luck_of_best paper_p_luck
-        p_consistent p_consistently_worse""",
+    P_VALUE: """p p_adjusted p_holm smallest_p smallest_p_adjusted p_luck p_luck_of_best
+        paper_p_luck p_consistent p_consistently_worse""",
     SHARE: "probability_of_improvement probability_low probability_high effect_size t",
     TENTH: "difference_se consistent_by_luck consistently_worse_by_luck",
     PLAIN: "steps_millions",
@@ -318,6 +318,10 @@ deviation over n seeds, and the difference from no noise in percentage points.""
 intervals. Above zero, both at once are better than the sum.""",
     "choice": """How the noise was chosen: each round of the search drops the worse half, and fresh
 seeds confirm the winner or not.""",
+    "robustness_score": """Primary figure of robustness: the mean return under noise that was not in
+training, of policies trained with noise and without.""",
+    "robustness": """Return under every test condition: mean \u00b1 standard deviation over n seeds,
+and difference from the policies trained without noise.""",
     "missing": "Runs that are in no table and no figure, with their seeds.",
     "compare_luck": """The same for the paper's tables.""",
     "compare": "The paper's table (environments v2, 1,000,000 steps) beside ours.",

@@ -783,7 +783,7 @@ def test_a_difference_needs_equal_steps_and_a_listing_one_version(tmp_path):
 
 
 def drawn_of(runs_dir):
-    """Return {name: (figure, caption)} of the figures of a folder of runs."""
+    """Return {name: Drawing} of the figures of a folder of runs."""
     studies, _ = analysis.runs.make_studies(analysis.runs.read_runs(runs_dir))
     drawn = analysis.figures.figures(studies, analysis.tables.make_tables(studies))
     return {drawing.name: drawing for drawing in drawn}
@@ -798,7 +798,7 @@ def test_effects_have_in_every_environment_the_rows_that_were_tried_there(tmp_pa
             write_run(tmp_path, [factor * (100 + seed)], env=env, seed=seed, noise=noise, rate=0.1)
             write_run(tmp_path, [100 + seed], env=env, seed=seed, noise=noise, rate=0.2)
     drawing = drawn_of(tmp_path)["effects_SAC"]
-    figure, caption = drawing.figure, drawing.caption
+    figure, caption = drawing.draw(), drawing.caption
     assert [ax.get_title() for ax in figure.axes] == ["Hopper-v5", "Walker2d-v5"]
     labels = [[text.get_text() for text in ax.get_yticklabels()] for ax in figure.axes]
     tried = [SCALE.replace("(", "\n("), ENDING]
@@ -822,15 +822,16 @@ def test_effects_of_many_configurations_are_a_heatmap(tmp_path):
     for seed in range(1, 8):
         write_run(tmp_path, [100], seed=seed)
         for i, rate in enumerate(rates):
-            write_run(tmp_path, [100 + (30 + seed) * (i == 0)], seed=seed, noise=SCALE, rate=rate)
+            effect = {0: 30 + seed, 1: -30 - seed}.get(i, 0)
+            write_run(tmp_path, [100 + effect], seed=seed, noise=SCALE, rate=rate)
     drawing = drawn_of(tmp_path)["effects_SAC"]
-    figure, caption = drawing.figure, drawing.caption
+    figure, caption = drawing.draw(), drawing.caption
     [image] = figure.axes[0].images
     assert image.get_array().shape == (1, len(rates)) and image.get_clim() == (-34, 34)
     assert image.cmap(0.5)[:3] == pytest.approx((1, 1, 1), abs=0.01)  # white at zero
     assert "end at \u00b1 34 %" in caption
     dots = [line.get_xdata()[0] for line in figure.axes[0].lines]
-    assert [round(x - 0.36) for x in dots] == [0]
+    assert [round(x - 0.36) for x in dots] == [0, 1]  # better, worse
 
 
 def test_odd_sweeps_are_analysed_too(tmp_path):
@@ -899,11 +900,9 @@ def test_numbers_near_zero_are_readable_everywhere(sparse):
         assert not re.search(r"[0-9]{6}", text.replace(",", "")), name
         assert "nan" not in text and "inf" not in text
     assert "-0.30 [-0.50, -0.10]" in (out / "best.md").read_text()  # Car-v0
-    effects = drawn_of(sparse.path / "runs")["effects_SAC"]
-    assert [ax.get_title() for ax in effects.figure.axes] == ["Car-v0", "Hopper-v5", "Maze-v0"]
-    marks = [
-        line.get_xdata()[0] for line in effects.figure.axes[2].lines if line.get_marker() == "o"
-    ]
+    effects = drawn_of(sparse.path / "runs")["effects_SAC"].draw()
+    assert [ax.get_title() for ax in effects.axes] == ["Car-v0", "Hopper-v5", "Maze-v0"]
+    marks = [line.get_xdata()[0] for line in effects.axes[2].lines if line.get_marker() == "o"]
     assert marks == pytest.approx([-1.3, 0.3])
 
 
@@ -911,15 +910,15 @@ def test_figures_have_labels_units_and_n(sweep):
     studies, _ = analysis.runs.make_studies(analysis.runs.read_runs(sweep.path / "runs"))
     tables = analysis.tables.make_tables(studies)
     drawings = {drawing.name: drawing for drawing in analysis.figures.figures(studies, tables)}
-    drawn = {name: drawing.figure for name, drawing in drawings.items()}
-    assert {name for name in drawn if drawings[name].narrow} == {"effects_SAC", "best_curves_SAC"}
-    assert set(drawn) == {
+    narrow = {name for name, drawing in drawings.items() if drawing.has_narrow}
+    assert narrow == {"effects_SAC", "best_curves_SAC"}
+    assert set(drawings) == {
         "effects_SAC",
         "best_curves_SAC",
         "curves_SAC_RandomEarlyTermination_50",
         "curves_SAC_RandomUniformScaleReward_0.5_1.5",
     }
-    curves = drawn["curves_SAC_RandomUniformScaleReward_0.5_1.5"]
+    curves = drawings["curves_SAC_RandomUniformScaleReward_0.5_1.5"].draw()
     assert [text.get_text() for text in curves.legends[0].get_texts()] == [
         "no noise (n = 4)",
         "rate 0.05 (n = 4)",
@@ -936,12 +935,12 @@ def test_figures_have_labels_units_and_n(sweep):
     [study] = studies  # an environment without this noise has no panel
     for config, returns in study.returns.items():
         returns[:, :, 0] = np.nan if config.noise == ENDING else 1.0
-    fig = analysis.figures.curves_figure(study, "RandomEarlyTermination(50)").figure
+    fig = analysis.figures.curves_figure(study, ENDING)
     assert [ax.get_title() for ax in fig.axes] == ["Pusher-v5"]
     study.returns[Configuration.parse(SCALE, 0.05)][:, :, 0] = (
         np.nan
     )  # nor has a rate that was not tried a line
-    fig = analysis.figures.curves_figure(study, SCALE).figure
+    fig = analysis.figures.curves_figure(study, SCALE)
     legend = [text.get_text() for text in fig.legends[0].get_texts()]
     assert legend[1] == "rate 0.05 (n = 4)" and len(fig.axes) == 2
 
@@ -953,7 +952,7 @@ def test_ablation_bars_stand_side_by_side(tmp_path):
         write_run(tmp_path, [20 * seed], seed=seed, noise=SCALE, rate=0.05)
         write_run(tmp_path, [30 * seed], seed=seed, noise=other, rate=0.05)
         write_run(tmp_path, [40 * seed], seed=seed, noise=other, rate=0.5)
-    figure = drawn_of(tmp_path)["parameters_SAC_RandomUniformScaleReward"].figure
+    figure = drawn_of(tmp_path)["parameters_SAC_RandomUniformScaleReward"].draw()
     (ax,) = figure.axes
     heights = [bar.get_height() for bar in ax.patches]
     np.testing.assert_equal(heights, [15, 30, NAN, 45, 60])
@@ -971,11 +970,22 @@ def test_markdown_and_latex_tables(sweep):
     assert "%" not in body and "_" not in body and latex.isascii()
 
 
+def test_numbers_that_are_shown_as_one_have_the_digits_of_their_spread():
+    """That is half of an interval, or else a standard deviation."""
+    numbers = {"difference": [12.345, 12.345, NAN], "difference_low": [11.111, NAN, NAN]}
+    numbers |= {"difference_high": [13.579, NAN, NAN], "pooled_std": [0.1, 123.0, NAN]}
+    numbers |= {"baseline_mean": [12.345, 12.345, NAN], "baseline_std": [0.123, NAN, NAN]}
+    text = analysis.formatting.shown(analysis.formatting.Table("", pd.DataFrame(numbers), "", ""))
+    assert list(text["difference"]) == ["12.3 [11.1, 13.6]", "12", "\u2013"]
+    assert list(text["no noise"]) == ["12.35 \u00b1 0.12", "12.35 \u00b1 \u2013", "\u2013"]
+
+
 @pytest.mark.parametrize("number, width", [(1, 5.2), (2, 8), (3, 10), (5, 10)])
 def test_a_figure_is_as_wide_as_its_panels_need(number, width):
-    figure, axes, _ = analysis.figures.panels(list("ABCDE"[:number]), ["no noise"])
+    what = list("ABCDE"[:number]), ["no noise"], "return", "steps"
+    figure, axes, _ = analysis.figures.panels(*what)
     assert figure.get_figwidth() == width and len(axes) == number
-    figure, _, _ = analysis.figures.panels(list("ABCDE"[:number]), ["no noise"], narrow=True)
+    figure, _, _ = analysis.figures.panels(*what, narrow=True)
     assert figure.get_figwidth() == 4.2
 
 

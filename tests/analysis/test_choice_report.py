@@ -164,7 +164,7 @@ def test_rates_that_change_are_read_sorted_and_shown(tmp_path):
     assert combined["noise_rate"] == "0.50 + 1.00 to 0.00"
     studies, _ = analysis.runs.make_studies(analysis.runs.read_runs(tmp_path / "runs"))
     figures = analysis.figures.figures(studies, analysis.tables.make_tables(studies))
-    drawn = {drawing.name: drawing.figure for drawing in figures}
+    drawn = {drawing.name: drawing.draw() for drawing in figures}
     lines = [text.get_text() for text in drawn["effects_SAC"].axes[0].get_yticklabels()]
     lines = [line.replace("\n(", "(") for line in lines]  # broken where there is little room
     changing = [f"{PUSH}, {rate}" for rate in ("0.00 to 1.00", "0.05", "1.00 to 0.00", "1.00")]

@@ -270,14 +270,14 @@ def test_heatmap_and_curves(tmp_path):
     write_tests(tmp_path, table, "Hopper-v5")
     runs = analysis.runs.read_runs(tmp_path)
     found, notes = analysis.robustness.read_robustness(tmp_path, runs)
-    tables = analysis.robustness.robustness_tables(found)
+    tables, _ = analysis.robustness.analyse_robustness(found)
     drawn = analysis.figures.robustness_figures(tables["robustness"].frame)
     drawn = {drawing.name: drawing for drawing in drawn}
     heatmap = "robustness_heatmap_PPO_Hopper-v5"
     curves = f"robustness_curves_PPO_{analysis.formatting.slug(SENSOR)}"
     assert notes == [] and set(drawn) == {heatmap, curves}
 
-    ax = drawn[heatmap].figure.axes[0]
+    ax = drawn[heatmap].draw().axes[0]
     rows = [label.get_text() for label in ax.get_yticklabels()]
     columns = [label.get_text() for label in ax.get_xticklabels()]
     assert rows == ["no noise", f"{PUSH}, 1.00", f"{SENSOR}, 0.20"]
@@ -289,11 +289,12 @@ def test_heatmap_and_curves(tmp_path):
     same = {(columns.index(f"{PUSH}, 1.00"), 1), (columns.index(f"{SENSOR}, 0.20"), 2)}
     assert dots == same and "A dot marks" in drawn[heatmap].caption
 
-    [ax] = drawn[curves].figure.axes
+    figure = drawn[curves].draw()
+    [ax] = figure.axes
     assert len(ax.lines) == 3
     assert ax.lines[0].get_xdata().tolist() == [0, 0.2, 0.5, 1]
     assert ax.lines[0].get_ydata().tolist() == [100, 80, 50, 40]
-    legend = [text.get_text() for text in drawn[curves].figure.legends[0].get_texts()]
+    legend = [text.get_text() for text in figure.legends[0].get_texts()]
     assert legend == rows
 
 
@@ -305,8 +306,9 @@ def test_robustness_of_another_experiment_is_apart(tmp_path):
         config["args"]["exp_name"] = "other"
         path.write_text(json.dumps(config))
     found, _ = analysis.robustness.read_robustness(tmp_path, analysis.runs.read_runs(tmp_path))
-    scores = analysis.robustness.robustness_tables(found)["robustness_score"].frame
-    assert scores.empty and set(found["exp_name"]) == {"ppo_continuous_noisy", "other"}
+    tables, sentences = analysis.robustness.analyse_robustness(found)
+    assert tables["robustness_score"].frame.empty and not sentences
+    assert set(found["exp_name"]) == {"ppo_continuous_noisy", "other"}
 
 
 def test_a_clean_return_of_zero_is_compared_in_units_of_the_return(tmp_path, capsys):
@@ -326,6 +328,7 @@ def test_a_clean_return_of_zero_is_compared_in_units_of_the_return(tmp_path, cap
     assert push.loc["", "p"] == pytest.approx(2 / 70**2)
     scores = push.filter(regex="percent$")
     assert scores.loc[["", "Maze-v0"]].isna().all(axis=None)
+    assert push.loc[["", "Maze-v0"], "worst_condition"].isna().all()
     assert scores.loc["Hopper-v5"].notna().all()
     text = capsys.readouterr().out
     assert f"all environments together, trained with {PUSH} at rate 1.00: more robust" in text

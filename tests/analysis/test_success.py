@@ -61,7 +61,8 @@ def test_the_verdict_is_in_percentage_points(runs_dir, capsys):
             assert not any(cells[name] for name in names if name.endswith("_percent"))
     report = (out / "report.html").read_text()
     assert "Final test success rate of every configuration" in report
-    assert "sum of rewards" not in report
+    figure = next(out.glob("curves_*.svg")).read_text()
+    assert "test success rate (%)" in figure and "sum of rewards" not in figure
 
 
 def test_success_is_beside_the_return(runs_dir, capsys):
