@@ -124,6 +124,11 @@ def harmful_noises(runs):
         effect = f["difference"], 2 * f["p"]  # Bonferroni's correction for two rates
         page, n = "TD3", f"runs: {sizes(f)}"
         rows.append(row(claim, page, float(paper), percents(f), [effect], n, claimed=-1))
+        if rate == "0.01":  # three other environments, tested together: plans.md, set C
+            f = comparisons(read_returns("td3_200k")).set_index("environment").loc["together"]
+            effect, claim = (f["difference_percent"], f["p"]), "The same, Hopper, Walker2d, Pusher"
+            n = "td3_200k: 12 + 12"
+            rows.append(row(claim, "C", float(paper), percents(f), [effect], n, claimed=-1))
     return rows
 
 
