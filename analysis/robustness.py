@@ -18,7 +18,7 @@ from analysis import verdicts
 from analysis.runs import KEYS, ROBUSTNESS_COLUMNS, STUDY, SUCCESS, study_name, where_tested
 from analysis.statistics import compare, holm, mean_std, percent_of
 from analysis.tables import table_of
-from noisy_wrappers import BASELINE, Configuration, rounded
+from noisy_wrappers import BASELINE, WRAPPERS, Configuration, rounded
 
 CLEAN = BASELINE  # a condition of a test is a Configuration, too
 RUN_COLUMNS = [*KEYS, "configuration", "seed", "elsewhere", "condition", "mean", "cvar"]
@@ -76,7 +76,11 @@ def read_episodes(path, metric="return"):
     table = table.assign(environment=table.get("environment", ""), result=results)
     table, found = table.dropna(subset="result"), {}
     for (noise, rate, environment), group in table.groupby(keys, sort=False)["result"]:
-        found[Configuration.parse(noise, rate), environment] = group.to_numpy(float)
+        condition = Configuration.parse(noise, rate)
+        unknown = [name for name in condition.wrappers if name not in WRAPPERS and ":" not in name]
+        if unknown:  # and none of the user's own
+            raise ValueError(f"unknown noise {unknown[0]!r}")
+        found[condition, environment] = group.to_numpy(float)
     return found
 
 
