@@ -1858,16 +1858,22 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and check the first observation."""
         self._steps = 0
-        with self._calling("reset(seed=..., options=...) must return (observation, info)"):
+        try:
             observation, info = self.env.reset(seed=seed, options=options)
+        except (SystemExit, TypeError, ValueError) as error:
+            self._explain(error, "reset(seed=..., options=...) must return (observation, info)")
+            raise
         return self._checked(observation), dict(info or {})
 
     def step(self, action: Any) -> Step:
         """Step the environment and check the observation and the reward."""
         self._steps += 1
-        values = "(observation, reward, terminated, truncated, info)"
-        with self._calling(f"step() must return {values}"):
+        try:
             observation, reward, terminated, truncated, info = self.env.step(copy.copy(action))
+        except (SystemExit, TypeError, ValueError) as error:
+            values = "(observation, reward, terminated, truncated, info)"
+            self._explain(error, f"step() must return {values}")
+            raise
         number = math.nan
         if not isinstance(reward, str):
             with contextlib.suppress(TypeError, ValueError):  # of None, or of several numbers
@@ -1900,25 +1906,20 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             parts[path] = part
         return _replaced(observation, parts) if parts else observation
 
-    @contextlib.contextmanager
-    def _calling(self, wanted: str) -> Iterator[None]:
-        """Say what is wrong if a wrapper, not the environment's code, failed to call or unpack.
+    def _explain(self, error: BaseException, wanted: str) -> None:
+        """Raise SpaceError if a wrapper, not the environment's code, failed to call or unpack.
 
-        An exit becomes an error, because a run would seem to have ended well.
+        An exit becomes a RuntimeError, because a run would seem to have ended well.
         """
         at = f"step {self._steps} of an episode: the environment"
-        try:
-            yield
-        except SystemExit as error:
+        if isinstance(error, SystemExit):
             text = f"{at} called sys.exit({error.code!r})"
             raise RuntimeError(text).with_traceback(error.__traceback__) from None
-        except (TypeError, ValueError) as error:
-            *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-            place = frame.f_globals.get("__name__", "")
-            is_old = re.search("unpack|unexpected keyword", str(error))
-            if is_old and place.startswith(("gymnasium.core", "gymnasium.wrappers.", __name__)):
-                raise SpaceError(f"{at}'s {wanted}: {error}") from error
-            raise
+        *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+        place = frame.f_globals.get("__name__", "")
+        is_old = re.search("unpack|unexpected keyword", str(error))
+        if is_old and place.startswith(("gymnasium.core", "gymnasium.wrappers.", __name__)):
+            raise SpaceError(f"{at}'s {wanted}: {error}") from error
 
     def _blame(self, what: str, value: Any, action: Any) -> None:
         """Stop at a value that is not finite, or rather at an action that was not, either."""
