@@ -100,8 +100,8 @@ def read_config(folder):
     """
     config = read_json(folder / "config.json")
 
-    def get(values, name, is_good):
-        value = values.get(name)
+    def get(values, name, is_good, default=None):
+        value = values.get(name, default)
         if not is_good(value):
             raise DamageError(f"config.json: {name} is {shortened(value)}")
         return value
@@ -113,9 +113,9 @@ def read_config(folder):
         return lambda value: isinstance(value, str) and is_good(value)
 
     args = get(config, "args", lambda value: isinstance(value, dict))
-    versions = get(config, "versions", lambda value: isinstance(value, dict | None))
+    versions = get(config, "versions", lambda value: isinstance(value, dict), default={})
     for name in args:
-        get(args, name, lambda value: not isinstance(value, dict))
+        get(args, name, is_flat)
     get(args, "max_episode_steps", lambda value: value is None or number(1)(value))
     noises, rates = args.get("noise"), args.get("noise_rate")
     try:
@@ -137,7 +137,7 @@ def read_config(folder):
         "total": get(args, "total_timesteps", number(1)),
         "args": args,
         "settings": {name: args[name] for name in args if name not in NOT_SETTINGS},
-        "versions": (versions or {}) | more,
+        "versions": versions | more,
     }
 
 
@@ -157,6 +157,12 @@ def read_result(folder, config):
         said = f"total_timesteps is {shortened(steps)}, in config.json {config['total']}"
         raise DamageError(f"result.json: {said}")
     return result
+
+
+def is_flat(value):
+    """Tell whether a value is what an argument may be: a single value, or a list of such."""
+    items = value if isinstance(value, list) else [value]
+    return not any(isinstance(item, list | dict) for item in items)
 
 
 def shortened(value):

@@ -87,10 +87,11 @@ def summary(progresses):
             for key in (progress.run.kind, None):
                 speeds.setdefault(key, []).append(progress.log.steps_per_second)
     speed = {key: harmonic_mean(values) for key, values in speeds.items()}
-    if running(progresses) and speed:
+    on_their_way = running(progresses)
+    if on_their_way and speed:
         seconds = sum(steps_left(p) / speed.get(p.run.kind, speed[None]) for p in progresses)
-        left = timedelta(seconds=round(seconds / len(running(progresses))))
-        now = sum(progress.log.steps_per_second for progress in running(progresses))
+        left = timedelta(seconds=round(seconds / len(on_their_way)))
+        now = sum(progress.log.steps_per_second for progress in on_their_way)
         text += f"; about {left} left"
         text += f", {now:,.0f} steps/s" * bool(now)  # a narrow terminal cuts the end off
     return text
@@ -237,7 +238,7 @@ def main(view, caller, argv):
     choices = []
     with contextlib.redirect_stdout(sys.stderr):  # what a user's module prints is no run
         args = parse_args(view, caller, argv)
-    if view == "status" and args.preset in (None, "custom") and args.given <= {"--runs-dir"}:
+    if not args.names_grid:
         runs = runs_in(args.runs_dir)
     elif args.preset == "choose":
         from sweep import choose  # and with it pandas: no other preset should wait for that

@@ -54,7 +54,11 @@ def parse_args(view, caller, argv):
     args.noises_of = preset
     if args.noises == [[("paper", None)]]:
         args.noises_of, args.noises = "paper", []
-    check(args)
+    # a status that names no grid is one of whatever the folder holds
+    whole_folder = preset in (None, "custom") and given <= {"--runs-dir"}
+    args.names_grid = view != "status" or not whole_folder
+    if args.names_grid:
+        check(args)
     return args
 
 

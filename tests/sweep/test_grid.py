@@ -17,6 +17,7 @@ import tyro
 from views import ROOT, finish, folders, locked, log_of, view
 
 import noisy_wrappers
+from sweep import options
 from sweep.grid import GIVEN_BY_THE_GRID, script_options
 
 ALGORITHMS = {"sac": 5, "td3": 5, "ppo": 10}  # seeds
@@ -118,6 +119,13 @@ def test_other_presets():
     ]
     picture = "runs/demo/results/curves_PPO_RandomNormalNoisyObservation_1.0.svg"
     assert picture in (ROOT / "Makefile").read_text()
+
+
+def test_a_status_of_a_whole_folder_asks_for_no_environment(tmp_path, monkeypatch):
+    finish(tmp_path / "one")
+    monkeypatch.setattr(options, "canonical_env_id", None)
+    shown = view("status", "--runs-dir", tmp_path)
+    assert (shown.code, shown.err) == (0, "") and "1 runs: 1 done" in shown.out
 
 
 def test_spellings_and_rate_zero_are_one_run():
