@@ -29,6 +29,7 @@ import json
 import math
 import os
 import runpy
+import shutil
 import signal
 import subprocess
 import sys
@@ -42,6 +43,12 @@ ALGOS = ("sac", "td3", "ppo")
 LEARNING_STARTS = 1000  # random steps of SAC and TD3, fewer than by default: they are not measured
 ROLLOUT = 2048  # the steps of PPO's rollout, the default of all programs here
 TOTAL_TIMESTEPS = 2_000_000  # more than any program takes before it is ended
+
+
+def fail(message):
+    """Exit with one line that says which argument is wrong."""
+    print("error:", message, file=sys.stderr)
+    raise SystemExit(2)
 
 
 # CHILDREN: what runs on the measured core, in the interpreter of the measured program. They rely on
@@ -273,6 +280,7 @@ def parse(argv):
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.error = fail
     add = parser.add_argument
     add("--algos", nargs="+", choices=ALGOS, default=ALGOS)
     add("--envs", nargs="+", default=["HalfCheetah-v5", "Humanoid-v5"], metavar="ENV_ID")
@@ -288,8 +296,20 @@ def parse(argv):
     options = parser.parse_args(argv[:end])
     options.flags = argv[end + 1 :]
     options.cores = sorted(os.sched_getaffinity(0), reverse=True)
+    for name, low in (("pairs", 1), ("seconds", 0.1), ("jobs", 2)):
+        value = getattr(options, name)
+        if value is not None and not value >= low:
+            fail(f"--{name} must be at least {low}, not {value}")
     if bool(options.against_cleanrl) != bool(options.cleanrl_python):
-        parser.error("--against-cleanrl and --cleanrl-python need each other")
+        fail("--against-cleanrl and --cleanrl-python need each other")
+    files = {"cleanrl": "cleanrl/sac_continuous_action.py", "checkout": "sac_continuous_noisy.py"}
+    for name, file in files.items():
+        folder = getattr(options, f"against_{name}")
+        if folder and not (folder / file).is_file():
+            fail(f"--against-{name}: there is no {folder / file}")
+    for program in filter(None, (options.cleanrl_python, options.against_sbx)):
+        if not shutil.which(program):
+            fail(f"{program} is not a program")
     return options
 
 

@@ -168,7 +168,22 @@ def test_an_interpreter_may_be_relative(tmp_path, monkeypatch):
     assert program.step == 100 and not (tmp_path / "bin/runs").exists()
 
 
-def test_cleanrl_needs_its_interpreter(capsys):
-    with pytest.raises(SystemExit):
-        bench.main(["--against-cleanrl", "."])
-    assert "--against-cleanrl and --cleanrl-python need each other" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--algos dqn", "invalid choice: 'dqn'"),
+        ("--seconds nan", "--seconds must be at least 0.1, not nan"),
+        ("--pairs 0", "--pairs must be at least 1, not 0"),
+        ("--jobs 1", "--jobs must be at least 2, not 1"),
+        ("--against-checkout .github", "--against-checkout: there is no .github/sac_continuous"),
+        ("--against-cleanrl .", "--against-cleanrl and --cleanrl-python need each other"),
+        ("--against-cleanrl . --cleanrl-python python3", "--against-cleanrl: there is no"),
+        ("--against-sbx ./no-python", "./no-python is not a program"),
+    ],
+)
+def test_bad_arguments(arguments, message, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        bench.main(arguments.split())
+    error = capsys.readouterr().err
+    assert exit_.value.code == 2
+    assert error.startswith("error: ") and message in error and error.count("\n") == 1
