@@ -46,10 +46,10 @@ class Environment(NamedTuple):
 # ------------------------------------------------------------------------------------- the question
 
 
-def ask(env_id, configurations=(), max_episode_steps=None, clock=time.perf_counter):
+def ask(env_id, configurations=(), max_episode_steps=None):
     """Make an environment as the scripts do, time it, and try configurations of noise on it.
 
-    clock: what times the environment. What it raises if it cannot be made or played passes through.
+    What it raises if it cannot be made or played passes through.
     """
     deadline = time.perf_counter() + PATIENCE
     with contextlib.redirect_stdout(sys.stderr):
@@ -57,7 +57,7 @@ def ask(env_id, configurations=(), max_episode_steps=None, clock=time.perf_count
         declared = made.spec.max_episode_steps
         with noisy.make_flat(made, constant("sac_continuous_noisy.py", "STEP_LIMIT")) as env:
             limit = env.spec.max_episode_steps
-            seconds, steps, length = time_steps(env, limit, deadline, clock)
+            seconds, steps, length = time_steps(env, limit, deadline)
             env.reset()  # a failure after this one is the noise's
             reasons = {noise: why_unfit(env, noise, limit, deadline) for noise in configurations}
             return Environment(
@@ -70,7 +70,7 @@ def ask(env_id, configurations=(), max_episode_steps=None, clock=time.perf_count
             )
 
 
-def time_steps(env, time_limit, deadline, clock):
+def time_steps(env, time_limit, deadline):
     """Return an environment's seconds a step, the steps timed, and the length of an episode.
 
     Each step bears its share of a reset: an episode is as long as those that ended while it was
@@ -85,17 +85,17 @@ def time_steps(env, time_limit, deadline, clock):
     ended = True
     while not steps or now < deadline and (steps < STEPS or now < begin + SECONDS):
         if ended:
-            start = clock()
+            start = time.perf_counter()
             env.reset()
-            resets, resetting = resets + 1, resetting + clock() - start
+            resets, resetting = resets + 1, resetting + time.perf_counter() - start
         action = env.action_space.sample()
-        start = clock()
+        start = time.perf_counter()
         _, _, terminated, truncated, _ = env.step(action)
-        steps, stepping = steps + 1, stepping + clock() - start
+        now = time.perf_counter()
+        steps, stepping = steps + 1, stepping + now - start
         ended = terminated or truncated
         if ended:
             episodes, in_episodes = episodes + 1, steps
-        now = time.perf_counter()
     length = in_episodes / episodes if episodes else time_limit
     return stepping / steps + resetting / resets / length, steps, math.ceil(length)
 
@@ -162,14 +162,9 @@ def run_seconds(run, environment):
     tests = math.ceil(steps / frequency) if frequency else 1
     test_steps = tests * run.options["eval-episodes"] * environment.episode_steps
     learned = max(0, steps - run.options.get("learning-starts", 0))
-    learning = learned * learning_seconds(run.kind[0], environment)
+    base, for_each = LEARNING[run.kind[0]]
+    learning = learned * (base + for_each * environment.observed)
     return START_UP + learning + (steps + test_steps) * environment.step_seconds
-
-
-def learning_seconds(algorithm, environment):
-    """Return about how many seconds an algorithm learns for each step of an environment."""
-    base, for_each = LEARNING[algorithm]
-    return base + for_each * environment.observed
 
 
 @functools.cache

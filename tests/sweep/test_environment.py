@@ -86,7 +86,8 @@ def test_resets_count_in_proportion(monkeypatch):
     clock.steps, clock.action_space = -1, clock  # the first step is not timed
     clock.seed = clock.sample = lambda *_: None
     monkeypatch.setattr(environment, "SECONDS", 0)
-    seconds, steps, length = environment.time_steps(clock, 1000, 1e9, lambda: clock.now)
+    monkeypatch.setattr(environment.time, "perf_counter", lambda: clock.now)
+    seconds, steps, length = environment.time_steps(clock, 1000, 1e9)
     assert (steps, length) == (200, 12)
     assert seconds == pytest.approx(0.5 + 6 / 12)
 
