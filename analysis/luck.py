@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from analysis.runs import STUDY, rows_of
-from analysis.statistics import LEVEL
+from analysis.statistics import LEVEL, pooled_std
 
 DRAWS = 10_000
 SEEDS_TO_RESAMPLE = 20  # with fewer seeds of the baseline, returns are taken as normal
@@ -61,13 +61,6 @@ def draw_differences(std, df, n_baseline, n_noisy, rng, seeds=()):
         if n > 0:
             differences[i] = spread * (mean_of(n) - baseline)
     return differences
-
-
-def pooled_std(samples):
-    """Return the standard deviation within samples, and its degrees of freedom."""
-    df = sum(len(sample) - 1 for sample in samples if len(sample))
-    squares = sum(((sample - sample.mean()) ** 2).sum() for sample in samples if len(sample))
-    return np.sqrt(squares / max(1, df)), df
 
 
 def summarize(environments, draws, percents):

@@ -39,6 +39,13 @@ def mean_std(values):
     return mean, values.std(ddof=1) if len(values) > 1 else nan, len(values)
 
 
+def pooled_std(samples):
+    """Return the standard deviation within samples (n_i), and its degrees of freedom."""
+    df = sum(len(sample) - 1 for sample in samples if len(sample))
+    squares = sum(((sample - np.mean(sample)) ** 2).sum() for sample in samples if len(sample))
+    return np.sqrt(squares / max(1, df)), df
+
+
 def percent_of(difference, baseline):
     """100 difference / |mean of the baseline|, or NaN where a percentage would mean nothing.
 

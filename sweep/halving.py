@@ -15,7 +15,7 @@ baseline on fresh seeds, in one comparison that is fixed beforehand.
 
 import math
 from itertools import count
-from statistics import fmean, variance
+from statistics import fmean
 from typing import NamedTuple
 
 import numpy as np
@@ -108,10 +108,8 @@ def spread(returns):
     for (noise, seed), value in returns.items():
         if seed < FIRST_CONFIRMATION_SEED:
             groups.setdefault(noise, []).append(value)
-    groups = [values for values in groups.values() if len(values) > 1]
-    freedom = sum(len(values) - 1 for values in groups)
-    squares = sum((len(values) - 1) * variance(values) for values in groups)
-    return math.sqrt(squares / freedom) if freedom else math.nan
+    std, freedom = statistics.pooled_std(list(groups.values()))
+    return float(std) if freedom else math.nan
 
 
 def missing(noises, seeds, returns):
