@@ -164,22 +164,30 @@ def environment_score(runs, config):
     if not conditions:
         return None
     clean, percent = y[CLEAN].mean(), percent_of(1.0, y[CLEAN])
-    clean_change = (x[CLEAN].mean() - clean) * percent
-    x, y = (side[conditions].mean(axis=1).to_numpy() for side in (x, y))
+
+    def score(returns):
+        """Return the score of every condition; returns: a frame of by_run."""
+        return (returns[conditions].mean() - clean) * percent
+
+    scores, baseline_scores = score(x), score(y)
     own = runs[runs["configuration"] == config].iloc[0]
-    row = own[[*KEYS, "elsewhere"]].to_dict() | compare(x, y)._asdict()
-    row |= {"scope": "environment", "x": x, "y": y, "conditions": len(conditions)}
-    row |= {"difference_percent": (x.mean() - y.mean()) * percent}
-    row |= {"clean_change_percent": clean_change, "worst_condition": ""}
-    for side, prefix in ((BASELINE, "baseline_"), (config, "")):
-        for value, name in (("cvar", "cvar_score"), ("mean", "score")):
-            scores = (by_run(runs, side, value)[conditions].mean() - clean) * percent
-            row[f"{prefix}{name}_percent"] = scores.mean()
-        row[f"{prefix}worst_score_percent"] = scores.min()
+    row = own[[*KEYS, "elsewhere"]].to_dict() | {
+        "clean_change_percent": (x[CLEAN].mean() - clean) * percent,
+        "score_percent": scores.mean(),
+        "baseline_score_percent": baseline_scores.mean(),
+        "worst_score_percent": scores.min(),
+        "baseline_worst_score_percent": baseline_scores.min(),
+        "cvar_score_percent": score(by_run(runs, config, "cvar")).mean(),
+        "baseline_cvar_score_percent": score(by_run(runs, BASELINE, "cvar")).mean(),
+        "worst_condition": "",
+    }
     if scores.notna().all():  # what has no percentages cannot be ranked
         worst = scores.idxmin()
         row["worst_condition"] = f"{worst.noise} at {worst.noise_rate}"
-    return row
+    x, y = (side[conditions].mean(axis=1).to_numpy() for side in (x, y))
+    row |= compare(x, y)._asdict()
+    row |= {"difference_percent": (x.mean() - y.mean()) * percent}
+    return row | {"scope": "environment", "x": x, "y": y, "conditions": len(conditions)}
 
 
 def average_score(scores):
