@@ -56,7 +56,7 @@ def progress_of(run, over):
     if status in STOPPED:
         return Progress(run, log, "to do", "stopped")
     if status == 0:  # the run was finished, and its folder has been moved or deleted since
-        return Progress(run, log, "to do", "no result.json")
+        return Progress(run, log._replace(step=0), "to do", "no result.json")
     if status is not None:
         ended = f"signal {status - 128}" if status > 128 else f"exit {status}"
         return Progress(run, log, "failed", ended)

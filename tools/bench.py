@@ -300,6 +300,9 @@ def parse(argv):
         value = getattr(options, name)
         if value is not None and not value >= low:
             fail(f"--{name} must be at least {low}, not {value}")
+    others = (options.against_cleanrl, options.against_sbx, options.against_checkout)
+    if options.jobs and any(others):
+        fail("--jobs compares runs of this version only: leave out --against-...")
     if bool(options.against_cleanrl) != bool(options.cleanrl_python):
         fail("--against-cleanrl and --cleanrl-python need each other")
     files = {"cleanrl": "cleanrl/sac_continuous_action.py", "checkout": "sac_continuous_noisy.py"}

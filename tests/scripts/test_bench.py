@@ -179,6 +179,7 @@ def test_an_interpreter_may_be_relative(tmp_path, monkeypatch):
         ("--against-cleanrl .", "--against-cleanrl and --cleanrl-python need each other"),
         ("--against-cleanrl . --cleanrl-python python3", "--against-cleanrl: there is no"),
         ("--against-sbx ./no-python", "./no-python is not a program"),
+        ("--jobs 2 --against-checkout .", "--jobs compares runs of this version only"),
     ],
 )
 def test_bad_arguments(arguments, message, capsys):

@@ -148,7 +148,10 @@ def test_noises_that_cannot_act_are_left_out_or_refused(tmp_path):
         f"error: --noises: these cannot act in toy_envs:Tiny-v0: {LATE} (an episode has at most 8 "
         "steps)"
     )
-    assert choose("Tiny", *named, "--runs-dir", tmp_path, "--", "--max-episode-steps=50").code == 0
+    longer = ["--runs-dir", tmp_path, "--", "--max-episode-steps=50"]
+    assert choose("Tiny", *named, *longer).code == 0
+    named[1] = "RandomEarlyTermination(50, truncate=True)"  # where the time limit truncates, too
+    assert choose("Tiny", *named, *longer).code == 2
     assert choose("Tiny", "--noises", "paper", "--runs-dir", tmp_path).out.count("\n") == 84
 
 

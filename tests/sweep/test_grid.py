@@ -166,9 +166,9 @@ def test_rates_of_ones_own_and_pairs():
 
 
 def test_status_arithmetic(tmp_path):
-    grid = ["baseline", "--algos", "sac", "--envs", "Hopper-v5", "--seeds", "1-6"]
+    grid = ["baseline", "--algos", "sac", "--envs", "Hopper-v5", "--seeds", "1-7"]
     grid += ["--total-timesteps", "1000", "--runs-dir", tmp_path]
-    done, running, slow, failed, stopped, lost = folders(*grid)
+    done, running, slow, failed, stopped, lost, deleted = folders(*grid)
     (tmp_path / "logs").mkdir()
     finish(done)
     for folder, text in {
@@ -179,15 +179,16 @@ def test_status_arithmetic(tmp_path):
         "(training stopped)\n# now host: exit=1\n",
         stopped: "step=500/1000 sps=100\n# now host: exit=143\n",
         lost: "step=500/1000 sps=100\n",
+        deleted: "step=1000/1000 sps=100\n# now host: exit=0\n",
     }.items():
         log_of(folder).write_text("# now host: python sac_continuous_noisy.py --seed 1\n" + text)
     os.utime(log_of(lost), (time.time() - 300,) * 2)
     with locked(running):
         result = view("status", *grid)
     assert result.code == 0
-    # 800 + 800 + 400 + 500 + 500 steps are left. At 200, 100, 10, 100, 100 and 100 steps per second
-    # the mean time of a step is 0.145 / 6 seconds, and two runs run at a time: 36.25 seconds.
-    state = "6 runs: 1 done, 1 running, 1 probably running, 1 failed, 2 to do; about 0:00:36 left, "
+    # 800 + 800 + 400 + 500 + 500 + 1000 steps are left. At 200, 100, 10, 100, 100, 100 and 100
+    # steps per second the mean time of a step is 0.155 / 7 seconds; two run at a time: 44.29 s.
+    state = "7 runs: 1 done, 1 running, 1 probably running, 1 failed, 3 to do; about 0:00:44 left, "
     state += "110 steps/s"
     assert state in result.out
     assert re.search(rf"exit 1 +{log_of(failed)} +ValueError: broken\n", result.out)
