@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from analysis.errors import fail, in_words
 from analysis.folders import CONFIRMATION, SEARCH, flat_choice
-from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED, SUCCESS, read_run
+from analysis.runs import CHOICE_COLUMNS, SUCCESS, read_run
 from analysis.statistics import detectable_shift, holm
 from analysis.verdicts import POINTS, what_all_runs_do
 from noisy_wrappers import BASELINE, Configuration, rounded
@@ -93,7 +93,7 @@ def follow(args, algorithm, env_id, environment):
         fail(f"--budget must be at least {len(noises)}, a run for each noise, not {budget}")
     schedule = halving.schedule(len(noises), budget)
     last_seed = sum(seeds for _, seeds in schedule)
-    if last_seed >= FIRST_CONFIRMATION_SEED:
+    if last_seed >= halving.FIRST_CONFIRMATION_SEED:
         fail(f"--budget {budget} is too large: the best noises would run with {last_seed} seeds")
     state, runs, tests, returns = walk(args, algorithm, env_id, noises, budget)
     folders = {steps: runs[key].folder for key, (steps, _) in tests.items()}
@@ -132,7 +132,7 @@ def walk(args, algorithm, env_id, noises, budget):
         if runs.keys() >= set(state.due):  # they have not finished
             return state, runs, tests, returns
         for noise, seed in state.due:
-            phase = SEARCH if seed < FIRST_CONFIRMATION_SEED else CONFIRMATION
+            phase = SEARCH if seed < halving.FIRST_CONFIRMATION_SEED else CONFIRMATION
             run, row = read(make_run(args, algorithm, env_id, noise, seed, phase))
             runs[noise, seed] = run
             if row:

@@ -21,10 +21,10 @@ from typing import NamedTuple
 import numpy as np
 
 from analysis import statistics, verdicts
-from analysis.runs import FIRST_CONFIRMATION_SEED
 from analysis.statistics import LEVEL  # of a verdict, two-sided, over all verdicts of one command
 from noisy_wrappers import BASELINE, Configuration, rounded
 
+FIRST_CONFIRMATION_SEED = 1001  # the search uses those below
 SCORED = 0.15  # a run's score in the search is the mean of its tests in this last part of its steps
 
 

@@ -15,12 +15,13 @@ import pytest
 import simulate_choose
 import stub_run
 
-from analysis.runs import CHOICE_COLUMNS, FIRST_CONFIRMATION_SEED
+from analysis.runs import CHOICE_COLUMNS
 from analysis.statistics import Comparison, holm
 from noisy_wrappers import BASELINE, Configuration, rounded
 from sweep import choose
 from sweep.environment import Environment, remember
 from sweep.halving import (
+    FIRST_CONFIRMATION_SEED,
     advance,
     compare,
     fewest_seeds,
