@@ -201,7 +201,6 @@ run_todo() {
     fail "--runs-dir: cannot write to $logs: ${reason##*: }"
   locks_work "$list" || fail "--runs-dir: $(no_locks "$logs")"
   if [ "$executor" = slurm ]; then
-    trap - EXIT # its tasks read the list later
     submit
     [ -n "$wait" ] || exit "$stopped"
     [ "${#ids[@]}" -gt 0 ] || return 0 # stopped before the first array

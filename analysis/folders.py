@@ -43,13 +43,13 @@ def is_run(folder):
 
 def has_begun(folder):
     """Tell whether a run has written more than its lock."""
-    return any((folder / name).exists() for name in ("config.json", "eval.csv"))
+    return any(os.path.exists(folder / name) for name in ("config.json", "eval.csv"))
 
 
 def runs_of(runs_dir):
     """Return the run folders of a folder of runs, those of a choice's two phases included."""
     folders = [runs_dir, *(runs_dir / phase for phase in PHASES)]
-    children = [child for folder in folders if folder.is_dir() for child in folder.iterdir()]
+    children = [child for folder in folders if os.path.isdir(folder) for child in folder.iterdir()]
     return sorted(filter(is_run, children))
 
 
@@ -146,7 +146,7 @@ def read_result(folder, config):
 
     config: from read_config. Raises DamageError.
     """
-    if not (folder / "result.json").exists():
+    if not os.path.exists(folder / "result.json"):
         return None
     result = read_json(folder / "result.json")
     mean = result.get("final_return_mean")
@@ -213,7 +213,7 @@ class Log(NamedTuple):
 def read_log(folder):
     """Read the end of the log that a sweep keeps of a run."""
     path = folder.parent / "logs" / f"{folder.name}.log"
-    if not path.is_file():
+    if not os.path.isfile(path):
         return Log(path, math.inf, 0, 0, None, "")
     with open(path, "rb") as file:
         status = os.fstat(file.fileno())

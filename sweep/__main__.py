@@ -219,6 +219,8 @@ def check_disk(folder):
             file.write(bytes(100_000))
             file.flush()
             os.fsync(file.fileno())
+    except FileNotFoundError:
+        pass  # nothing was started from here
     except OSError as error:
         print(f"error: cannot write to {folder}: {error.strerror}", file=sys.stderr)
 
@@ -238,15 +240,15 @@ def main(view, caller, argv):
     choices = []
     with contextlib.redirect_stdout(sys.stderr):  # what a user's module prints is no run
         args = parse_args(view, caller, argv)
-    if not args.names_grid:
-        runs = runs_in(args.runs_dir)
-    elif args.preset == "choose":
-        from sweep import choose  # and with it pandas: no other preset should wait for that
+        if not args.names_grid:
+            runs = runs_in(args.runs_dir)
+        elif args.preset == "choose":
+            from sweep import choose  # and with it pandas: no other preset should wait for that
 
-        choices = choose.choices(args)
-        runs = [run for choice in choices for run in choice.runs.values()]
-    else:
-        runs = grid(args)
+            choices = choose.choices(args)
+            runs = [run for choice in choices for run in choice.runs.values()]
+        else:
+            runs = grid(args)
     runs.sort(key=lambda run: run.seed)  # the first seed of everything first
     return VIEWS[view](args, runs, choices) or 0
 

@@ -45,7 +45,8 @@ class Choice(NamedTuple):
 def choices(args):
     """Return the choices of one command, or exit if its numbers make no choice.
 
-    Where runs are listed, the environments of choices that have not begun are made and timed.
+    Where runs are listed, environments are made, timed and tried with noises: those of choices that
+    have no runs yet, and those in which some of the noises were never tried.
     """
     pairs = list(itertools.product(dict.fromkeys(args.algos), args.envs))
     fewest = halving.fewest_seeds(len(pairs))
@@ -55,31 +56,31 @@ def choices(args):
             f"difference could be significant (number of verdicts: {len(pairs)})"
         )
     known = {env_id: remembered(args.runs_dir, env_id) for env_id in args.envs}
-    found = [follow(args, *pair, known[pair[1]]) for pair in pairs]
-    listed = args.view in ("list", "dry-run")
-    new = [choice.kind for choice in found if listed and not choice.returns]
-    if not new:
-        return found
-    noises = {env_id: candidates(args, algorithm, env_id) for algorithm, env_id in new}
+    noises = {}  # to try, by environment
+    for algorithm, env_id in pairs if args.view in ("list", "dry-run") else ():
+        tried = known[env_id].tried if known[env_id] else {}
+        named = candidates(args, algorithm, env_id)
+        has_runs = follow(args, algorithm, env_id, None).returns
+        if not has_runs or not {noise.noise for noise in named} <= tried.keys():
+            noises[env_id] = named
     for env_id, answer in ask_all(args, noises).items():
-        leave_out(args, env_id, answer.unfit)
         known[env_id] = answer
+        if (unfit := unfit_noises(answer.tried)) and not args.noises:
+            text = f"{env_id}: left out, because they cannot act there: {unfit}"
+            print(text, file=sys.stderr)
         if args.view == "list":
             remember(args.runs_dir, env_id, answer)
     return [follow(args, *pair, known[pair[1]]) for pair in pairs]
 
 
-def leave_out(args, env_id, unfit):
-    """Say which noises cannot act in an environment; exit if the user has named them."""
+def unfit_noises(tried):
+    """Return the noises that cannot act in an environment, those with one reason together."""
     noises_of = {}
-    for noise, reason in unfit.items():
-        reason = reason.removeprefix(noise.partition("(")[0]).strip()  # of several noises, often
-        noises_of.setdefault(reason, []).append(noise)
-    told = "; ".join(f"{', '.join(noises)} ({reason})" for reason, noises in noises_of.items())
-    if told and args.noises:
-        fail(f"--noises: these cannot act in {env_id}: {told}")
-    if told:
-        print(f"{env_id}: left out, because they cannot act there: {told}", file=sys.stderr)
+    for noise, reason in tried.items():
+        if reason:
+            reason = reason.removeprefix(noise.partition("(")[0]).strip()  # of several, often
+            noises_of.setdefault(reason, []).append(noise)
+    return "; ".join(f"{', '.join(noises)} ({reason})" for reason, noises in noises_of.items())
 
 
 def follow(args, algorithm, env_id, environment):
@@ -87,7 +88,7 @@ def follow(args, algorithm, env_id, environment):
 
     environment: what is known of it, or None.
     """
-    noises = candidates(args, algorithm, env_id, environment.unfit if environment else {})
+    noises = candidates(args, algorithm, env_id, environment.tried if environment else {})
     budget = 3 * len(noises) if args.budget is None else args.budget
     if budget < len(noises):
         fail(f"--budget must be at least {len(noises)}, a run for each noise, not {budget}")
@@ -147,7 +148,7 @@ def walk(args, algorithm, env_id, noises, budget):
 def read(run):
     """Return a run, with what is damaged in it, and its data, None if it has not finished."""
     runs_dir, phase = run.folder.parents[1], run.folder.parent
-    if not phase.exists() and (runs_dir / run.folder.name).exists():
+    if not phase.exists() and os.path.exists(runs_dir / run.folder.name):
         fail(f"{flat_choice(runs_dir)} (or choose another --runs-dir, if it is another sweep)")
     if not result(run)[0]:
         return run, None
@@ -158,8 +159,11 @@ def read(run):
     return run._replace(damage=damage), None
 
 
-def candidates(args, algorithm, env_id, unfit=()):
-    """Return the noises to choose from, each once, but for those that cannot act there."""
+def candidates(args, algorithm, env_id, tried=()):
+    """Return the noises to choose from, each once, but for those that cannot act there.
+
+    tried: see Environment. Exits if the user has named one that cannot act.
+    """
     noises = dict.fromkeys(configurations(args, algorithm, env_id))
     noises.pop(BASELINE, None)  # at rate 0 a noise is none
     for pairs in args.exclude:
@@ -169,7 +173,10 @@ def candidates(args, algorithm, env_id, unfit=()):
         if excluded not in noises:
             fail(f"--exclude: {excluded} is not among the noises")
         del noises[excluded]
-    noises = [noise for noise in noises if noise.noise not in unfit]
+    reasons = {noise.noise: tried[noise.noise] for noise in noises if noise.noise in tried}
+    if args.noises and any(reasons.values()):
+        fail(f"--noises: these cannot act in {env_id}: {unfit_noises(reasons)}")
+    noises = [noise for noise in noises if not reasons.get(noise.noise)]
     if not noises:
         fail("there is no noise to choose from")
     return noises

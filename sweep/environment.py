@@ -40,7 +40,7 @@ class Environment(NamedTuple):
     episode_steps: int  # of a test: the time limit; without one, what the timed episodes had
     observed: int  # numbers in an observation
     bounded: bool  # are its actions? SAC and TD3 need that
-    unfit: dict[str, str]  # noises that cannot act here, as Configuration.noise -> why
+    tried: dict[str, str]  # noises: why each cannot act here, or ""; by Configuration.noise
 
 
 # ------------------------------------------------------------------------------------- the question
@@ -59,14 +59,14 @@ def ask(env_id, configurations=(), max_episode_steps=None):
             limit = env.spec.max_episode_steps
             seconds, steps, length = time_steps(env, limit, deadline)
             env.reset()  # a failure after this one is the noise's
-            reasons = {noise: why_unfit(env, noise, limit, deadline) for noise in configurations}
+            tried = {n.noise: why_unfit(env, n, limit, deadline) for n in configurations}
             return Environment(
                 step_seconds=seconds,
                 timed_steps=steps,
                 episode_steps=declared or length,
                 observed=math.prod(env.observation_space.shape),
                 bounded=bool(np.isfinite([env.action_space.low, env.action_space.high]).all()),
-                unfit={noise.noise: reason for noise, reason in reasons.items() if reason},
+                tried=tried,
             )
 
 
@@ -222,8 +222,10 @@ def time_left(batches, jobs, elsewhere=False):
 
 
 def remember(runs_dir, env_id, environment):
-    """Keep what was found, for a status."""
+    """Keep what was found, for a status; what other noises did there is kept, too."""
     path = file_of(runs_dir, env_id)
+    if before := remembered(runs_dir, env_id):
+        environment = environment._replace(tried=before.tried | environment.tried)
     with contextlib.suppress(OSError):  # benchmark.sh will say so
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(environment))

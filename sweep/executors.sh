@@ -113,6 +113,7 @@ submit() { # the array's indices are line numbers, counted from the offset of it
       [ "$stopped" -eq 0 ] || break # Ctrl-C ends sbatch, too
       fail "sbatch refused runs $((offset + 1)) to $((offset + n)); submitted before: ${ids[*]}"
     }
+    trap - EXIT # of benchmark.sh, which removes the list: the tasks read it later
     ids+=("${id%%;*}")
   done
   if [ "$stopped" -eq 0 ]; then

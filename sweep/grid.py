@@ -261,7 +261,7 @@ def runs_in(folder):
     runs = []
     for path in sorted(folders):
         kind, steps, damage = ("", ""), 0, ""  # unknown: it has failed before it began
-        if (path / "config.json").exists():
+        if os.path.exists(path / "config.json"):
             try:
                 config = read_config(path)
                 kind, steps = (config["exp_name"], config["environment"]), config["total"]
@@ -276,7 +276,7 @@ def result(run):
 
     Exits if the folder holds a finished run of another length or with other options.
     """
-    if run.damage or not (run.folder / "result.json").exists():
+    if run.damage or not os.path.exists(run.folder / "result.json"):
         return False, run.damage
     try:
         config = read_config(run.folder)
@@ -314,7 +314,8 @@ def other_options(run, made_with):
 def command_line(run):
     """Return a run's command, complete: it can be pasted into a shell in the project's folder."""
     words = [os.environ.get("PYTHON", "python"), *run.command]
-    own = any(re.match(r"[\w.]+:[A-Za-z_]", word) for word in run.command)  # module:Name
+    noises = any(re.match(r"[\w.]+:[A-Za-z_]", word) for word in run.command)  # module:Name(...)
+    own = ":" in run.kind[1] or noises
     if own and "PYTHONPATH" in os.environ:  # where a module of the user's lies
         words = ["env", f"PYTHONPATH={os.environ['PYTHONPATH']}", *words]
     return shlex.join(words)

@@ -47,6 +47,8 @@ def parse_args(view, caller, argv):
         fail(unknown_option(name, known))
     parser.set_defaults(**PRESETS.get(preset, {}))
     args = parser.parse_args(words)
+    if args.preset != preset:
+        fail(f"the preset comes first: {args.preset} --...")
     args.view, args.given, args.extra = view, given, extra
     args.jobs, args.elsewhere = machines()
     args.runs_dir = from_project(caller, args.runs_dir)
@@ -127,6 +129,12 @@ def from_project(caller, text):
         path = os.path.relpath(path)
     if not re.fullmatch(r"[^-\t\n][^\t\n]*", path):
         fail("--runs-dir must be a path without tabs and newlines that begins with no dash")
+    try:
+        os.stat(path)
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        fail(f"--runs-dir: {path}: {error.strerror}")
     return path
 
 

@@ -42,7 +42,7 @@ PROJECT = Path(__file__).resolve().parent.parent
 ALGOS = ("sac", "td3", "ppo")
 LEARNING_STARTS = 1000  # random steps of SAC and TD3, fewer than by default: they are not measured
 ROLLOUT = 2048  # the steps of PPO's rollout, the default of all programs here
-TOTAL_TIMESTEPS = 2_000_000  # more than any program takes before it is ended
+TOTAL_TIMESTEPS = 10**9  # more than any program takes before it is ended
 
 
 def fail(message):

@@ -26,6 +26,13 @@ def choose(env, *words, view_name="dry-run", algos=("ppo",)):
     return view(view_name, "choose", "--algos", *algos, "--envs", f"toy_envs:{env}-v0", *words)
 
 
+def train(line):
+    """Do a run of a list."""
+    command = shlex.split(line.split("\t")[1])
+    script = next(i for i, word in enumerate(command) if word.endswith("_noisy.py"))
+    stub_run.train(command[script:])
+
+
 def planned(algorithm, env_id, *words):
     """Return the baseline of a grid with these options."""
     args = parse_args("list", "/", ["custom", *words])
@@ -160,6 +167,17 @@ def test_what_an_environment_prints_is_no_command(tmp_path):
     assert "reset!" in shown.err and "reset!" not in shown.out
 
 
+def test_what_a_noise_prints_is_no_command(tmp_path, monkeypatch):
+    text = "import noisy_wrappers\nprint('loaded!')\n\n\nclass Loud(noisy_wrappers.RewardNoise):\n"
+    (tmp_path / "loud_noises.py").write_text(f"{text}    pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    words = ["--algos", "ppo", "--envs", "Hopper", "--seeds", "1", "--runs-dir", tmp_path]
+    shown = view("list", "custom", *words, "--noises", "loud_noises:Loud()@1")
+    assert shown.code == 0 and "loaded!" in shown.err
+    folders = [Path(line.split("\t")[0]).name for line in shown.out.splitlines()]
+    assert [name.partition("_s1_")[0] for name in folders] == ["baseline", "p1.0"]
+
+
 # WHAT IT COSTS
 
 
@@ -263,12 +281,29 @@ def test_a_status_makes_no_environment(tmp_path, monkeypatch):
 def test_a_choice_that_has_begun_is_not_asked_again(tmp_path, monkeypatch):
     words = ["--runs-dir", tmp_path, "--noises", f"{SCALE}@1", "--confirm", "4"]
     words += ["--total-timesteps", "4000"]
-    command = choose("Tiny", *words).out.splitlines()[0].split("\t")[1]
-    stub_run.train(shlex.split(command[command.index("ppo_") :]))  # it says that it took 36 seconds
+    train(choose("Tiny", *words, view_name="list").out.splitlines()[0])  # it says: in 36 seconds
     monkeypatch.setattr(environment, "ask", None)
     shown = choose("Tiny", *words)
     assert shown.code == 0
     assert "1 are done, about 0.07 core-hours are left" in shown.err
+
+
+def test_another_choice_in_the_folder_changes_no_noises_of_the_first(tmp_path):
+    short = ["--runs-dir", tmp_path, "--total-timesteps", "4000"]
+    first = [*short, "--noise-rates", "1"]
+    train(choose("Tiny", *first, view_name="list").out.splitlines()[0])
+    other = ["--noises", f"{SCALE}@1", "--confirm", "4", *short]
+    for line in choose("Tiny", *other, view_name="list").out.splitlines():
+        train(line)
+    assert "8 of 8 noises" in choose("Tiny", *first, view_name="status").out
+    [path] = tmp_path.glob("logs/*.json")
+    path.unlink()
+    assert "8 of 8 noises" in choose("Tiny", *first, view_name="list").err
+    # what no earlier choice tried is tried, and one that cannot act is refused whoever asks again
+    for _ in range(2):
+        other[1] = f"{LATE[:-1]}, 60)@1"
+        shown = choose("Tiny", *other, view_name="list")
+        assert shown.code == 2 and "60) (an episode has at most 8 steps)" in shown.err
 
 
 def test_what_cannot_be_read_is_asked_again(tmp_path):

@@ -11,6 +11,7 @@ import sys
 import time
 from collections import Counter
 from importlib import import_module
+from pathlib import Path
 
 import pytest
 import tyro
@@ -18,7 +19,7 @@ from views import ROOT, finish, folders, locked, log_of, view
 
 import noisy_wrappers
 from sweep import options
-from sweep.grid import GIVEN_BY_THE_GRID, script_options
+from sweep.grid import GIVEN_BY_THE_GRID, PlannedRun, command_line, script_options
 
 ALGORITHMS = {"sac": 5, "td3": 5, "ppo": 10}  # seeds
 SCALE = "RandomUniformScaleReward(0.5, 1.5)"
@@ -121,6 +122,36 @@ def test_other_presets():
     assert picture in (ROOT / "Makefile").read_text()
 
 
+def test_a_status_with_a_preset_that_is_not_the_first_word_is_refused(tmp_path):
+    result = view("status", "--runs-dir", tmp_path, "demo")
+    assert (result.code, result.err) == (2, "error: the preset comes first: demo --...\n")
+
+
+def test_a_folder_that_no_file_system_can_hold_ends_in_a_line(tmp_path):
+    for words in ("list demo", "status demo", "status"):
+        result = view(*words.split(), "--runs-dir", tmp_path / ("x" * 300))
+        assert result.code == 2 and result.err.count("\n") == 1, result.err
+        assert result.err.startswith("error: --runs-dir: /") and "too long" in result.err
+
+
+@pytest.mark.parametrize(
+    ("env_id", "noise", "is_own"),
+    [
+        ("Hopper-v5", A, False),
+        ("my_envs:2D-v0", A, True),
+        ("Hopper-v5", "my_noises:Sticky(2)", True),
+    ],
+)
+def test_a_command_with_a_module_of_the_users_takes_the_path_along(
+    env_id, noise, is_own, monkeypatch
+):
+    monkeypatch.setenv("PYTHONPATH", "/own")
+    command = ["ppo_continuous_noisy.py", "--env-id", env_id, "--noise", noise]
+    command += ["--noise-rate", "1.0:0.0"]
+    run = PlannedRun(Path("runs/x"), ("ppo", env_id), 1, 1000, command, {})
+    assert command_line(run).startswith("env PYTHONPATH=/own ") is is_own
+
+
 def test_a_status_of_a_whole_folder_asks_for_no_environment(tmp_path, monkeypatch):
     finish(tmp_path / "one")
     monkeypatch.setattr(options, "canonical_env_id", None)
@@ -197,6 +228,15 @@ def test_status_arithmetic(tmp_path):
         ["0:01:20", "10/s", "200", str(slow)],
         ["0:00:08", "100/s", "200", str(running)],
     ]
+
+
+def test_a_report_of_runs_without_logs_does_not_blame_the_disk(tmp_path):
+    grid = ["baseline", *GRID, "--total-timesteps", "1000", "--runs-dir", tmp_path]
+    [folder] = folders(*grid)
+    finish(folder)
+    (folder / "result.json").write_text("{")
+    result = view("report", *grid)
+    assert result.code == 1 and "damaged" in result.out and not result.err
 
 
 def test_a_finished_run_of_another_length_is_not_taken_for_done(tmp_path):
