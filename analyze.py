@@ -95,7 +95,7 @@ def write_results(out, results, latex):
     out.mkdir(parents=True, exist_ok=True)
     for table in results.tables.values():
         write_table(out, table, latex)
-    drawn = list(figures(results.studies, results.tables))
+    drawn = figures(results.studies, results.tables)
     names = {*results.tables}
     for drawing in drawn:
         names |= write_figure(out, drawing, latex)

@@ -118,6 +118,12 @@ class FinishedRun:
         return self.elsewhere or self.environment
 
     @property
+    def study(self):
+        """What its study's name is made of: the algorithm, the exp_name, the phase of a choice."""
+        phase = self.folder.resolve().parent.name
+        return self.algorithm, self.exp_name, phase if phase in PHASES else ""
+
+    @property
     def runs_dir(self):
         """The folder of all runs beside it, in both phases of a choice."""
         folder = self.folder.resolve().parent
@@ -385,10 +391,10 @@ def names_of(runs):
     """Name each run's study as analyze.py does, and in which arguments the run differs from it."""
     studies = {}
     for run in runs:
-        studies.setdefault((run.algorithm, run.exp_name), []).append(run.settings)
+        studies.setdefault(run.study, []).append(run.settings)
     usual = {key: usual_settings(settings) for key, settings in studies.items()}
     for run in runs:
-        key = run.algorithm, run.exp_name
+        key = run.study
         own = [f"{name}={run.settings[name]}" for name in difference(run.settings, usual[key])]
         yield ", ".join([study_name(*key), *own])
 

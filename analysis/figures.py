@@ -39,16 +39,22 @@ class Drawing:
 
 
 def figures(studies, tables):
-    """Yield a Drawing for every figure, in the order of the report."""
+    """Return a Drawing for every figure, in the order of the report; each has another name."""
+    drawings, used = [], set()
     for study in studies:
-        yield from comparison_figures(study, tables["statistics"].frame, tables["best"].frame)
+        drawings += comparison_figures(study, tables["statistics"].frame, tables["best"].frame)
         for noise in sorted({config.noise for config in study.returns} - {""}) or [""]:
             title = f"{study.name}, {noise or 'no noise'}"
             caption = f"{title}: learning curves, mean over n seeds, shaded {ONE_STD}."
-            yield Drawing("curves", title, caption, partial(curves_figure, study, noise))
-        yield from ablation_figures(study, tables[f"summary_{study.algorithm}"].frame)
+            drawings.append(Drawing("curves", title, caption, partial(curves_figure, study, noise)))
+        drawings += ablation_figures(study, tables[f"summary_{study.algorithm}"].frame)
     if "robustness" in tables:
-        yield from robustness_figures(tables["robustness"].frame, studies[0].metric)
+        drawings += robustness_figures(tables["robustness"].frame, studies[0].metric)
+    for drawing in drawings:
+        while drawing.name in used:  # of "lr 1" and "lr_1", say, which are one name of a file
+            drawing.label += " again"
+        used.add(drawing.name)
+    return drawings
 
 
 def comparison_figures(study, statistics, best):

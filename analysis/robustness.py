@@ -9,6 +9,7 @@ Holm's correction; docs/statistics.md has the details. All of this may be of the
 instead of the return, in percentage points.
 """
 
+import zlib
 from itertools import zip_longest
 
 import numpy as np
@@ -35,8 +36,8 @@ def read_robustness(runs_dir, runs, metric="return"):
     """Read robustness.csv (or .csv.gz) of every finished run: one row per run and condition.
 
     metric: what `mean` is of, "return" or "success rate" (in percent); of the latter, only
-    conditions in which the environment tells it. Return the frame (RUN_COLUMNS) and notes on the
-    files that could not be read.
+    conditions in which the environment tells it, to some run; the others had none there. Return the
+    frame (RUN_COLUMNS) and notes on the files that could not be read.
     """
     rows, notes = [], []
     for run in runs[runs["status"] == "finished"].itertuples():
@@ -47,7 +48,7 @@ def read_robustness(runs_dir, runs, metric="return"):
             continue
         try:
             tests = read_episodes(path, metric)
-        except (OSError, ValueError, EOFError) as error:
+        except (OSError, ValueError, EOFError, zlib.error) as error:
             notes.append(f"{run.run}: {path.name} is left out: {' '.join(str(error).split())}")
             continue
         row = {name: getattr(run, name) for name in (*KEYS, "configuration", "seed")}
@@ -55,14 +56,17 @@ def read_robustness(runs_dir, runs, metric="return"):
             row |= {"condition": condition, "elsewhere": elsewhere}
             row["environment"] = where_tested(run.environment, elsewhere)
             rows.append(row | {"mean": results.mean(), "cvar": cvar(results)})
-    return pd.DataFrame(rows, columns=RUN_COLUMNS), notes
+    table = pd.DataFrame(rows, columns=RUN_COLUMNS)
+    place = [table["environment"], table["condition"]]
+    told = table["mean"].notna().groupby(place).transform("any")
+    return table[told].fillna({"mean": 0.0, "cvar": 0.0}), notes
 
 
 def read_episodes(path, metric="return"):
     """Read one file: {(Configuration, environment): results of its episodes}.
 
-    The environment is empty for that of the training. A result is a return, or of success 100 or 0.
-    Raises ValueError.
+    The environment is empty for that of the training. A result is a return, or of success 100 or 0,
+    NaN where no episode of the condition tells it. Raises ValueError.
     """
     keys = ["noise", "noise_rate", "environment"]
     table = pd.read_csv(path, dtype=dict.fromkeys(keys, str)).fillna(dict.fromkeys(keys, ""))
@@ -74,13 +78,14 @@ def read_episodes(path, metric="return"):
     if metric == SUCCESS:
         results = 100 * pd.to_numeric(table.get("success", np.nan))
     table = table.assign(environment=table.get("environment", ""), result=results)
-    table, found = table.dropna(subset="result"), {}
+    found = {}
     for (noise, rate, environment), group in table.groupby(keys, sort=False)["result"]:
         condition = Configuration.parse(noise, rate)
         unknown = [name for name in condition.wrappers if name not in WRAPPERS and ":" not in name]
         if unknown:  # and none of the user's own
             raise ValueError(f"unknown noise {unknown[0]!r}")
-        found[condition, environment] = group.to_numpy(float)
+        told = group.notna().any()
+        found[condition, environment] = group.fillna(0 if told else np.nan).to_numpy(float)
     return found
 
 
@@ -135,18 +140,21 @@ def condition_rows(runs):
 def score_rows(runs):
     """Yield the score of every configuration with noise: over all environments, then in each.
 
-    `primary` are those over all environments, or in the only one. Tests in another environment are
-    apart: they leave those at home as they are.
+    `primary` are those over all environments that have two seeds of both kinds, or in the only one.
+    Tests in another environment are apart: they leave those at home as they are.
     """
     for _, group in runs.groupby(STUDY):
         for config in sorted({*group["configuration"]} - {BASELINE}):
             scores = [environment_score(same, config) for _, same in group.groupby("environment")]
             scores = [score for score in scores if score]
             at_home = [score for score in scores if not score["elsewhere"]]
-            if len(at_home) > 1:
-                yield average_score(at_home) | {"primary": True}
+            counting = [score for score in at_home if min(score["n"], score["n_baseline"]) >= 2]
+            counting = counting or at_home
+            if len(counting) > 1:
+                yield average_score(counting) | {"primary": True}
             for score in scores:
-                yield score | {"primary": bool(score["elsewhere"]) or len(at_home) == 1}
+                is_only = len(counting) == 1 and score is counting[0]
+                yield score | {"primary": bool(score["elsewhere"]) or is_only}
 
 
 def environment_score(runs, config):

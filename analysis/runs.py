@@ -159,10 +159,11 @@ def set_older_versions_apart(runs):
 
     So an average over environments has one version of each.
     """
-    finished = runs[(runs["status"] == "finished") & (runs["phase"] == "")]
-    parts = finished["environment"].str.extract(VERSION)
+    ours = runs[(runs["phase"] == "") & runs["environment"].notna()]
+    parts = ours["environment"].str.extract(VERSION)
     version = parts["version"].fillna(-1).astype(int)
-    newest = version.groupby([*(finished[name] for name in STUDY), parts["name"]]).transform("max")
+    finished = version.where(ours["status"] == "finished")  # NaN if it is not
+    newest = finished.groupby([*(ours[name] for name in STUDY), parts["name"]]).transform("max")
     older = parts.loc[version < newest, "version"].fillna("")
     runs.loc[older.index, "phase"] = f"{OLDER} v" + older
 
@@ -173,11 +174,14 @@ def failed_without_a_folder(runs_dir):
     A run that ended well or was stopped, and has no folder, was moved or deleted by somebody.
     """
     rows = []
-    for path in sorted(runs_dir.glob("logs/*__*.log")):
-        log = folders.read_log(runs_dir / path.stem)
-        failed = log.exit_status not in (None, 0, *folders.STOPPED)
-        if failed and not (runs_dir / path.stem).exists():
-            rows.append({"run": path.stem, "status": "failed", "reason": log.last_line})
+    for phase in ("", *folders.PHASES):
+        for path in sorted(runs_dir.glob(f"{phase or '.'}/logs/*__*.log")):
+            folder = runs_dir / phase / path.stem
+            log = folders.read_log(folder)
+            failed = log.exit_status not in (None, 0, *folders.STOPPED)
+            if failed and not folder.exists():
+                row = {"run": str(folder.relative_to(runs_dir)), "phase": phase}
+                rows.append(row | {"status": "failed", "reason": log.last_line})
     return rows
 
 
@@ -320,11 +324,20 @@ class Study:
 def make_studies(runs, metric="return"):
     """Arrange the finished runs into a list of Study, and list in words what had to be cut.
 
-    metric: what is compared, "return" or "success rate"; of the latter, only runs that tell it.
+    metric: what is compared, "return" or "success rate"; of the latter, only environments that tell
+    it. A run there that never does was never successful.
     """
     studies, notes = [], []
     column = "success_rates" if metric == SUCCESS else "returns"
-    finished = runs[(runs["status"] == "finished") & runs[column].notna()]
+    finished = runs[runs["status"] == "finished"]
+    if metric == SUCCESS:
+        told = finished[column].notna()
+        silent = ~told & told.groupby(finished["environment"]).transform("any")
+        for env, n in finished.loc[silent, "environment"].value_counts(sort=False).items():
+            notes.append(f"runs on {env} that never tell success, as others do, count as 0 %: {n}")
+        never = finished.loc[silent, "steps"].map(lambda steps: np.zeros(len(steps)))
+        finished = finished.assign(**{column: finished[column].where(~silent, never)})
+    finished = finished[finished[column].notna()]
     for key, group in finished.groupby(STUDY):
         name = study_name(*key)
         steps, longest = reduce(np.intersect1d, group["steps"]), group["steps"].map(len).max()

@@ -31,12 +31,17 @@ def columns(scores):
     return [column[np.isfinite(column)] for column in scores]
 
 
+def exact(value, *samples):
+    """Return a difference or a spread of samples, but 0 where it is nothing but rounding errors."""
+    return value if abs(value) > 1e-12 * abs(np.concatenate(samples)).max() else 0.0
+
+
 def mean_std(values):
     """Mean, sample standard deviation (ddof=1) and number of the values that are not NaN."""
     values = np.asarray(values, float)
     values = values[np.isfinite(values)]
     mean = values.mean() if len(values) else nan
-    return mean, values.std(ddof=1) if len(values) > 1 else nan, len(values)
+    return mean, exact(values.std(ddof=1), values) if len(values) > 1 else nan, len(values)
 
 
 def pooled_std(samples):
@@ -104,12 +109,14 @@ def bootstrap_iqm(scores, baseline=None, resamples=2000):
     n = np.array([len(sample) for sample in samples])
     if n.min() < SEEDS_FOR_IQM:
         return value, nan, nan
+    # a baseline that is drawn anew may be 0: then there is no interval of the change in percent
     rng = np.random.default_rng(0)
     observed = [np.broadcast_to(sample, (resamples, len(sample))) for sample in samples]
     variances = np.empty(len(samples))
     for i, sample in enumerate(samples):
         drawn = sample[rng.integers(n[i], size=(resamples, n[i]))]
-        estimates = estimate([*observed[:i], drawn, *observed[i + 1 :]])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            estimates = estimate([*observed[:i], drawn, *observed[i + 1 :]])
         variances[i] = n[i] / (n[i] - 1) * estimates.var(ddof=1)
     _, half = satterthwaite(variances, n)
     return value, value - half, value + half
@@ -268,7 +275,7 @@ def compare(x, y):
     """Compare the means of two samples x and y of the same environments."""
     xs, ys = columns(x), columns(y)
     pairs = list(zip(xs, ys, strict=True))
-    differences = np.array([a.mean() - b.mean() for a, b in pairs])
+    differences = np.array([exact(a.mean() - b.mean(), a, b) for a, b in pairs])
     stds = np.array([sqrt((mean_std(a)[1] ** 2 + mean_std(b)[1] ** 2) / 2) for a, b in pairs])
     percents = list(map(percent_of, differences, ys))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -305,10 +312,11 @@ def contrast(samples, weights):
     sample has fewer than two values.
     """
     estimate = sum(w * np.mean(sample) for w, sample in zip(weights, samples, strict=True))
+    estimate = exact(estimate, *samples)
     sizes = np.array([len(sample) for sample in samples])
     if sizes.min() < 2:
         return estimate, nan, nan, nan
-    variances = np.array([np.var(sample, ddof=1) for sample in samples])
+    variances = np.array([mean_std(sample)[1] ** 2 for sample in samples])
     error, half = satterthwaite(np.square(weights) * variances / sizes, sizes)
     return estimate, error, estimate - half, estimate + half
 

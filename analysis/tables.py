@@ -271,11 +271,16 @@ def family_notes(judged):
                     f"{smallest:.2g})."
                 )
             elif (needed := ceil(round(size * smallest / statistics.LEVEL, 9))) > 1:
+                is_holm = study[-1] == CONFIRMATION  # not Benjamini and Hochberg's correction
+                can = "no difference can be significant after the correction"
+                if not is_holm:
+                    can = (
+                        "differences can be significant after the correction only if at least "
+                        f"{needed} of them are"
+                    )
                 notes.append(
-                    f"{where}: with {seeds} and {size:.0f} comparisons, differences can be "
-                    f"significant after the correction only if at least {needed} of them are "
-                    f"(smallest possible p: {smallest:.2g}, corrected for one alone "
-                    f"{min(1, size * smallest):.2g})."
+                    f"{where}: with {seeds} and {size:.0f} comparisons, {can} (smallest possible "
+                    f"p: {smallest:.2g}, corrected for one alone {min(1, size * smallest):.2g})."
                 )
     return notes
 

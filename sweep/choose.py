@@ -13,6 +13,8 @@ import sys
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from analysis.errors import fail, in_words
 from analysis.folders import CONFIRMATION, SEARCH, flat_choice
 from analysis.runs import CHOICE_COLUMNS, SUCCESS, read_run
@@ -125,12 +127,15 @@ def walk(args, algorithm, env_id, noises, budget):
     """Go from batch to batch as long as runs are finished.
 
     Returns the state; the runs that were due; the steps and the results of the tests of those that
-    are finished; and their scores. All but the state are {(configuration, seed): ...}.
+    are finished; and their scores. All but the state are {(configuration, seed): ...}. A run that
+    tells no success, where others do, had none.
     """
-    runs, tests, returns = {}, {}, {}
+    runs, tests, returns, tells = {}, {}, {}, set()
     while True:
         state = halving.advance(noises, budget, args.confirm, returns)
         if runs.keys() >= set(state.due):  # they have not finished
+            if tells == {False}:
+                fail(f"--metric success_rate: {env_id} tells no `is_success` or `success`")
             return state, runs, tests, returns
         for noise, seed in state.due:
             phase = SEARCH if seed < halving.FIRST_CONFIRMATION_SEED else CONFIRMATION
@@ -138,8 +143,8 @@ def walk(args, algorithm, env_id, noises, budget):
             runs[noise, seed] = run
             if row:
                 values = row["success_rates" if args.metric == SUCCESS else "returns"]
-                if values is None:
-                    fail(f"--metric success_rate: {env_id} tells no `is_success` or `success`")
+                tells.add(values is not None)
+                values = np.zeros(len(row["steps"])) if values is None else values
                 tests[noise, seed] = tuple(row["steps"]), values
                 score = halving.score(row["steps"], values) if phase == SEARCH else values[-1]
                 returns[noise, seed] = score

@@ -456,6 +456,9 @@ def test_five_against_five_cannot_reach_significance_alone_among_90(tmp_path):
     assert "with 5 seeds and 90 comparisons" in note and "0.0079" in note
     assert "only if at least 15 of them are" in note  # 90 * 0.0079 / 0.05 = 14.3
     assert "for one alone 0.71" in note
+    confirmed = table.assign(phase="confirmation", comparisons=90)
+    (note,) = analysis.tables.family_notes(confirmed)
+    assert "with 5 seeds and 90 comparisons, no difference can be significant after the" in note
 
 
 def test_two_seeds_have_no_interval(tmp_path):

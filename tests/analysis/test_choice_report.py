@@ -174,6 +174,18 @@ def test_rates_that_change_are_read_sorted_and_shown(tmp_path):
     assert named == ["no noise", *(f"rate {rate}" for rate in rates)]
 
 
+def test_figures_of_experiments_with_similar_names_have_names_of_their_own(tmp_path):
+    for name in ("lr 1", "lr_1"):
+        for seed in (1, 2):
+            more = {"seed": seed, "exp_name": name}
+            write_run(tmp_path, [10], folder=f"{name}-{seed}", **more)
+            write_run(tmp_path, [9], folder=f"{name}-{seed}-p", noise=PUSH, rate=0.1, **more)
+    studies, _ = analysis.runs.make_studies(analysis.runs.read_runs(tmp_path))
+    figures = analysis.figures.figures(studies, analysis.tables.make_tables(studies))
+    names = {drawing.name for drawing in figures}
+    assert len(figures) == len(names) and {"effects_SAC_lr_1", "effects_SAC_lr_1_again"} <= names
+
+
 def test_interactions_by_hand(tmp_path):
     cells = {
         ((), ()): [100, 104, 108],  # mean 104, variance 16

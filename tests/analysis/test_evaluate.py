@@ -370,6 +370,15 @@ def test_trainings_with_other_settings_are_other_rows_of_the_table(runs, capsys)
     ]
 
 
+def test_the_phases_of_a_choice_are_other_rows_of_the_table(runs, capsys):
+    folders = list(runs.glob("*__ppo_*"))
+    for phase, folder in zip(("search", "confirmation"), folders, strict=False):
+        shutil.copytree(folder, runs / "choice" / phase / folder.name)
+    main(Args((runs / "choice",), episodes=1))
+    table = capsys.readouterr().out
+    assert "PPO [search]" in table and "PPO [confirmation]" in table
+
+
 def test_a_folder_stands_for_its_finished_runs(runs, capsys):
     (one(runs, "SAC") / "result.json").unlink()
     runs = runs.rename(runs.parent / "two__words")  # which is no run's name here

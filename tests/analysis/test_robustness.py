@@ -188,6 +188,21 @@ def test_environments_count_equally_and_the_test_is_stratified(tmp_path):
     assert scores["p_holm"].isna().tolist() == [False, True, True]  # the others are secondary
 
 
+def test_an_environment_with_one_seed_does_not_hide_the_others(tmp_path):
+    clean, weak, strong = ([100, 101, 99, 100], [50, 51, 52, 53], [80, 81, 82, 83])
+    table = {("", 0.0): {("", "0.0"): clean, (SENSOR, "1.0"): weak}}
+    table |= {(PUSH, 1.0): {("", "0.0"): clean, (SENSOR, "1.0"): strong}}
+    full, single = (1, 2, 3, 4), (1,)
+    for env, seeds in (("A-v0", full), ("B-v0", full), ("C-v0", single)):
+        write_tests(tmp_path / "three/runs", table, env, seeds)
+    average = row(run(tmp_path / "three")["robustness_score"], scope="all")
+    assert average["p_holm"] == average["p"] < 0.01 and average["n"] == 4
+    for env, seeds in (("A-v0", full), ("B-v0", single)):
+        write_tests(tmp_path / "two/runs", table, env, seeds)
+    scores = run(tmp_path / "two")["robustness_score"]
+    assert list(scores["environment"][scores["p_holm"].notna()]) == ["A-v0"]
+
+
 def test_sentences_say_what_the_seeds_could_have_shown(tmp_path, capsys):
     alike = {("", 0.0): HOPPER["", 0.0], (PUSH, 1.0): dict(HOPPER["", 0.0])}
     alike[PUSH, 1.0][SENSOR, "0.2"] = [78, 79, 81, 82]
@@ -227,12 +242,17 @@ def test_compressed_damaged_and_unfinished_runs(tmp_path, capsys):
 
     damaged = next((tmp_path / "runs").glob(f"*{PUSH}*__1"))
     (damaged / "robustness.csv").write_text("noise,rate\n")
+    bad_disk = next((tmp_path / "runs").glob(f"*{SENSOR}*__1")) / "robustness.csv.gz"
+    packed = bytearray(bad_disk.read_bytes())
+    packed[60:63] = bytes(255 - byte for byte in packed[60:63])
+    bad_disk.write_bytes(packed)
     unfinished = next((tmp_path / "runs").glob(f"*{PUSH}*__2"))
     (unfinished / "result.json").unlink()
     tables = run(tmp_path, out="fewer")
     assert row(tables["robustness_score"], noise=PUSH)["n"] == 2
     printed = capsys.readouterr().out
     assert f"{damaged.name}: robustness.csv is left out: unexpected header" in printed
+    assert f"{bad_disk.parent.name}: robustness.csv.gz is left out: Error -3" in printed
     for path in (tmp_path / "runs").glob("*baseline*"):
         shutil.rmtree(path)
     assert run(tmp_path, out="none")["robustness_score"].empty  # nothing to compare with

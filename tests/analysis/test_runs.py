@@ -25,6 +25,26 @@ def test_a_run_that_failed_before_it_had_a_folder_is_listed(tmp_path):
     assert all(table["run"].str.contains("_NormalNoisyObservation_0.1_0.2__Pendulum-v1"))
 
 
+def test_a_run_of_a_choice_that_failed_before_it_had_a_folder_is_listed(tmp_path):
+    for phase in ("search", "confirmation"):
+        (tmp_path / phase / "logs").mkdir(parents=True)
+        log = tmp_path / phase / "logs" / "a__run.log"
+        log.write_text(f"{BEGUN}error: no\n# 2026 host: exit=2\n")
+    table, count = left_out(read_runs(tmp_path))
+    assert count == {"failed": 2}
+    assert list(table["run"]) == ["search/a__run", "confirmation/a__run"]
+
+
+def test_an_unfinished_run_of_an_older_version_lacks_no_others(tmp_path):
+    for seed in (1, 2):
+        for env in ("Hopper-v4", "Hopper-v5"):
+            last = env == "Hopper-v4" and seed == 2
+            write_run(tmp_path, [10], env=env, seed=seed)
+            write_run(tmp_path, [9], env=env, seed=seed, noise=SCALE, rate=0.1, finished=not last)
+    _, count = left_out(read_runs(tmp_path))
+    assert count == {"unfinished": 1}
+
+
 def reasons(runs):
     """Return what is said of each run that differs from its study, by its seed."""
     different = runs[runs["status"] == "different"]

@@ -128,6 +128,25 @@ def test_a_comparison_by_hand():
     assert one.difference == 2 and np.isnan([one.p, one.detectable, one.pooled_std]).all()
 
 
+def test_rounding_errors_are_no_difference():
+    """The means of three and of five times 0.95 differ in the last digit."""
+    x, y = np.full(3, 0.95), np.full(5, 0.95)
+    assert x.mean() != y.mean()
+    found = statistics.compare(x, y)
+    assert (found.difference, found.effect_size, found.pooled_std, found.p) == (0, 0, 0, 1)
+    assert found.seeds_needed == np.inf
+    x, y = np.full(5, 0.95), np.full(10, 0.95)
+    assert statistics.compare(x, y)[4:7] == (0, 0, 0)  # the difference and its interval
+    two = statistics.compare(np.full((3, 2), [0.95, 0.7]), np.full((5, 2), [0.95, 0.7]))
+    assert (two.effect_size, two.t, two.p) == (0, 0, 1)
+
+
+def test_an_iqm_that_may_be_drawn_as_zero_has_no_interval_of_its_change(recwarn):
+    x, y = np.array([[0.0, 1, 1, 1, 1]] * 2).T, np.array([[0.0, 0, 1, 1, 1, 1, 1, 1]] * 2).T
+    value, low, high = statistics.bootstrap_iqm(x, y)
+    assert np.isfinite(value) and np.isnan([low, high]).all() and not recwarn.list
+
+
 def test_over_environments_effects_are_averaged_and_percent_where_all_have_it():
     x, y = stacked([3.0, 4, 5], [20.0, 40]), stacked([1.0, 2, 3], [10.0, 20, 30, 40])
     found = statistics.compare(x, y)

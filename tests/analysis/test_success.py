@@ -9,6 +9,7 @@ import pytest
 import tyro
 from test_analyze import SCALE, row, run, write_run
 
+import analysis.robustness
 import analysis.runs
 import analyze
 import evaluate
@@ -113,6 +114,27 @@ def test_evaluate_stores_success(env_id, tmp_path, capsys):
     analyze.main(analyze.Args(tmp_path, metric="success_rate"))
     table = pd.read_csv(tmp_path / "results/robustness.csv")
     assert table["mean"].item() == pytest.approx(100 * np.mean(solved))
+
+
+def test_a_run_that_tells_no_success_had_none(runs_dir):
+    """Some environments tell a success only."""
+    seeds = {folder: int(folder.name[-1]) for folder in runs_dir.iterdir() if SCALE in folder.name}
+    header = "noise,noise_rate,episode,episodic_return,episodic_length"
+    for folder, seed in seeds.items():
+        tells = seed > 2
+        if not tells:
+            path = folder / "eval.csv"
+            lines = path.read_text().splitlines()
+            path.write_text("\n".join(line.rpartition(",")[0] for line in lines) + "\n")
+        rows = [f",0.0,{i},-50.0,9{',1' if tells and i < 1 else ',' * tells}" for i in range(5)]
+        text = "\n".join([header + ",success" * tells, *rows])
+        (folder / "robustness.csv").write_text(text + "\n")
+    runs = analysis.runs.read_runs(runs_dir)
+    [study], notes = analysis.runs.make_studies(runs, "success rate")
+    assert study.final(max(study.returns))[:, 0].tolist() == [0, 0, 100, 100, 100]
+    assert notes == [f"runs on {ENV} that never tell success, as others do, count as 0 %: 2"]
+    table, _ = analysis.robustness.read_robustness(runs_dir, runs, "success rate")
+    assert table.sort_values("seed")["mean"].tolist() == [0, 0, 20, 20, 20]
 
 
 def test_robustness_is_judged_by_success(tmp_path, capsys):

@@ -408,6 +408,19 @@ def test_choose_by_success_needs_an_environment_that_tells_it(tmp_path, capsys):
     assert capsys.readouterr().err == told
 
 
+def test_a_run_that_tells_no_success_had_none(tmp_path):
+    text = f"--algos | ppo | --envs | toy_envs:Success-v0 | --metric | success_rate | {THREE}"
+    [choice] = choose.choices(arguments(text, tmp_path))
+    for run in choice.state.due:
+        stub_run.train(choice.runs[run].command)
+    silent = choice.state.due[0]
+    path = choice.runs[silent].folder / "eval.csv"  # as where only a success is told
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(line.rpartition(",")[0] for line in lines) + "\n")
+    [choice] = choose.choices(arguments(text, tmp_path))
+    assert choice.returns[silent] == 0 < max(choice.returns.values())
+
+
 def test_choose_stops_where_all_tests_are_equal(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(stub_run, "episodes_of", lambda *run: [[-50.0] * 10] * 10)
     args = arguments(f"--algos | ppo | --envs | Pendulum-v1 | {THREE}", tmp_path)
