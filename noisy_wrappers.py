@@ -222,8 +222,8 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     @property
     def applied_fraction(self) -> float:
-        """The realised rate, times_applied / opportunities; nan before the first opportunity."""
-        return self.times_applied / self.opportunities if self.opportunities else math.nan
+        """The realised rate, times_applied / opportunities; 0 before the first opportunity."""
+        return self.times_applied / max(1, self.opportunities)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment; a seed also reseeds the noise. The rate follows its schedule."""
@@ -948,10 +948,17 @@ class RandomDynamics(NoiseWrapper):
         chosen = self.acts() and any((values != 1).any() for values in factors.values())
         if chosen:
             self._scale(model, factors)
+        scaled = {field: getattr(model, field).copy() for field in self.fields}
         observation, info = self.env.reset(seed=seed, options=options)
         if chosen:
-            if self._model() is not model:  # the environment has built a new one
-                self._scale(self._model(), factors)
+            model = self._model()  # perhaps a new one, or one whose values reset() has set
+            own = {field: getattr(model, field).copy() for field in self.fields}
+            is_own = {field: own[field] != scaled[field] for field in self.fields}
+            if any(changed.any() for changed in is_own.values()):
+                self._restore()
+                for field, changed in is_own.items():
+                    getattr(model, field)[changed] = own[field][changed]
+                self._scale(model, factors)
             info = {**self.mark(info), "dynamics": factors}
         return observation, info
 
@@ -1383,11 +1390,16 @@ class RecordEpisodeStatistics(gym.wrappers.RecordEpisodeStatistics[Any, Any]):
         """Step the environment; raise ValueError if its info has an "episode" already."""
         steps = self.episode_lengths
         try:
-            return super().step(action)
+            observation, reward, terminated, truncated, info = super().step(action)
         except AssertionError as error:
             if self.episode_lengths == steps:  # it comes from the environment's own step
                 raise
             raise ValueError(_RECORDED) from error
+        if terminated or truncated:
+            recorded = dict(info)
+            del info["episode"]  # the environment may return the same dict again
+            info = recorded
+        return observation, reward, terminated, truncated, info
 
 
 # ---------------------------------------------------------------------------------- during training
@@ -1834,7 +1846,8 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     next one into the same array, and actions, because it may write into those; so are infos, which
     may be None. An observation that has not the shape of its space, a step of four values and a
     reset without seed and options raise SpaceError. The spaces are looked up once, because an
-    environment may make new ones, with new generators, at every access.
+    environment may make new ones, with new generators, at every access; ``reset(seed=...)`` seeds
+    that of the actions, from which an environment may draw, too.
 
     >>> env = FiniteNumbers(gym.make("Pendulum-v1", disable_env_checker=True))
     >>> _ = env.reset(seed=0)
@@ -1858,6 +1871,8 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and check the first observation."""
         self._steps = 0
+        if seed is not None:
+            self.action_space.seed(seed)
         try:
             observation, info = self.env.reset(seed=seed, options=options)
         except (SystemExit, TypeError, ValueError) as error:
@@ -1887,7 +1902,7 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """Close the environment; warn if that fails, because what was trained in it is valid."""
         try:
             self.env.close()
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             gym.logger.warn(f"closing the environment failed: {error!r}")
 
     def _checked(self, observation: Any, action: Any = None) -> Any:
@@ -2025,18 +2040,19 @@ def canonical_env_id(env_id: str) -> str:
     return f"{module}{colon}{spec.id}"
 
 
-def refusals(env_id: str) -> tuple[type[Exception], ...]:
+def refusals(env_id: str) -> tuple[type[BaseException], ...]:
     """Return the errors that ``make_flat(gymnasium.make(env_id))`` raises on purpose.
 
     They are Gymnasium's and this module's. Of Gymnasium's own environments a missing dependency is
-    an ImportError, and some of Gymnasium-Robotics fail an assertion where MuJoCo is too new. Any
-    other error comes from the environment's code. :func:`reason` puts them into words.
+    an ImportError, and some of Gymnasium-Robotics fail an assertion where MuJoCo is too new. An
+    exit is refused, too. Any other error comes from the environment's code. :func:`reason` puts
+    them into words.
     """
     spec = gym.registry.get(env_id.rpartition(":")[2])
     maker: Any = spec.entry_point if spec else ""  # "package.module:Class" or a function
     package = getattr(maker, "__module__", str(maker)).partition(".")[0]
     more = {"gymnasium": (ImportError,), "gymnasium_robotics": (AssertionError,)}
-    return (gym.error.Error, SpaceError, *more.get(package, ()))
+    return (gym.error.Error, SpaceError, SystemExit, *more.get(package, ()))
 
 
 def reason(error: BaseException) -> str:
@@ -2044,8 +2060,12 @@ def reason(error: BaseException) -> str:
 
     >>> reason(ValueError("low must not\nexceed high")), reason(KeyError())
     ('low must not exceed high', 'KeyError')
+    >>> reason(SystemExit(1))
+    'the environment called sys.exit(1)'
     """
     text = " ".join(str(error).split())
+    if isinstance(error, SystemExit):
+        return f"the environment called sys.exit({error.code!r})"
     if not text and isinstance(error, AssertionError) and "gymnasium_robotics" in sys.modules:
         packages = ("gymnasium-robotics", "mujoco")
         now = " and ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)
@@ -2160,11 +2180,12 @@ def reset_worker_signals() -> None:
 class EnvState:
     """What an environment carries from one episode to the next, to resume training.
 
-    That is the random generators of the environment and of its action space, the random streams and
-    the counters of its noise wrappers, the returns that RecordEpisodeStatistics remembers, and the
-    global generators of ``random`` and NumPy, from which an environment may draw. Further
-    ``generators`` are kept with them. After loading, call :func:`set_progress` again. An
-    environment that carries anything else from one episode to the next does not resume exactly.
+    That is the random generators of the environment, of its action space, and among the attributes
+    of its wrappers, of itself and of an environment inside it; the random streams and the counters
+    of its noise wrappers, the returns that RecordEpisodeStatistics remembers, and the global
+    generators of ``random`` and NumPy, from which an environment may draw. Further ``generators``
+    are kept with them. After loading, call :func:`set_progress` again. An environment that carries
+    anything else from one episode to the next does not resume exactly.
 
     >>> env = make_noisy(gym.make("Pendulum-v1"), ["RandomNormalNoisyObservation(1)"], [0.5])
     >>> _ = env.reset(seed=1)
@@ -2186,6 +2207,23 @@ class EnvState:
         of_numpy = np.random.Generator | np.random.RandomState
         return [generator for generator in found if isinstance(generator, of_numpy)]
 
+    def _attributes(self) -> dict[str, Any]:
+        """Return the generators of an environment beside its np_random, by their places."""
+        layers = [*_layers(self.env), self.env.unwrapped]
+        holders = {f"{i}": layer for i, layer in enumerate(layers)}
+        for place, layer in [*holders.items()]:
+            for name, value in vars(layer).items():
+                if isinstance(value, gym.Env) and value not in layers:
+                    holders[f"{place}.{name}"] = value
+        known, found = [id(generator) for generator in self._generators()], {}
+        kinds = np.random.Generator | np.random.RandomState | random.Random
+        for place, holder in holders.items():
+            for name, value in {} if isinstance(holder, NoiseWrapper) else vars(holder).items():
+                fixed = isinstance(value, kinds) and not isinstance(value, random.SystemRandom)
+                if fixed and id(value) not in known:
+                    found[f"{place}.{name}"] = value
+        return found
+
     def _returns(self) -> deque[float]:
         recorded = self.env.has_wrapper_attr("return_queue")
         return self.env.get_wrapper_attr("return_queue") if recorded else deque()
@@ -2196,6 +2234,7 @@ class EnvState:
             "python": random.getstate(),
             "numpy": _without_arrays(np.random.get_state(legacy=False)),
             "generators": [_stream(generator) for generator in self._generators()],
+            "attributes": {place: _stream(held) for place, held in self._attributes().items()},
             "noise": [wrapper.state_dict() for wrapper in noise_wrappers(self.env).values()],
             "returns": [float(value) for value in self._returns()],
         }
@@ -2206,14 +2245,13 @@ class EnvState:
         Raises:
             ValueError: a state of another number of generators or noise wrappers.
         """
-        version, words, normal = state["python"]
-        random.setstate((version, tuple(words), normal))
+        _set_stream(random, state["python"])
         np.random.set_state(state["numpy"])
         for generator, stream in zip(self._generators(), state["generators"], strict=True):
-            if isinstance(generator, np.random.RandomState):
-                generator.set_state(stream)
-            else:
-                generator.bit_generator.state = stream
+            _set_stream(generator, stream)
+        attributes, streams = self._attributes(), state.get("attributes", {})
+        for place in attributes.keys() & streams.keys():
+            _set_stream(attributes[place], streams[place])
         wrappers = noise_wrappers(self.env).values()
         for wrapper, part in zip(wrappers, state["noise"], strict=True):
             wrapper.load_state_dict(part)
@@ -2223,9 +2261,22 @@ class EnvState:
 
 def _stream(generator: Any) -> Any:
     """Return the state of a random generator; dm_control's environments have a RandomState."""
+    if isinstance(generator, random.Random):
+        return generator.getstate()
     if isinstance(generator, np.random.RandomState):
         return _without_arrays(generator.get_state(legacy=False))
     return _without_arrays(generator.bit_generator.state)
+
+
+def _set_stream(generator: Any, stream: Any) -> None:
+    """Set the state of a random generator, or of the module random."""
+    if isinstance(generator, np.random.Generator):
+        generator.bit_generator.state = stream
+    elif isinstance(generator, np.random.RandomState):
+        generator.set_state(stream)
+    else:
+        version, words, normal = stream
+        generator.setstate((version, tuple(words), normal))
 
 
 # The scripts' arguments that change nothing about what a run learns. A run may be resumed with

@@ -415,7 +415,7 @@ def read_args():
     """Read the command line; a whole number may be written as 1e6."""
     words = sys.argv[1:]
     for i, word in enumerate(words):
-        flag, equals, number = word.rpartition("=")
+        flag, equals, number = word.partition("=") if word.startswith("--") else ("", "", word)
         is_name = (flag or words[i - 1]).replace("_", "-") in ("--exp-name", "--runs-dir")
         with contextlib.suppress(ValueError):  # it is no number
             if "e" in number.lower() and float(number).is_integer() and not is_name:
@@ -501,8 +501,8 @@ def prepare_compiler():
 
     say("compiling ...")
     torch.compiler.reset()  # forget what earlier runs of this process compiled
-    for path in Path(cache_dir()).rglob("*.so"):
-        with contextlib.suppress(OSError):  # another process removed it
+    with contextlib.suppress(OSError):  # another process removes files, too
+        for path in Path(cache_dir()).rglob("*.so"):
             if path.stat().st_size == 0 and time.time() - path.stat().st_mtime > 60:
                 path.unlink()
 

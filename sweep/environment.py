@@ -135,7 +135,7 @@ def ask_all(args, configurations):
     for env_id, noises in configurations.items():
         try:
             answer = ask(env_id, noises, options["max-episode-steps"])
-        except Exception as error:  # others may be wrong, too
+        except (Exception, SystemExit) as error:  # others may be wrong, too
             reason = with_place(error, (*noisy.refusals(env_id), noisy.NotFiniteError))
             reasons.append(f"no algorithm can be trained in {env_id}: {reason}")
             continue

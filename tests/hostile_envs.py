@@ -106,6 +106,13 @@ class Exits(Hostile):
         sys.exit()
 
 
+class ExitsAtOnce(Hostile):
+    """Ends the program when it is made."""
+
+    def __init__(self, workers):
+        sys.exit(0)
+
+
 class OfOldAPI(Hostile):
     """Returns four values."""
 
@@ -182,7 +189,7 @@ def register(entry_point, name="", **kwargs):
 
 for entry_point in (Hostile, Refused, Broken, OfOldAPI, ResetOfOldAPI, ResetOfNothing, OtherShape):
     register(entry_point)
-for entry_point in (NoInfo, BadClose, OwnCompiler, Exits):
+for entry_point in (NoInfo, BadClose, OwnCompiler, Exits, ExitsAtOnce):
     register(entry_point, workers=0)
 register(OwnSignals)
 register(Hostile, "HostileAlone", workers=0)

@@ -378,6 +378,14 @@ def test_an_exit_of_the_environment_is_an_error_with_its_place(algorithm, tmp_pa
 
 
 @one_script
+def test_an_exit_of_the_constructor_is_a_line(algorithm, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        run(algorithm, tmp_path, env_id="hostile_envs:ExitsAtOnce-v0")
+    assert stopped.value.code == 2
+    assert_one_line(capsys.readouterr().err, "ExitsAtOnce-v0: the environment called sys.exit(0)")
+
+
+@one_script
 def test_an_info_may_be_none(algorithm, tmp_path):
     run(algorithm, tmp_path, env_id="hostile_envs:NoInfo-v0")
 

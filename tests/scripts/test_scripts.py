@@ -695,11 +695,11 @@ def test_a_module_beside_the_caller_and_steps_as_1e2(tmp_path):
     (tmp_path / "my_physics.py").touch()
     options = ["--env-id", "my_envs:Mine-v0", "--total-timesteps", "1.2E2", "--no-compile"]
     options += ["--learning-starts=5e1", "--eval-frequency", "0", "--eval-episodes", "1"]
-    options += ["--exp-name", "1e3", "--runs-dir=2e1"]  # these are names
+    options += ["--exp-name", "lr=1e3", "--runs-dir=2e1"]  # these are names
     result = real_command("SAC", *options, cwd=tmp_path)
     assert (result.code, result.err) == (0, "")
     [run_dir] = (tmp_path / "2e1").iterdir()
-    assert run_dir.name.endswith("__1e3")
+    assert run_dir.name.endswith("__lr=1e3")
     args = json.loads((run_dir / "config.json").read_text())["args"]
     assert (args["total_timesteps"], args["learning_starts"]) == (120, 50)
     assert args["env_id"] == "my_envs:Mine-v0"

@@ -136,6 +136,31 @@ def test_a_model_that_is_built_in_reset():
     np.testing.assert_array_equal(env.model.body_mass, mass)
 
 
+class Heavier(Cart):
+    """An environment that sets the mass of its cart at every reset."""
+
+    def reset(self, **kwargs):
+        self.episode = getattr(self, "episode", 0) + 1
+        self.model.body_mass[1] = self.episode
+        return super().reset(**kwargs)
+
+
+def test_values_that_reset_sets_are_scaled_and_restored():
+    env = Heavier()
+    noisy = RandomDynamics(env, 1.0, 1.5, 1.5)
+    inertia, masses = env.model.body_inertia.copy(), env.model.body_subtreemass.copy()
+    others = env.model.body_mass[2:].copy()
+    for episode in (1, 2):
+        noisy.reset(seed=0)
+        assert env.model.body_mass[1:].tolist() == [1.5 * episode, *1.5 * others]
+        assert env.model.body_subtreemass[0] == pytest.approx(1.5 * (episode + others.sum()))
+    noisy.noise_rate = 0
+    noisy.reset()
+    assert env.model.body_mass[1:].tolist() == [3, *others]
+    np.testing.assert_array_equal(env.model.body_inertia, inertia)
+    np.testing.assert_array_equal(env.model.body_subtreemass, masses)  # the environment's own
+
+
 def test_what_the_user_changes_between_episodes_stays():
     env = Cart()
     noisy = RandomDynamics(env, 0.0, 1.3, 1.3)

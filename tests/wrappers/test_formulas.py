@@ -246,7 +246,7 @@ def test_a_rate_that_is_wrong_by_ten_percent_would_be_seen(wrong):
 def test_applied_fraction_is_the_rate(text, rate):
     """Up to four standard deviations."""
     env = build(text, episodes_env([10]), rate)
-    assert math.isnan(env.applied_fraction)
+    assert env.applied_fraction == 0
     steps = rollout(env, seed=3, steps=4000)
     seen = sum("noise" in info for *_, info in steps)
     resets = sum(reward is None for _, reward, *_ in steps)

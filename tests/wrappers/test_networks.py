@@ -2,6 +2,8 @@
 
 import copy
 import json
+import random
+import sys
 
 import gymnasium as gym
 import numpy as np
@@ -201,6 +203,68 @@ def test_an_env_state_has_only_pythons_own_types(make_generator):
     env.unwrapped.np_random = make_generator(4)
     EnvState(env, rng).load_state_dict(saved)
     assert env.unwrapped.np_random.normal(size=5).tolist() == expected
+
+
+class Drawing(gym.Env):
+    """Draws from generators that are attributes, one of an environment inside it."""
+
+    observation_space = gym.spaces.Box(-9, 9, (4,), np.float64)
+    action_space = gym.spaces.Box(-1, 1, (1,))
+
+    def __init__(self):
+        self.robot = gym.make("Pendulum-v1").unwrapped
+        self.dice = random.SystemRandom()  # nothing can restore it, and nothing fails
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        if seed is not None:
+            self.rng, self.old = np.random.default_rng(seed), np.random.RandomState(seed)
+            self.python = random.Random(seed)
+            self.robot.reset(seed=seed)
+        drawn = [self.rng.normal(), self.old.normal(), self.python.random()]
+        return np.array([*drawn, self.robot.reset()[0][0]]), {}
+
+
+def test_an_env_state_has_the_generators_among_the_attributes():
+    env = gym.wrappers.TransformReward(Drawing(), abs)
+    first, _ = env.reset(seed=1)
+    saved = json.loads(json.dumps(EnvState(env).state_dict()))
+    second, _ = env.reset()
+    other = gym.wrappers.TransformReward(Drawing(), abs)
+    other.reset(seed=2)
+    EnvState(other).load_state_dict(saved)
+    np.testing.assert_array_equal(other.reset()[0], second)
+    assert (first != second).all()
+    del saved["attributes"]  # of a checkpoint that an earlier version wrote
+    EnvState(other).load_state_dict(saved)
+
+
+def test_a_seed_reaches_the_actions_that_an_environment_draws_itself():
+    env = make_flat(gym.make("Pendulum-v1"))
+    drawn = []
+    for _ in range(2):
+        env.reset(seed=3)
+        drawn.append(env.unwrapped.action_space.sample())
+    assert drawn[0] == drawn[1]
+
+
+def test_an_environment_that_exits_when_it_is_closed(monkeypatch):
+    env = make_flat(gym.make("Pendulum-v1"))
+    monkeypatch.setattr(env.unwrapped, "close", sys.exit)
+    with pytest.warns(UserWarning, match="closing the environment failed: SystemExit"):
+        env.close()
+
+
+def test_an_environment_may_return_the_same_info_again(monkeypatch):
+    env = make_noisy(gym.make("Pendulum-v1", max_episode_steps=3), [], [])
+    inner, info = env.env, {"mine": 1}
+    step = inner.step
+    monkeypatch.setattr(inner, "step", lambda action: (*step(action)[:4], info))
+    for _ in range(2):
+        env.reset()
+        infos = [env.step(np.zeros(1, np.float32))[4] for _ in range(3)]
+        assert infos[:2] == [{"mine": 1}] * 2 and infos[2]["episode"]["l"] == 3
+    assert info == {"mine": 1}
 
 
 def test_an_env_state_of_another_stack_is_refused():
