@@ -1846,8 +1846,7 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     next one into the same array, and actions, because it may write into those; so are infos, which
     may be None. An observation that has not the shape of its space, a step of four values and a
     reset without seed and options raise SpaceError. The spaces are looked up once, because an
-    environment may make new ones, with new generators, at every access; ``reset(seed=...)`` seeds
-    that of the actions, from which an environment may draw, too.
+    environment may make new ones, with new generators, at every access.
 
     >>> env = FiniteNumbers(gym.make("Pendulum-v1", disable_env_checker=True))
     >>> _ = env.reset(seed=0)
@@ -1871,8 +1870,6 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and check the first observation."""
         self._steps = 0
-        if seed is not None:
-            self.action_space.seed(seed)
         try:
             observation, info = self.env.reset(seed=seed, options=options)
         except (SystemExit, TypeError, ValueError) as error:

@@ -267,6 +267,7 @@ def learn(args, env, test_env, stop):
     # SETUP: torch.func differentiates the losses, so autograd need not follow the networks
     torch.manual_seed(args.seed)
     rng = np.random.default_rng(args.seed)
+    env.action_space.seed(args.seed)  # an environment may draw from it
     observation, _ = env.reset(seed=args.seed)
     total_steps = args.total_timesteps // args.num_steps * args.num_steps
     rollout = Rollout(args.num_steps, env)

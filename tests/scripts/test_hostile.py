@@ -14,6 +14,7 @@ import time
 from pathlib import Path
 
 import commands
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -247,6 +248,17 @@ def test_a_seed_seeds_all_that_is_random(algorithm, tmp_path):
     rows = {name: (run_dir / "eval.csv").read_bytes() for name, run_dir in runs.items()}
     assert rows["one"] == rows["same"] != rows["other"]
     torch.testing.assert_close(policy(runs["one"]), policy(runs["same"]), rtol=0, atol=0)
+
+
+@each_script
+def test_a_seed_reaches_the_action_space_of_training(algorithm, tmp_path, monkeypatch):
+    """An environment may draw from it; that of tests may be the same object."""
+    seeds, seed_of_box = [], gym.spaces.Box.seed
+    monkeypatch.setattr(
+        gym.spaces.Box, "seed", lambda box, seed: seeds.append(seed) or seed_of_box(box, seed)
+    )
+    run(algorithm, tmp_path, seed=7, **ALONE)
+    assert seeds == [7]
 
 
 @each_script

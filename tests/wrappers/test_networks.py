@@ -239,15 +239,6 @@ def test_an_env_state_has_the_generators_among_the_attributes():
     EnvState(other).load_state_dict(saved)
 
 
-def test_a_seed_reaches_the_actions_that_an_environment_draws_itself():
-    env = make_flat(gym.make("Pendulum-v1"))
-    drawn = []
-    for _ in range(2):
-        env.reset(seed=3)
-        drawn.append(env.unwrapped.action_space.sample())
-    assert drawn[0] == drawn[1]
-
-
 def test_an_environment_that_exits_when_it_is_closed(monkeypatch):
     env = make_flat(gym.make("Pendulum-v1"))
     monkeypatch.setattr(env.unwrapped, "close", sys.exit)
