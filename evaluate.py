@@ -26,6 +26,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import warnings
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -240,17 +241,26 @@ def check_runs(runs, conditions, bad, storing):
 
     The policy must fit its environment, and every noise must be able to act on it.
     """
-    stored = {}
+    stored, told = {}, {}
     for run in runs:
         try:
             refuse_foreign_module(run, run.environment)
-            with load(run) as (env, _):
+            with load(run) as (env, _), warnings.catch_warnings(record=True) as notes:
                 for condition in conditions:
                     condition.wrap(env)
+            told |= dict.fromkeys(str(note.message) for note in notes)
             stored[run] = read_stored(run) if storing else {}
         except Exception as error:  # any but a ValueError is of the user's environment
             bad[run.folder] = with_place(error, ValueError)
+    for note in told:
+        print(note, file=sys.stderr)
     return stored
+
+
+def add_noise(env, condition):
+    """Wrap an environment in the noise of a condition; check_runs has told what it warns of."""
+    with warnings.catch_warnings(action="ignore"):
+        return condition.wrap(env)
 
 
 def tell(bad):
@@ -266,7 +276,7 @@ def tell(bad):
 def play(run, condition, args):
     """Play episodes; return what play_episodes does."""
     with load(run) as (env, policy):
-        return play_episodes(condition.wrap(env), policy, args.episodes, args.seed)
+        return play_episodes(add_noise(env, condition), policy, args.episodes, args.seed)
 
 
 def draw(run, condition, args):
@@ -275,7 +285,7 @@ def draw(run, condition, args):
     name = f"{run.folder.name}__{condition.slug or 'clean'}{place}.mp4"
     try:
         with load(run, "human" if args.render else "rgb_array") as (env, policy):
-            noisy_env = condition.wrap(env)
+            noisy_env = add_noise(env, condition)
             if args.video:
                 [result] = record(noisy_env, policy, args.seed, args.video / name)
             else:

@@ -370,6 +370,12 @@ def test_trainings_with_other_settings_are_other_rows_of_the_table(runs, capsys)
     ]
 
 
+def test_what_a_noise_warns_of_is_said_once_in_a_line(runs, capsys):
+    main(Args((runs,), noises=("RandomEarlyTermination(5000)",), episodes=1))
+    lines = [line for line in capsys.readouterr().err.splitlines() if "never acts" in line]
+    assert len(lines) == 1 and lines[0].startswith("RandomEarlyTermination(5000) never acts: ")
+
+
 def test_the_phases_of_a_choice_are_other_rows_of_the_table(runs, capsys):
     folders = list(runs.glob("*__ppo_*"))
     for phase, folder in zip(("search", "confirmation"), folders, strict=False):
