@@ -19,7 +19,7 @@ Presets
   best       the paper's best noise for each algorithm and environment
   paper      15 noises at 6 rates, 9,100 runs
   ablation   PPO with noise of several strengths (the paper's appendix)
-  custom     what the grid options name, nothing else
+  custom     the noises that the grid options name; the rest is as in baseline
 Every preset includes the baselines.
 
 Grid options replace a preset's values
@@ -41,7 +41,7 @@ Grid options replace a preset's values
 
 Options of choose
   --noises paper           the paper's 15 noises at 6 rates: 318 runs. The default is 10 noises at
-                           rates 0.05 and 1.0, in 105 runs (docs/sweeps.md lists them). Both confirm
+                           rates 0.05 and 1.0, 105 runs if all can act (see docs/sweeps.md). Both confirm
                            a true gain of 1.5 standard deviations in 9 of 10 cases
   --exclude "NOISE@RATE"   noises to leave out, for example because they always fail
   --budget N               about how many runs the search may take (default: 3 for each noise)
@@ -76,9 +76,10 @@ Examples
   ./benchmark.sh paper --dry-run | grep sac_ | head -n 1 | sh
 
 Run the same command again to resume: finished runs are skipped. Ctrl-C saves a checkpoint of every
-run and exits. `status` without a preset lists all runs in RUNS_DIR. Logs are in RUNS_DIR/logs. The
-interpreter is $PYTHON, else .venv/bin/python, else python. Exit status: 0 all runs are done, 1 some
-are not, 2 bad arguments, 130 stopped by Ctrl-C. See docs/sweeps.md.
+run and exits. `status` without a preset counts all runs in RUNS_DIR. Logs are in logs/ beside the
+runs. The interpreter is $PYTHON, else .venv/bin/python, else python. Exit status: 0 all runs are
+done (slurm without --wait: submitted), 1 some are not, 2 bad arguments, 130 stopped by Ctrl-C. See
+docs/sweeps.md.
 END
 }
 

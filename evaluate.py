@@ -13,7 +13,8 @@ robustness.csv in the run's folder, and what is stored there is not played again
 column for the seed: with any --seed but the default, everything is played and nothing is stored.
 
 The module of an environment or of a noise, as in my_envs:MyEnv-v0, is imported from your own path,
-never from a folder of runs. Runs that cannot be tested are listed; the exit status is 1 then.
+never from a folder of runs. Runs that cannot be tested are listed; the exit status is 1 then, and
+2 if there are no others.
 """
 
 import csv
