@@ -160,7 +160,9 @@ def analyse(args, runs, paper, choice):
         for name, table in tables.items():
             tables[name] = replace(table, caption=table.caption.replace("return", metric))
     else:
-        tables |= success_table(make_studies(runs, SUCCESS)[0])
+        of_success, notes_on_success = make_studies(runs, SUCCESS)
+        tables |= success_table(of_success)
+        notes += [note for note in notes_on_success if note not in notes]
     tables["missing"] = table_of("missing", missing)
     if choice is not None:
         tables["choice"] = table_of("choice", choice)

@@ -34,6 +34,7 @@ from dataclasses import dataclass, replace
 from importlib.machinery import PathFinder
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pandas as pd
 import tyro
@@ -67,8 +68,11 @@ from noisy_wrappers import (
     NotFiniteError,
     SpaceError,
     canonical_env_id,
+    make_flat,
     module_path,
     outcome,
+    reason,
+    refusals,
     rounded,
     seed_globals,
     seeded_globals,
@@ -185,20 +189,29 @@ def load(run, render_mode=None):
     Raises ValueError if a run cannot be tested, besides what its environment raises.
     """
     script = importlib.import_module(script_name(run.algorithm))
+
+    def make_env(env_id, **kwargs):
+        """Make a clean environment as the script does."""
+        try:
+            env = gym.make(env_id, disable_env_checker=True, max_episode_steps=steps, **kwargs)
+            return make_flat(env, script.STEP_LIMIT)
+        except refusals(env_id) as error:
+            raise ValueError(reason(error)) from error
+
     for environment in (run.environment, run.tested_in):
         canonical_env_id(environment)  # imports its module
     steps = run.settings.get("max_episode_steps")
     drawn = {"render_mode": render_mode} if render_mode else {}  # not every class takes it
     seed_globals(Args.seed)  # as every episode does: the constructor may draw, too
-    with script.make_env(run.tested_in, max_episode_steps=steps, **drawn) as env:
+    with make_env(run.tested_in, **drawn) as env:
         if run.elsewhere:
-            with script.make_env(run.environment, max_episode_steps=steps) as trained_in:
+            with make_env(run.environment) as trained_in:
                 check_spaces(run, trained_in, env)
         try:
             policy = script.load_policy(run.folder, env)
         except Exception as error:  # a damaged file may raise anything
-            reason = f"policy.pt is not a policy for {run.tested_in}: {in_words(error)}"
-            raise ValueError(reason) from None
+            text = f"policy.pt is not a policy for {run.tested_in}: {in_words(error)}"
+            raise ValueError(text) from None
         yield env, policy
 
 
@@ -267,11 +280,11 @@ def add_noise(env, condition):
 def tell(bad):
     """Print each reason why runs cannot be tested, with the first of them; bad: see check_runs."""
     folders = {}
-    for folder, reason in bad.items():
-        folders.setdefault(reason, []).append(folder)
-    for reason, (first, *others) in folders.items():
+    for folder, text in bad.items():
+        folders.setdefault(text, []).append(folder)
+    for text, (first, *others) in folders.items():
         more = f" and {len(others)} more" if others else ""
-        print(f"error: {first}{more}: {reason}", file=sys.stderr)
+        print(f"error: {first}{more}: {text}", file=sys.stderr)
 
 
 def play(run, condition, args):

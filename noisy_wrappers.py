@@ -951,14 +951,15 @@ class RandomDynamics(NoiseWrapper):
         scaled = {field: getattr(model, field).copy() for field in self.fields}
         observation, info = self.env.reset(seed=seed, options=options)
         if chosen:
-            model = self._model()  # perhaps a new one, or one whose values reset() has set
-            own = {field: getattr(model, field).copy() for field in self.fields}
-            is_own = {field: own[field] != scaled[field] for field in self.fields}
-            if any(changed.any() for changed in is_own.values()):
-                self._restore()
-                for field, changed in is_own.items():
-                    getattr(model, field)[changed] = own[field][changed]
-                self._scale(model, factors)
+            if self._model() is not model:  # the environment has built a new one
+                self._scale(self._model(), factors)
+                scaled = {}
+            for field, values in scaled.items():
+                if (getattr(model, field) != values).any():
+                    raise ValueError(
+                        f"fields: this environment's reset() sets {field} itself, so that no "
+                        "factor of RandomDynamics is left"
+                    )
             info = {**self.mark(info), "dynamics": factors}
         return observation, info
 
@@ -1397,7 +1398,7 @@ class RecordEpisodeStatistics(gym.wrappers.RecordEpisodeStatistics[Any, Any]):
             raise ValueError(_RECORDED) from error
         if terminated or truncated:
             recorded = dict(info)
-            del info["episode"]  # the environment may return the same dict again
+            del info[self._stats_key]  # the environment may return the same dict again
             info = recorded
         return observation, reward, terminated, truncated, info
 
@@ -1802,6 +1803,8 @@ def _import_module(module: str, problem: str) -> None:
                 f"{loaded.__file__}; rename yours"
             )
         importlib.import_module(module)
+    except SystemExit as error:
+        raise ValueError(f"{problem}: {module} called sys.exit({error.code!r})") from error
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
             raise  # it exists, and imports another one that does not
@@ -2211,7 +2214,8 @@ class EnvState:
         for place, layer in [*holders.items()]:
             for name, value in vars(layer).items():
                 if isinstance(value, gym.Env) and value not in layers:
-                    holders[f"{place}.{name}"] = value
+                    inside = [*_layers(value), value.unwrapped]
+                    holders |= {f"{place}.{name}.{i}": part for i, part in enumerate(inside)}
         known, found = [id(generator) for generator in self._generators()], {}
         kinds = np.random.Generator | np.random.RandomState | random.Random
         for place, holder in holders.items():

@@ -373,9 +373,9 @@ def fail_on(errors, message, code=2):
     try:
         yield
     except errors as error:
-        hidden = isinstance(error.__context__, OSError)  # by torch.save: the disk is full, say
-        error = error.__context__ if hidden else error
-        fail(f"{message}: {noisy.reason(error)}", code)
+        # torch.save hides the reason: that the disk is full, say
+        hidden = isinstance(error, RuntimeError) and isinstance(error.__context__, OSError)
+        fail(f"{message}: {noisy.reason(error.__context__ if hidden else error)}", code)
     except Exception as error:  # of the environment, say: its traceback is what the user needs
         error.add_note(f"({message})")
         raise
@@ -479,10 +479,11 @@ def prepare_compiler():
 
     say("compiling ...")
     torch.compiler.reset()  # forget what earlier runs of this process compiled
-    with contextlib.suppress(OSError):  # another process removes files, too
+    with contextlib.suppress(OSError):  # another process removed a folder
         for path in Path(cache_dir()).rglob("*.so"):
-            if path.stat().st_size == 0 and time.time() - path.stat().st_mtime > 60:
-                path.unlink()
+            with contextlib.suppress(OSError):  # or it
+                if path.stat().st_size == 0 and time.time() - path.stat().st_mtime > 60:
+                    path.unlink()
 
 
 def start_again(error):

@@ -151,7 +151,9 @@ def score_rows(runs):
             counting = [score for score in at_home if min(score["n"], score["n_baseline"]) >= 2]
             counting = counting or at_home
             if len(counting) > 1:
-                yield average_score(counting) | {"primary": True}
+                of = f"{len(counting)} of {len(at_home)}" if len(counting) < len(at_home) else "all"
+                where = f"{of} environments together"
+                yield average_score(counting) | {"primary": True, "where": where}
             for score in scores:
                 is_only = len(counting) == 1 and score is counting[0]
                 yield score | {"primary": bool(score["elsewhere"]) or is_only}
@@ -217,7 +219,8 @@ def analyse_robustness(runs, metric="return"):
     if runs.empty:
         return {}, []
     table = pd.DataFrame(condition_rows(runs), columns=COLUMNS)
-    scores = pd.DataFrame(score_rows(runs), columns=[*SCORE_COLUMNS, "primary", "elsewhere"])
+    more = ["primary", "elsewhere", "where"]
+    scores = pd.DataFrame(score_rows(runs), columns=[*SCORE_COLUMNS, *more])
     primary = scores[scores["primary"].astype(bool)]
     for _, family in primary[primary["p"].notna()].groupby([*STUDY, "elsewhere"]):
         scores.loc[family.index, "p_holm"] = holm(family["p"].to_numpy(float))
@@ -238,7 +241,7 @@ def robustness_sentences(scores, metric):
     """Yield one plain sentence for each training configuration: is it more robust?"""
     unit = verdicts.POINTS if metric == SUCCESS else ""
     for row in scores.itertuples():
-        where = row.environment or "all environments together"
+        where = row.environment or row.where
         study = study_name(row.algorithm, row.exp_name, row.phase)
         start = f"{study} on {where}, trained with {row.noise} at rate {row.noise_rate}"
         shown, limit = "no clear difference in robustness to new noise", ""

@@ -325,7 +325,7 @@ def make_studies(runs, metric="return"):
     """Arrange the finished runs into a list of Study, and list in words what had to be cut.
 
     metric: what is compared, "return" or "success rate"; of the latter, only environments that tell
-    it. A run there that never does was never successful.
+    it. A run there that never does was never successful, and a note says so.
     """
     studies, notes = [], []
     column = "success_rates" if metric == SUCCESS else "returns"
@@ -334,7 +334,10 @@ def make_studies(runs, metric="return"):
         told = finished[column].notna()
         silent = ~told & told.groupby(finished["environment"]).transform("any")
         for env, n in finished.loc[silent, "environment"].value_counts(sort=False).items():
-            notes.append(f"runs on {env} that never tell success, as others do, count as 0 %: {n}")
+            notes.append(
+                f"runs on {env} that never tell success, as others do, count as 0 %: {n} (version "
+                "0.2 noted no success: leave its runs out)"
+            )
         never = finished.loc[silent, "steps"].map(lambda steps: np.zeros(len(steps)))
         finished = finished.assign(**{column: finished[column].where(~silent, never)})
     finished = finished[finished[column].notna()]

@@ -33,7 +33,7 @@ def columns(scores):
 
 def exact(value, *samples):
     """Return a difference or a spread of samples, but 0 where it is nothing but rounding errors."""
-    return value if abs(value) > 1e-12 * abs(np.concatenate(samples)).max() else 0.0
+    return 0.0 if abs(value) <= 1e-12 * abs(np.concatenate(samples)).max() else value
 
 
 def mean_std(values):

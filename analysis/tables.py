@@ -271,13 +271,14 @@ def family_notes(judged):
                     f"{smallest:.2g})."
                 )
             elif (needed := ceil(round(size * smallest / statistics.LEVEL, 9))) > 1:
-                is_holm = study[-1] == CONFIRMATION  # not Benjamini and Hochberg's correction
-                can = "no difference can be significant after the correction"
-                if not is_holm:
-                    can = (
-                        "differences can be significant after the correction only if at least "
-                        f"{needed} of them are"
-                    )
+                can = (
+                    "differences can be significant after the correction only if at least "
+                    f"{needed} of them are"
+                )
+                if study[-1] == CONFIRMATION:  # Holm's, not Benjamini and Hochberg's
+                    others = compared.loc[compared["phase"] == CONFIRMATION, "smallest_p"]
+                    alone = " alone" if others.nunique() > 1 else ""
+                    can = f"no difference can be significant{alone} after the correction"
                 notes.append(
                     f"{where}: with {seeds} and {size:.0f} comparisons, {can} (smallest possible "
                     f"p: {smallest:.2g}, corrected for one alone {min(1, size * smallest):.2g})."

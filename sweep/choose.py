@@ -47,8 +47,7 @@ class Choice(NamedTuple):
 def choices(args):
     """Return the choices of one command, or exit if its numbers make no choice.
 
-    Where runs are listed, environments are made, timed and tried with noises: those of choices that
-    have no runs yet, and those in which some of the noises were never tried.
+    Where runs are listed, environments are made, timed and tried with noises: see untried.
     """
     pairs = list(itertools.product(dict.fromkeys(args.algos), args.envs))
     fewest = halving.fewest_seeds(len(pairs))
@@ -58,21 +57,32 @@ def choices(args):
             f"difference could be significant (number of verdicts: {len(pairs)})"
         )
     known = {env_id: remembered(args.runs_dir, env_id) for env_id in args.envs}
-    noises = {}  # to try, by environment
-    for algorithm, env_id in pairs if args.view in ("list", "dry-run") else ():
-        tried = known[env_id].tried if known[env_id] else {}
-        named = candidates(args, algorithm, env_id)
-        has_runs = follow(args, algorithm, env_id, None).returns
-        if not has_runs or not {noise.noise for noise in named} <= tried.keys():
-            noises[env_id] = named
+    listed = args.view in ("list", "dry-run")
+    noises = {env_id: untried(args, env_id, known[env_id]) for env_id in args.envs if listed}
+    noises = {env_id: new for env_id, new in noises.items() if new}
     for env_id, answer in ask_all(args, noises).items():
-        known[env_id] = answer
+        before = known[env_id].tried if known[env_id] else {}
+        known[env_id] = answer._replace(tried=before | answer.tried)
         if (unfit := unfit_noises(answer.tried)) and not args.noises:
             text = f"{env_id}: left out, because they cannot act there: {unfit}"
             print(text, file=sys.stderr)
         if args.view == "list":
-            remember(args.runs_dir, env_id, answer)
+            remember(args.runs_dir, env_id, known[env_id])
     return [follow(args, *pair, known[pair[1]]) for pair in pairs]
+
+
+def untried(args, env_id, environment):
+    """Return the noises to try in an environment, of which `environment` is known, or None.
+
+    All of them until the first run of a choice there is finished. From then on a choice keeps its
+    noises: only such as were never tried, or were refused and are named all the same.
+    """
+    tried = environment.tried if environment else {}
+    noises = candidates(args, args.algos[0], env_id)
+    fit = None if args.noises else environment
+    if not any(follow(args, algorithm, env_id, fit).returns for algorithm in args.algos):
+        return noises
+    return [n for n in noises if n.noise not in tried or (args.noises and tried[n.noise])]
 
 
 def unfit_noises(tried):
@@ -134,7 +144,7 @@ def walk(args, algorithm, env_id, noises, budget):
     while True:
         state = halving.advance(noises, budget, args.confirm, returns)
         if runs.keys() >= set(state.due):  # they have not finished
-            if tells == {False}:
+            if tells == {False} and (state.rounds or not state.due):
                 fail(f"--metric success_rate: {env_id} tells no `is_success` or `success`")
             return state, runs, tests, returns
         for noise, seed in state.due:

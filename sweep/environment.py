@@ -222,10 +222,8 @@ def time_left(batches, jobs, elsewhere=False):
 
 
 def remember(runs_dir, env_id, environment):
-    """Keep what was found, for a status; what other noises did there is kept, too."""
+    """Keep what was found, for a status."""
     path = file_of(runs_dir, env_id)
-    if before := remembered(runs_dir, env_id):
-        environment = environment._replace(tried=before.tried | environment.tried)
     with contextlib.suppress(OSError):  # benchmark.sh will say so
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(environment))

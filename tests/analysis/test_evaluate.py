@@ -500,14 +500,14 @@ def test_a_window_needs_a_display(runs):
 def test_a_window_shows_one_episode_of_each_condition(runs, monkeypatch, capsys):
     """The window itself is replaced."""
     modes = []
-    make_env = ppo.make_env
+    make_env = gym.make
 
     def make(env_id, render_mode=None, **kwargs):
         modes.append(render_mode)
         return make_env(env_id, **kwargs)
 
     monkeypatch.setattr(evaluate, "works", lambda code: True)
-    monkeypatch.setattr(ppo, "make_env", make)
+    monkeypatch.setattr(gym, "make", make)
     before = files(runs)
     main(Args((one(runs, "PPO"),), (ACTION,), (1.0,), render=True, jobs=2))
     assert modes == [None, "human", "human"]  # the first is the check
@@ -536,6 +536,9 @@ BAD_RUNS = {
     "delete that file": lambda run_dir: (run_dir / "robustness.csv").write_text("a,b\n1,2\n"),
     "there is no environment 'Nothing-v0'": lambda run_dir: other_environment(
         run_dir, "Nothing-v0"
+    ),
+    "needs Box actions of floats in one dimension; CartPole-v1": lambda run_dir: other_environment(
+        run_dir, "CartPole-v1"
     ),
     "RuntimeError: not today .*broken.py, line 2": lambda run_dir: other_environment(
         run_dir, "broken:Mine-v0"

@@ -188,7 +188,7 @@ def test_environments_count_equally_and_the_test_is_stratified(tmp_path):
     assert scores["p_holm"].isna().tolist() == [False, True, True]  # the others are secondary
 
 
-def test_an_environment_with_one_seed_does_not_hide_the_others(tmp_path):
+def test_an_environment_with_one_seed_does_not_hide_the_others(tmp_path, capsys):
     clean, weak, strong = ([100, 101, 99, 100], [50, 51, 52, 53], [80, 81, 82, 83])
     table = {("", 0.0): {("", "0.0"): clean, (SENSOR, "1.0"): weak}}
     table |= {(PUSH, 1.0): {("", "0.0"): clean, (SENSOR, "1.0"): strong}}
@@ -201,6 +201,7 @@ def test_an_environment_with_one_seed_does_not_hide_the_others(tmp_path):
         write_tests(tmp_path / "two/runs", table, env, seeds)
     scores = run(tmp_path / "two")["robustness_score"]
     assert list(scores["environment"][scores["p_holm"].notna()]) == ["A-v0"]
+    assert "on 2 of 3 environments together, trained with" in capsys.readouterr().out
 
 
 def test_sentences_say_what_the_seeds_could_have_shown(tmp_path, capsys):

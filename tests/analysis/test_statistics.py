@@ -139,6 +139,7 @@ def test_rounding_errors_are_no_difference():
     assert statistics.compare(x, y)[4:7] == (0, 0, 0)  # the difference and its interval
     two = statistics.compare(np.full((3, 2), [0.95, 0.7]), np.full((5, 2), [0.95, 0.7]))
     assert (two.effect_size, two.t, two.p) == (0, 0, 1)
+    assert np.isnan(statistics.exact(np.nan, x))
 
 
 def test_an_iqm_that_may_be_drawn_as_zero_has_no_interval_of_its_change(recwarn):

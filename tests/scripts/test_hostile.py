@@ -10,6 +10,7 @@ import random
 import re
 import shutil
 import signal
+import sys
 import time
 from pathlib import Path
 
@@ -395,6 +396,16 @@ def test_an_exit_of_the_constructor_is_a_line(algorithm, tmp_path, capsys):
         run(algorithm, tmp_path, env_id="hostile_envs:ExitsAtOnce-v0")
     assert stopped.value.code == 2
     assert_one_line(capsys.readouterr().err, "ExitsAtOnce-v0: the environment called sys.exit(0)")
+
+
+@one_script
+def test_the_words_of_an_exit_are_told(algorithm, capsys):
+    with pytest.raises(SystemExit), SCRIPTS[algorithm].fail_on(SystemExit, "--env-id Mine-v0"):
+        try:
+            raise FileNotFoundError("no data")
+        except OSError:
+            sys.exit("run ./download.sh first")
+    assert_one_line(capsys.readouterr().err, "called sys.exit('run ./download.sh first')")
 
 
 @one_script

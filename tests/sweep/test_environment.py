@@ -306,6 +306,20 @@ def test_another_choice_in_the_folder_changes_no_noises_of_the_first(tmp_path):
         assert shown.code == 2 and "60) (an episode has at most 8 steps)" in shown.err
 
 
+def test_a_refusal_holds_until_the_noise_is_named_again(tmp_path):
+    short = ["--runs-dir", tmp_path, "--total-timesteps", "4000"]
+    first = [*short, "--noise-rates", "1"]
+    train(choose("Tiny", *first, view_name="list").out.splitlines()[0])
+    known = remembered(tmp_path, "toy_envs:Tiny-v0")
+    tried = known.tried | {SCALE: "NameError: an error that has been mended"}
+    remember(tmp_path, "toy_envs:Tiny-v0", known._replace(tried=tried))
+    for algos in (["ppo"], ["ppo", "sac"]):
+        assert "7 of 7 noises" in choose("Tiny", *first, view_name="list", algos=algos).err
+    named = ["--noises", f"{SCALE}@1", "--confirm", "4", *short]
+    assert choose("Tiny", *named, view_name="list").code == 0
+    assert choose("Tiny", *named, view_name="status").code == 0
+
+
 def test_what_cannot_be_read_is_asked_again(tmp_path):
     assert remembered(tmp_path, "m:A-v0") is None
     remember(tmp_path, "m:A-v0", KNOWN)

@@ -145,20 +145,12 @@ class Heavier(Cart):
         return super().reset(**kwargs)
 
 
-def test_values_that_reset_sets_are_scaled_and_restored():
-    env = Heavier()
-    noisy = RandomDynamics(env, 1.0, 1.5, 1.5)
-    inertia, masses = env.model.body_inertia.copy(), env.model.body_subtreemass.copy()
-    others = env.model.body_mass[2:].copy()
-    for episode in (1, 2):
+def test_fields_that_reset_sets_itself_are_refused():
+    noisy = RandomDynamics(Heavier(), 1.0, 1.5, 1.5)
+    with pytest.raises(ValueError, match="fields: this environment's reset.. sets body_mass itse"):
         noisy.reset(seed=0)
-        assert env.model.body_mass[1:].tolist() == [1.5 * episode, *1.5 * others]
-        assert env.model.body_subtreemass[0] == pytest.approx(1.5 * (episode + others.sum()))
-    noisy.noise_rate = 0
-    noisy.reset()
-    assert env.model.body_mass[1:].tolist() == [3, *others]
-    np.testing.assert_array_equal(env.model.body_inertia, inertia)
-    np.testing.assert_array_equal(env.model.body_subtreemass, masses)  # the environment's own
+    friction = RandomDynamics(Heavier(), 1.0, 1.5, 1.5, fields=("geom_friction",))
+    assert friction.reset(seed=0)[1]["noise"] == ("RandomDynamics",)
 
 
 def test_what_the_user_changes_between_episodes_stays():

@@ -141,7 +141,12 @@ def test_unknown_environments(env_id, reason):
 
 @pytest.mark.parametrize(
     ("source", "error"),
-    [("{}[1]", KeyError), ("import no_such_module", ModuleNotFoundError), ("x = ][", SyntaxError)],
+    [
+        ("{}[1]", KeyError),
+        ("import no_such_module", ModuleNotFoundError),
+        ("x = ][", SyntaxError),
+        ("raise SystemExit(3)", ValueError),
+    ],
 )
 def test_what_a_module_raises_passes_through(source, error, tmp_path, monkeypatch):
     (tmp_path / "buggy_module.py").write_text(source)

@@ -212,7 +212,7 @@ class Drawing(gym.Env):
     action_space = gym.spaces.Box(-1, 1, (1,))
 
     def __init__(self):
-        self.robot = gym.make("Pendulum-v1").unwrapped
+        self.robot = gym.make("Pendulum-v1")
         self.dice = random.SystemRandom()  # nothing can restore it, and nothing fails
 
     def reset(self, *, seed=None, options=None):
