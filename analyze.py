@@ -157,6 +157,10 @@ def analyse(args, runs, paper, choice):
     robustness_tables, robustness = analyse_robustness(tests, metric)
     tables = make_tables(studies, paper) | robustness_tables
     if metric == SUCCESS:
+        told = {environment for study in studies for environment in study.environments}
+        silent = sorted({*runs.loc[runs["status"] == "finished", "environment"]} - told)
+        if silent:
+            notes.append(f"left out, because they never tell success: {', '.join(silent)}")
         for name, table in tables.items():
             tables[name] = replace(table, caption=table.caption.replace("return", metric))
     else:
@@ -195,7 +199,7 @@ def main(args):
         fail(f"no folder {args.runs_dir}")
     try:
         paper = read_paper(args.compare) if args.compare else None
-        choice = read_choice(args.runs_dir)
+        choice = read_choice(args.runs_dir, args.metric.replace("_", " "))
     except ValueError as error:
         fail(error)
     out = args.out or args.runs_dir / "results"

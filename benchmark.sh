@@ -220,7 +220,7 @@ run_todo() {
     sleep 1 & wait $! || true # a trap interrupts wait, not sleep
   done
   kill -- "-$guard" || true
-  kill "$watch" && { [ ! -t 2 ] || echo >&2; } || true
+  kill "$watch" 2>/dev/null && { [ ! -t 2 ] || echo >&2; } || true
   group='' ids=()
   tried+=$'\n'$todo
 }

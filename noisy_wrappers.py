@@ -979,7 +979,7 @@ class RandomDynamics(NoiseWrapper):
             model = getattr(model, "ptr", model)
             if mujoco and isinstance(model, mujoco.MjModel):
                 return model
-        raise ValueError(f"RandomDynamics needs an environment with a MuJoCo model, not {self.env}")
+        raise ValueError(f"RandomDynamics needs an environment with a MuJoCo model, not {base}")
 
     def _scale(self, model: Any, factors: dict[str, NDArray[Any]]) -> None:
         """Multiply the rows of the fields, and let MuJoCo derive its constants from them."""

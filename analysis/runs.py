@@ -185,12 +185,17 @@ def failed_without_a_folder(runs_dir):
     return rows
 
 
-def read_choice(runs_dir):
-    """Read the choice.csv of `./benchmark.sh choose`, or return None where there is none.
+def choice_file(metric="return"):
+    """Name the file of what was chosen by a metric: scores of two do not compare."""
+    return "choice_by_success.csv" if metric == SUCCESS else "choice.csv"
+
+
+def read_choice(runs_dir, metric="return"):
+    """Read the choice_file of `./benchmark.sh choose`, or return None where there is none.
 
     Raises ValueError for a damaged file, and where an earlier version kept all runs in one folder.
     """
-    path = Path(runs_dir) / "choice.csv"
+    path = Path(runs_dir) / choice_file(metric)
     if not path.exists():
         return None
     if not any((path.parent / phase).exists() for phase in PHASES):

@@ -326,8 +326,8 @@ intervals. Above zero, both at once are better than the sum.""",
 seeds confirm the winner or not.""",
     "robustness_score": """Primary figure of robustness: the mean return under noise that was not in
 training, of policies trained with noise and without.""",
-    "robustness": """Return under every test condition: mean \u00b1 standard deviation over n seeds,
-and difference from the policies trained without noise.""",
+    "robustness": """The return under every test condition: mean \u00b1 standard deviation over n
+seeds, and difference from the policies trained without noise.""",
     "missing": "Runs that are in no table and no figure, with their seeds.",
     "compare_luck": """The same for the paper's tables.""",
     "compare": "The paper's table (environments v2, 1,000,000 steps) beside ours.",

@@ -160,7 +160,7 @@ def power(row):
         found = rounded(row["detectable"], spread_of(row))
         parts.append(f"{seeds} could have shown {found} ({before})")
     needed = row["seeds_needed"]
-    if needed > max(n, m):
+    if needed > max(n, m) and row["difference"]:
         needed = f"about {needed:.0f}" if needed <= MAX_SEEDS else f"more than {MAX_SEEDS:,}"
         observed = rounded(abs(row["difference"]), spread_of(row))
         parts.append(f"{observed} would take {needed} seeds each")

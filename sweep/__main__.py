@@ -12,6 +12,7 @@ machine whose locks this one cannot see is taken for running while its log is yo
 
 import contextlib
 import os
+import shlex
 import shutil
 import sys
 import tempfile
@@ -194,8 +195,9 @@ def show_report(args, runs, choices):
 
         choose.report(choices, args)
     if any(p.state == "done" for p in progresses):
-        print(f"See the curves with: tensorboard --logdir {args.runs_dir}")
-        print(f"Make tables and figures with: python analyze.py --runs-dir {args.runs_dir}")
+        place = shlex.quote(args.runs_dir)
+        print(f"See the curves with: tensorboard --logdir {place}")
+        print(f"Make tables and figures with: python analyze.py --runs-dir {place}")
     return int(unfinished)
 
 

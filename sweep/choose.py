@@ -17,7 +17,7 @@ import numpy as np
 
 from analysis.errors import fail, in_words
 from analysis.folders import CONFIRMATION, SEARCH, flat_choice
-from analysis.runs import CHOICE_COLUMNS, SUCCESS, read_run
+from analysis.runs import CHOICE_COLUMNS, SUCCESS, choice_file, read_run
 from analysis.statistics import detectable_shift, holm
 from analysis.verdicts import POINTS, what_all_runs_do
 from noisy_wrappers import BASELINE, Configuration, rounded
@@ -301,7 +301,7 @@ def report(found, args):
         for choice, (helped, _) in zip(found, judged, strict=True):
             names = choice.kind[0].upper(), choice.kind[1]
             rows += halving.records(*names, choice.state, choice.returns, helped)
-        write_choice(Path(args.runs_dir, "choice.csv"), rows)
+        write_choice(Path(args.runs_dir, choice_file(args.metric)), rows)
         lines = [sentence for _, sentence in judged]
     print(*lines, sep="\n")
 

@@ -124,6 +124,8 @@ def from_project(caller, text):
 
     It is relative where it lies in the project, so that it means the same on other machines.
     """
+    if not text:
+        fail("--runs-dir must name a folder")
     path = os.path.normpath(os.path.join(caller, os.path.expanduser(text)))
     if Path(path).is_relative_to(os.getcwd()):
         path = os.path.relpath(path)

@@ -66,6 +66,13 @@ def test_the_verdict_is_in_percentage_points(runs_dir, capsys):
     assert "test success rate (%)" in figure and "sum of rewards" not in figure
 
 
+def test_environments_that_tell_no_success_are_named(runs_dir, tmp_path, capsys):
+    write_run(runs_dir, [-50.0, -50.0])
+    analyze.main(analyze.Args(runs_dir, tmp_path / "out", metric="success_rate"))
+    said = capsys.readouterr().out
+    assert "note: left out, because they never tell success: Hopper-v5\n" in said
+
+
 def test_success_is_beside_the_return(runs_dir, capsys):
     tables = run(runs_dir.parent)
     found = row(tables["success"], noise=SCALE)
@@ -163,6 +170,7 @@ def test_robustness_is_judged_by_success(tmp_path, capsys):
     table = pd.read_csv(tmp_path / "out/robustness.csv")
     assert table["mean"].tolist() == [100, 44, 100, 84] and table["cvar"].isna().all()
     page = (tmp_path / "out/report.html").read_text()
+    assert "The success rate under every test condition" in page
     assert (
         "in percentage points. A dot marks" in page and "the mean success rate under noise" in page
     )

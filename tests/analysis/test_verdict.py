@@ -110,8 +110,10 @@ def test_no_clear_difference_says_what_the_seeds_could_have_shown():
     [text] = said["sentence"]
     assert f"; 10 seeds could have shown {shift * spread:.1f} (80 % power), and 1.5 would" in text
     assert f" would take about {row['seeds_needed']:.0f} seeds each." in text
-    _, said = judge(TEN, {"0.10": TEN})
+    _, said = judge(TEN, {"0.10": TEN + 0.01})
     assert "0.0 would take more than 1,000 seeds each." in said["sentence"].iloc[0]
+    _, said = judge(TEN, {"0.10": TEN})
+    assert "would take" not in said["sentence"].iloc[0]
 
 
 def test_the_power_is_said_to_be_before_the_correction():

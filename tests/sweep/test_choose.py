@@ -379,7 +379,7 @@ def test_a_noise_is_chosen_by_the_rate_of_success(env_id, tmp_path):
     args = arguments(text, tmp_path)
     batches(args)
     [verdict] = conclude(args)
-    lines = read(tmp_path / "choice.csv")
+    lines = read(tmp_path / "choice_by_success.csv")
     rates = {}
     for line in lines[-2:]:
         noise = Configuration.parse(line["noise"], line["noise_rate"])

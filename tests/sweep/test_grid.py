@@ -122,6 +122,18 @@ def test_other_presets():
     assert picture in (ROOT / "Makefile").read_text()
 
 
+def test_a_folder_without_a_name_is_refused():
+    result = view("list", "demo", "--runs-dir", "")
+    assert (result.code, result.err) == (2, "error: --runs-dir must name a folder\n")
+
+
+def test_a_report_quotes_the_folder(tmp_path):
+    grid = ["baseline", *GRID, "--total-timesteps", "1000", "--runs-dir", tmp_path / "a b"]
+    [folder] = folders(*grid)
+    finish(folder)
+    assert f"analyze.py --runs-dir '{tmp_path}/a b'\n" in view("report", *grid).out
+
+
 def test_a_status_with_a_preset_that_is_not_the_first_word_is_refused(tmp_path):
     result = view("status", "--runs-dir", tmp_path, "demo")
     assert (result.code, result.err) == (2, "error: the preset comes first: demo --...\n")
