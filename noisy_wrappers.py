@@ -948,18 +948,16 @@ class RandomDynamics(NoiseWrapper):
         chosen = self.acts() and any((values != 1).any() for values in factors.values())
         if chosen:
             self._scale(model, factors)
-        scaled = {field: getattr(model, field).copy() for field in self.fields}
+            scaled = {field: getattr(model, field).copy() for field in self.fields}
         observation, info = self.env.reset(seed=seed, options=options)
         if chosen:
             if self._model() is not model:  # the environment has built a new one
                 self._scale(self._model(), factors)
-                scaled = {}
-            for field, values in scaled.items():
-                if (getattr(model, field) != values).any():
-                    raise ValueError(
-                        f"fields: this environment's reset() sets {field} itself, so that no "
-                        "factor of RandomDynamics is left"
-                    )
+            elif own := [name for name in scaled if (getattr(model, name) != scaled[name]).any()]:
+                raise ValueError(
+                    f"fields: this environment's reset() sets {own[0]} itself, so that no factor "
+                    "of RandomDynamics is left"
+                )
             info = {**self.mark(info), "dynamics": factors}
         return observation, info
 
