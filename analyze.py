@@ -144,7 +144,7 @@ def print_results(out, results):
 
 def analyse(args, runs, paper, choice):
     """Compute everything that is told of a frame of runs (read_runs); see main."""
-    metric = args.metric.replace("_", " ")
+    metric = args.metric
     missing, number = left_out(runs)
     studies, notes = make_studies(runs, metric)
     if not studies and make_studies(runs)[0]:
@@ -195,11 +195,12 @@ def main(args):
     """
     paths = {name: getattr(args, name) for name in ("runs_dir", "out", "compare")}
     args = replace(args, **{name: path and path.expanduser() for name, path in paths.items()})
+    args = replace(args, metric=args.metric.replace("_", " "))
     if not args.runs_dir.is_dir():
         fail(f"no folder {args.runs_dir}")
     try:
         paper = read_paper(args.compare) if args.compare else None
-        choice = read_choice(args.runs_dir, args.metric.replace("_", " "))
+        choice = read_choice(args.runs_dir, args.metric)
     except ValueError as error:
         fail(error)
     out = args.out or args.runs_dir / "results"
