@@ -96,10 +96,10 @@ def write_results(out, results, latex):
     for table in results.tables.values():
         write_table(out, table, latex)
     drawn = figures(results.studies, results.tables)
-    names = {*results.tables}
     for drawing in drawn:
-        names |= write_figure(out, drawing, latex)
+        write_figure(out, drawing, latex)
     write_report(out, results, drawn)
+    names = {*results.tables, *(drawing.name for drawing in drawn)}
     old = sorted({path.stem for path in [*out.glob("*.csv"), *out.glob("*.svg")]} - names)
     if old:
         told = f"{out} also holds files that this analysis did not write: {', '.join(old)}"

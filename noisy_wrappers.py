@@ -62,58 +62,6 @@ from numpy.typing import NDArray
 
 __version__ = "0.3.0"
 
-__all__ = [
-    "BASELINE",
-    "MAY_DIFFER_IN_A_RUN",
-    "MAY_DIFFER_IN_A_TABLE",
-    "WRAPPERS",
-    "Configuration",
-    "EnvState",
-    "FiniteNumbers",
-    "Noise",
-    "NoiseWrapper",
-    "NotFiniteError",
-    "ObservationNoise",
-    "RandomActionDelay",
-    "RandomDropoutObservation",
-    "RandomDynamics",
-    "RandomEarlyTermination",
-    "RandomMixupObservation",
-    "RandomNormalNoisyAction",
-    "RandomNormalNoisyObservation",
-    "RandomNormalNoisyReward",
-    "RandomUniformNoisyObservation",
-    "RandomUniformNoisyReward",
-    "RandomUniformScaleObservation",
-    "RandomUniformScaleReward",
-    "RewardNoise",
-    "SpaceError",
-    "canonical_env_id",
-    "handle_signals",
-    "into_space",
-    "make_flat",
-    "make_noisy",
-    "module_path",
-    "noise_statistics",
-    "noise_wrappers",
-    "note_versions",
-    "outcome",
-    "parse_noise",
-    "rate_order",
-    "reason",
-    "refusals",
-    "remarks",
-    "reset_worker_signals",
-    "rounded",
-    "run_name",
-    "seed_globals",
-    "seeded_globals",
-    "set_progress",
-    "signatures",
-    "split_noises",
-    "success_rate",
-]
-
 Env = gym.Env[Any, Any]
 Info = dict[str, Any]
 Step = tuple[Any, Any, bool, bool, Info]  # observation, reward, terminated, truncated, info
@@ -1261,12 +1209,6 @@ class Configuration:
         The last is a noise that is not ours: its module need not be there where runs are analysed.
         """
         return {WRAPPERS[name].kind if name in WRAPPERS else "own" for name in self.wrappers}
-
-    @property
-    def parts(self) -> list["Configuration"]:
-        """The configurations with one of the noises each."""
-        pairs = zip(self.noises, self.rates, strict=True)
-        return [Configuration((noise,), (rate,)) for noise, rate in pairs]
 
     @property
     def slug(self) -> str:

@@ -44,23 +44,21 @@ def configurations(rows):
     return sorted(configs, key=lambda config: (config[0], rate_order(config[1])))
 
 
-def effects_figure(rows, metric, narrow=False):
+def effects_figure(rows, metric):
     """Draw the effect of every noise, a panel for each environment with what was tried there.
 
     rows: those of statistics in which environments of one study were compared. Up to MOST_IN_FOREST
-    noises and rates are a forest plot; more are heatmaps of noises by rates. The panels stand below
-    each other if the figure shall be narrow, otherwise in two columns.
+    noises and rates are a forest plot; more are heatmaps of noises by rates.
     """
     is_forest = len(configurations(rows)) <= MOST_IN_FOREST
     scale = column, unit, limit = heatmap_scale(rows)
     panels = list(rows.groupby("environment"))
     labels = [labels_of(panel, is_forest) for _, panel in panels]
-    across = 1 if narrow else min(2, len(panels))
+    across = min(2, len(panels))
     width = style.WIDTH if across == 2 else style.WIDTHS[0]
-    width = style.NARROW_WIDTH if narrow else width
     lines = [len("\n".join(names).split("\n")) for names in labels]
     lines = [max(lines[i : i + across]) for i in range(0, len(lines), across)]
-    heights = [0.75 + (0.18 if narrow else 0.22) * number for number in lines]
+    heights = [0.75 + 0.22 * number for number in lines]
     fig = Figure(figsize=(width, 0.4 + sum(heights)), layout="constrained")
     grid = fig.add_gridspec(len(heights), across, height_ratios=heights)
     axes = [fig.add_subplot(grid[i]) for i in range(len(panels))]
@@ -69,15 +67,15 @@ def effects_figure(rows, metric, narrow=False):
             forest_panel(ax, panel, (width - 2 * across) / across)
         else:
             image = heat_panel(ax, panel, scale)
-        ax.set_yticks(range(len(names)), names, fontsize=6.5 if narrow else 8)
+        ax.set_yticks(range(len(names)), names, fontsize=8)
         ax.set_title(environment, fontsize=9)
     write_below = fig.supxlabel if across > 1 else axes[-1].set_xlabel
     quantity = f"difference from no noise in mean {metric}"
     write_below(quantity if is_forest else "noise rate", fontsize=9)
     if not is_forest:
-        place = {"location": "bottom", "fraction": 0.05} if narrow else {"fraction": 0.02}
-        place["extend"] = "both" if rows[column].abs().max() > limit else "neither"
-        fig.colorbar(image, ax=axes, pad=0.01, label=f"{quantity} ({unit})", **place)
+        beyond = "both" if rows[column].abs().max() > limit else "neither"
+        place = {"fraction": 0.02, "pad": 0.01, "extend": beyond}
+        fig.colorbar(image, ax=axes, label=f"{quantity} ({unit})", **place)
     return fig
 
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from analysis import style
-from analysis.effects import configurations, effects_caption, effects_figure, heatmap
+from analysis.effects import effects_caption, effects_figure, heatmap
 from analysis.formatting import slug
 from analysis.runs import KEYS, STUDY, SUCCESS, rows_of, study_name
 from analysis.verdicts import percent, seeds_of
@@ -29,8 +29,7 @@ class Drawing:
     kind: str  # effects, best_curves, curves, parameters or robustness
     label: str  # what sets it apart from others of its kind
     caption: str
-    draw: Callable[..., Figure]  # draw(), or draw(narrow=True) for a telephone
-    has_narrow: bool = False  # where there are many panels
+    draw: Callable[[], Figure]
 
     @property
     def name(self):
@@ -61,10 +60,9 @@ def comparison_figures(study, statistics, best):
     """Yield the Drawing of a study's effects, and that of the curves of its best noises."""
     compared = statistics["verdict"].notna() & (statistics["scope"] == "environment")
     compared = statistics[rows_of(statistics, study.key) & compared]
-    several = compared["environment"].nunique() > 1
     if len(compared):
         draw = partial(effects_figure, compared, study.metric)
-        yield Drawing("effects", study.name, effects_caption(study, compared), draw, several)
+        yield Drawing("effects", study.name, effects_caption(study, compared), draw)
     if len(compared) and len(study.returns) > 2:
         caption = (
             f"{study.name}: test {study.metric} without noise (black) and with the best noise of "
@@ -72,7 +70,7 @@ def comparison_figures(study, statistics, best):
             "The best of many looks better than it is."
         )
         draw = partial(best_curves_figure, study, best[KEYS].merge(compared))
-        yield Drawing("best_curves", study.name, caption, draw, several)
+        yield Drawing("best_curves", study.name, caption, draw)
 
 
 def span(numbers):
@@ -81,13 +79,13 @@ def span(numbers):
     return f"{low}" if low == high else f"{low} to {high}"
 
 
-def panels(environments, labels, metric, below, narrow=False):
+def panels(environments, labels, metric, below):
     """Make one panel per environment, three in a row, above a legend with as many labels.
 
-    below: the label of all x axes. A narrow figure, for a telephone, has one panel in a row.
+    below: the label of all x axes.
     """
-    across = 1 if narrow else min(3, len(environments))
-    width = style.NARROW_WIDTH if narrow else style.WIDTHS[across - 1]
+    across = min(3, len(environments))
+    width = style.WIDTHS[across - 1]
     down = -(-len(environments) // across)
     columns = max(1, min(4, int(13 * width / max(map(len, labels)))))
     legend = 0.2 + 0.2 * -(-len(labels) // columns)
@@ -110,14 +108,14 @@ def panels(environments, labels, metric, below, narrow=False):
     return fig, axes, add_legend
 
 
-def best_curves_figure(study, best, narrow=False):
+def best_curves_figure(study, best):
     """Draw no noise against the best noise of each environment: means and standard deviations.
 
     best: the rows of statistics of these noises.
     """
     labels = ["no noise", "best noise, in the colour of its verdict"]
     steps, below = training_steps(study)
-    fig, axes, _ = panels(list(best["environment"]), labels, study.metric, below, narrow)
+    fig, axes, _ = panels(list(best["environment"]), labels, study.metric, below)
     # Three lines of title above each panel
     fig.subplots_adjust(top=1 - 0.6 / fig.get_figheight(), hspace=0.75)
     configs = {(config.noise, config.noise_rate): config for config in study.returns}
@@ -132,7 +130,7 @@ def best_curves_figure(study, best, narrow=False):
         lines = f"{noise}, {row.noise_rate}\n{row.verdict} (n = {seeds_of(row.n, row.n_baseline)})"
         ax.set_title(f"{row.environment}\n{lines}", fontsize=7.5)
     handles = [axes[0].lines[0], Rectangle((0, 0), 1, 1, color=style.UNCLEAR)]
-    fig.legend(handles, labels, loc="lower center", ncols=1 if narrow else 2, frameon=False)
+    fig.legend(handles, labels, loc="lower center", ncols=2, frameon=False)
     return fig
 
 
@@ -228,22 +226,11 @@ def bars(ax, place, rows, width, **look):
 
 
 def robustness_figures(table, metric="return"):
-    """Yield a Drawing for every figure of robustness: heatmaps, then curves."""
+    """Yield a heatmap of robustness for every environment of a study."""
     for (*study, environment), rows in table.groupby([*STUDY, "environment"]):
         clean = rows[(rows["noise"] == "") & (rows["test_noise"] == "")]["mean"]
         if len(clean) and len(rows) > 1:
             yield robustness_heatmap(study_name(*study), environment, rows, clean.iloc[0], metric)
-    for (*study, noise), rows in table.groupby([*STUDY, "test_noise"]):
-        of_one_noise = pd.to_numeric(rows["test_rate"], errors="coerce").notna().all()
-        if noise and of_one_noise and rows["test_rate"].nunique() >= 3:
-            clean, name = rows_of(table, study) & (table["test_noise"] == ""), study_name(*study)
-            caption = (
-                f"{name}, tested with {noise}: mean {metric} over seeds against the rate, shaded "
-                f"{ONE_STD}; a line for each noise in training."
-            )
-            draw = partial(robustness_curves_figure, rows, table[clean], metric)
-            several = rows["environment"].nunique() > 1
-            yield Drawing("robustness", f"curves {name} {noise}", caption, draw, several)
 
 
 def robustness_heatmap(algorithm, environment, rows, clean, metric):
@@ -271,7 +258,7 @@ def robustness_heatmap(algorithm, environment, rows, clean, metric):
     )
     form = (lambda value: percent(value).removesuffix(" %")) if in_percent else rounded
     draw = partial(heatmap_figure, name, values.astype(float), dots.eq(True), limit, form)
-    return Drawing("robustness", f"heatmap {algorithm} {environment}", caption, draw, True)
+    return Drawing("robustness", f"heatmap {algorithm} {environment}", caption, draw)
 
 
 def names_of(noises, rates, none):
@@ -279,60 +266,26 @@ def names_of(noises, rates, none):
     return (noises + ", " + rates).where(noises != "", none)
 
 
-def heatmap_figure(name, grid, dots, limit, form, narrow=False):
-    """Draw a figure of one heatmap, a narrow one the other way round; see effects.heatmap."""
-    if narrow:
-        grid, dots = grid.T, dots.T
-    size = 6 if narrow else 8
+def heatmap_figure(name, grid, dots, limit, form):
+    """Draw a figure of one heatmap: see effects.heatmap."""
     lines, columns = (list(map(style.broken, labels)) for labels in (grid.index, grid.columns))
     high = 0.25 * sum(line.count("\n") + 1 for line in lines) + 0.05 * max(map(len, columns))
-    width = style.NARROW_WIDTH if narrow else min(style.WIDTH, 4 + 0.9 * len(columns))
+    width = min(style.WIDTH, 4 + 0.9 * len(columns))
     fig = Figure(figsize=(width, 1.2 + high), layout="constrained")
     ax = fig.subplots()
-    heatmap(ax, grid, limit, form, dots, size)
+    heatmap(ax, grid, limit, form, dots, 8)
     place = {"rotation": 35, "ha": "right", "rotation_mode": "anchor"}
-    ax.set_xticks(range(len(columns)), columns, fontsize=size, **place)
-    ax.set_yticks(range(len(lines)), lines, fontsize=size)
+    ax.set_xticks(range(len(columns)), columns, fontsize=8, **place)
+    ax.set_yticks(range(len(lines)), lines, fontsize=8)
     ax.set(xlabel=grid.columns.name, ylabel=grid.index.name)
     ax.set_title(name, fontsize=9)
     return fig
 
 
-def robustness_curves_figure(rows, clean, metric, narrow=False):
-    """Draw the return against the rate of a test noise: one line per training configuration.
-
-    rows, clean: those of the table of robustness that were tested with the noise, and with none.
-    """
-    environments = sorted(set(rows["environment"]))
-    rows = pd.concat([clean, rows])
-    rows = rows.assign(rate=rows["test_rate"].astype(float)).sort_values("rate")
-    configs = configurations(rows)
-    labels = [f"{name}, {rate}" if name else "no noise" for name, rate in configs]
-    below = "rate of the noise in the test (0: clean)"
-    fig, axes, add_legend = panels(environments, labels, metric, below, narrow)
-    for ax, environment in zip(axes, environments, strict=True):
-        for i, (noise, rate) in enumerate(configs):
-            line = rows[(rows["noise"] == noise) & (rows["noise_rate"] == rate)]
-            line = line[line["environment"] == environment]
-            look = style.line_style(i, len(configs)) | {"label": labels[i]}
-            look["marker"] = look["marker"] or "."
-            curve(ax, line["rate"], line["mean"], line["std"].astype(float).fillna(0), **look)
-    add_legend()
-    return fig
-
-
 def write_figure(out, drawing, latex=False):
-    """Write {name}.svg, with `latex` also .pdf; without dates, so equal figures are equal files.
-
-    A narrow figure is for the report only, so it is no .pdf. Return the names of the files.
-    """
-    figures = {drawing.name: drawing.draw()}
-    if drawing.has_narrow:
-        figures[f"{drawing.name}_narrow"] = drawing.draw(narrow=True)
-    for name, figure in figures.items():
-        figure.savefig(out / f"{name}.svg", metadata={"Date": None})
+    """Write {name}.svg, with `latex` also .pdf; without dates, so equal figures are equal files."""
+    figure = drawing.draw()
+    figure.savefig(out / f"{drawing.name}.svg", metadata={"Date": None})
     if latex:
-        figure = figures[drawing.name]
         figure.set_layout_engine("none")  # the layout is done
         figure.savefig(out / f"{drawing.name}.pdf", metadata={"CreationDate": None})
-    return figures.keys()

@@ -51,14 +51,10 @@ MERGED = {
     ),
     "IQM": "{iqm} [{iqm_low}, {iqm_high}]",
     "IQM change %": "{iqm_change_percent} [{iqm_change_low}, {iqm_change_high}]",
-    "interaction": "{interaction} [{interaction_low}, {interaction_high}]",
-    "interaction %": "{interaction_percent} [{percent_low}, {percent_high}]",
     "difference": "{difference} [{difference_low}, {difference_high}]",
     "P(improvement)": "{probability_of_improvement} [{probability_low}, {probability_high}]",
     "luck 95 % (p)": "{luck_95} ({p_luck_of_best})",
     "score % (baseline)": "{score_percent} ({baseline_score_percent})",
-    "worst_score % (baseline)": "{worst_score_percent} ({baseline_worst_score_percent})",
-    "cvar_score % (baseline)": "{cvar_score_percent} ({baseline_cvar_score_percent})",
 }
 
 

@@ -46,32 +46,25 @@ def read_paper(folder):
     return tables
 
 
-def compare_tables(paper, lengths, alone, best, consistency, good, bad, early):
+def compare_tables(paper, lengths, alone, consistency, early):
     """Yield (name, table) for each table of `paper`, a dict from read_paper.
 
     `lengths` has the steps of each study, by the values of its columns STUDY: final returns after
     fewer steps than the paper's are shown beside them, without a difference.
     """
-    paper, luck = with_luck(paper)
     # The paper's table has baselines too: they are rows of their own here.
-    listed = alone.index[alone["noise"] == ""].union(best.index)
-    table = compare_table(alone, listed, with_baseline_rows(paper["best"]), *FINAL)
-    yield "compare_best", only_equal_steps(table, lengths)
-    for name, table in (("consistent", good), ("consistently_worse", bad)):
-        table = compare_table(consistency, table.index, paper[name], *AVERAGE)
+    best = with_baseline_rows(add_luck_of_paper(paper["best"]))
+    yield "compare_best", only_equal_steps(compare_table(alone, best, *FINAL), lengths)
+    for name in ("consistent", "consistently_worse"):
+        table = compare_table(consistency, paper[name], *AVERAGE)
         yield f"compare_{name}", only_equal_steps(table, lengths)
-    yield "compare_luck", luck
-    table = compare_table(early, early.index, paper["early_performance"], *FINAL)
-    yield "compare_early_performance", table[table["listed_by"] != "ours"]
+    yield "compare_early_performance", compare_table(early, paper["early_performance"], *FINAL)
 
 
-def with_luck(paper):
-    """Add to the paper's tables what luck alone would show, and return its table of luck, too."""
-    best, good, bad = (paper[name] for name in ("best", "consistent", "consistently_worse"))
+def add_luck_of_paper(best):
+    """Add to the paper's table of best noises what luck alone would show."""
     best = best.assign(difference=best["noisy_mean"] - best["baseline_mean"])
-    lucks = luck_of_paper(best, PAPER_SEEDS, PAPER_CONFIGURATIONS)
-    best, good, bad, luck = add_luck(lucks, best, good, bad)
-    return paper | {"best": best, "consistent": good, "consistently_worse": bad}, luck
+    return add_luck(best, luck_of_paper(best, PAPER_SEEDS, PAPER_CONFIGURATIONS))
 
 
 def with_baseline_rows(paper):
@@ -90,18 +83,15 @@ def only_equal_steps(table, lengths):
     return table
 
 
-def compare_table(ours, listed, paper, mean, std, number):
-    """Set the paper's figures beside ours for every row that the paper or our own table has.
+def compare_table(ours, paper, mean, std, number):
+    """Set our figures beside every row of the paper's table that has them, once for each study.
 
-    `ours` holds every configuration, and `listed` the index of those in our own table: a row of the
-    paper may match those of several studies or versions of an environment, of which only one is
-    listed. `mean`, `std` and `number` name its columns. The difference is in standard errors:
-    (ours - paper) / sqrt(std^2 / n + paper_std^2 / paper_n).
+    `ours` holds every configuration; `mean`, `std` and `number` name its columns. The difference is
+    in standard errors: (ours - paper) / sqrt(std^2 / n + paper_std^2 / paper_n).
     """
     keys = [name for name in (*KEYS, "steps_millions") if name in paper]
     numbers = [name for name in (mean, std, number, "steps_millions") if name in ours]
     ours = ours.astype(dict.fromkeys(numbers, float))  # a table without rows has no types
-    ours["listed"] = ours.index.isin(listed)
     shared = [name for name in keys if name not in ("exp_name", "phase", "environment")]
     if "environment" in keys:
         shared.append("place")
@@ -110,10 +100,7 @@ def compare_table(ours, listed, paper, mean, std, number):
             for table in (ours, paper)
         )
     paper = paper.rename(columns={name: f"paper_{name}" for name in paper if name not in shared})
-    table = ours.merge(paper, on=shared, how="outer", indicator="side")
-    in_ours, in_paper = table["listed"].eq(True), table["side"] != "left_only"
-    table["listed_by"] = np.select([in_ours & in_paper, in_ours], ["both", "ours"], "paper")
-    table = table[in_ours | in_paper]
+    table = paper.merge(ours, on=shared, how="left")
     for name in set(keys) - set(shared):
         table[name] = table[name].fillna(table[f"paper_{name}"])
     paper_n = table["algorithm"].map(PAPER_SEEDS)
@@ -122,6 +109,6 @@ def compare_table(ours, listed, paper, mean, std, number):
     variance = table[std] ** 2 / table[number] + table[f"paper_{std}"] ** 2 / paper_n
     difference = table[mean] - table[f"paper_{mean}"]
     table["difference_se"] = difference / np.sqrt(variance.where(variance > 0))
-    columns = [*keys, "listed_by", number, mean, std, f"paper_{mean}", f"paper_{std}"]
+    columns = [*keys, number, mean, std, f"paper_{mean}", f"paper_{std}"]
     columns += ["difference_se", *(f"paper_{name}" for name in LUCK if f"paper_{name}" in table)]
     return table.sort_values(keys, kind="stable")[columns]

@@ -22,13 +22,12 @@ from analysis.tables import table_of
 from noisy_wrappers import BASELINE, WRAPPERS, Configuration, rounded
 
 CLEAN = BASELINE  # a condition of a test is a Configuration, too
-RUN_COLUMNS = [*KEYS, "configuration", "seed", "elsewhere", "condition", "mean", "cvar"]
+RUN_COLUMNS = [*KEYS, "configuration", "seed", "elsewhere", "condition", "mean"]
 COLUMNS = [*KEYS, "test_noise", "test_rate", "tested_on", "n", "mean", "std", "difference"]
-COLUMNS += ["change_percent", "cvar", "score_percent"]
+COLUMNS += ["change_percent", "score_percent"]
 SCORE_COLUMNS = """scope environment noise noise_rate n n_baseline conditions difference
     difference_low difference_high difference_percent effect_size p p_holm detectable score_percent
-    baseline_score_percent clean_change_percent cvar_score_percent baseline_cvar_score_percent
-    worst_score_percent baseline_worst_score_percent worst_condition t pooled_std smallest_p"""
+    baseline_score_percent clean_change_percent t pooled_std smallest_p"""
 SCORE_COLUMNS = [*STUDY, *SCORE_COLUMNS.split()]
 
 
@@ -55,11 +54,11 @@ def read_robustness(runs_dir, runs, metric="return"):
         for (condition, elsewhere), results in tests.items():
             row |= {"condition": condition, "elsewhere": elsewhere}
             row["environment"] = where_tested(run.environment, elsewhere)
-            rows.append(row | {"mean": results.mean(), "cvar": cvar(results)})
+            rows.append(row | {"mean": results.mean()})
     table = pd.DataFrame(rows, columns=RUN_COLUMNS)
     place = [table["environment"], table["condition"]]
     told = table["mean"].notna().groupby(place).transform("any")
-    return table[told].fillna({"mean": 0.0, "cvar": 0.0}), notes
+    return table[told].fillna({"mean": 0.0}), notes
 
 
 def read_episodes(path, metric="return"):
@@ -89,11 +88,6 @@ def read_episodes(path, metric="return"):
     return found
 
 
-def cvar(returns):
-    """Mean of the worst tenth of the returns (n), rounded up to whole episodes."""
-    return np.sort(returns)[: -(-len(returns) // 10)].mean()
-
-
 def is_unseen(condition, config):
     """Tell whether a test condition counts in the score of a training configuration."""
     ends = "RandomEarlyTermination" in condition.wrappers
@@ -113,22 +107,21 @@ def tested_on(condition, config):
     return "new noise"
 
 
-def by_run(runs, config, value):
-    """Arrange the runs of a configuration as a frame (seeds x conditions) of `value`."""
+def by_run(runs, config):
+    """Arrange the mean returns of a configuration as a frame (seeds x conditions)."""
     mine = runs[runs["configuration"] == config]
-    return mine.pivot(index="seed", columns="condition", values=value)
+    return mine.pivot(index="seed", columns="condition", values="mean")
 
 
 def condition_rows(runs):
     """Yield one row per training configuration and test condition, in each environment."""
     for _, group in runs.groupby([*STUDY, "environment"]):
-        baseline = by_run(group, BASELINE, "mean")
+        baseline = by_run(group, BASELINE)
         for (config, condition), tests in group.groupby(["configuration", "condition"]):
             mean, std, n = mean_std(tests["mean"])
             row = tests.iloc[0][KEYS].to_dict()
             row |= {"test_noise": condition.noise, "test_rate": condition.noise_rate}
             row |= {"tested_on": tested_on(condition, config), "n": n, "mean": mean, "std": std}
-            row["cvar"] = tests["cvar"].mean()
             if config != BASELINE and condition in baseline:
                 row["difference"] = mean - baseline[condition].mean()
                 row["change_percent"] = percent_of(row["difference"], baseline[condition])
@@ -166,7 +159,7 @@ def environment_score(runs, config):
     and `y` (baseline seeds), the mean returns over the conditions. What is in percent is relative
     to the clean return of the baseline, NaN where that has no percentages.
     """
-    x, y = by_run(runs, config, "mean"), by_run(runs, BASELINE, "mean")
+    x, y = by_run(runs, config), by_run(runs, BASELINE)
     if CLEAN not in x or CLEAN not in y:
         return None
     complete = pd.concat([x, y]).notna().all()
@@ -174,29 +167,15 @@ def environment_score(runs, config):
     if not conditions:
         return None
     clean, percent = y[CLEAN].mean(), percent_of(1.0, y[CLEAN])
-
-    def score(returns):
-        """Return the score of every condition; returns: a frame of by_run."""
-        return (returns[conditions].mean() - clean) * percent
-
-    scores, baseline_scores = score(x), score(y)
-    own = runs[runs["configuration"] == config].iloc[0]
-    row = own[[*KEYS, "elsewhere"]].to_dict() | {
-        "clean_change_percent": (x[CLEAN].mean() - clean) * percent,
-        "score_percent": scores.mean(),
-        "baseline_score_percent": baseline_scores.mean(),
-        "worst_score_percent": scores.min(),
-        "baseline_worst_score_percent": baseline_scores.min(),
-        "cvar_score_percent": score(by_run(runs, config, "cvar")).mean(),
-        "baseline_cvar_score_percent": score(by_run(runs, BASELINE, "cvar")).mean(),
-        "worst_condition": "",
-    }
-    if scores.notna().all():  # what has no percentages cannot be ranked
-        worst = scores.idxmin()
-        row["worst_condition"] = f"{worst.noise} at {worst.noise_rate}"
+    clean_change = (x[CLEAN].mean() - clean) * percent
     x, y = (side[conditions].mean(axis=1).to_numpy() for side in (x, y))
-    row |= compare(x, y)._asdict()
-    row |= {"difference_percent": (x.mean() - y.mean()) * percent}
+    row = runs[runs["configuration"] == config].iloc[0][[*KEYS, "elsewhere"]].to_dict()
+    row |= compare(x, y)._asdict() | {
+        "difference_percent": (x.mean() - y.mean()) * percent,
+        "score_percent": (x.mean() - clean) * percent,
+        "baseline_score_percent": (y.mean() - clean) * percent,
+        "clean_change_percent": clean_change,
+    }
     return row | {"scope": "environment", "x": x, "y": y, "conditions": len(conditions)}
 
 
@@ -205,13 +184,8 @@ def average_score(scores):
     table = pd.DataFrame(scores)
     x, y = (np.array([*zip_longest(*table[name], fillvalue=np.nan)]) for name in ("x", "y"))
     row = scores[0] | compare(x, y)._asdict()
-    row |= {"scope": "all", "environment": "", "worst_condition": ""}
-    row |= table.filter(like="percent").mean(skipna=False)
-    row |= table[["conditions", *table.filter(like="worst_score")]].min(skipna=False)
-    if pd.notna(row["worst_score_percent"]):
-        place = table.loc[table["worst_score_percent"].idxmin()]
-        row["worst_condition"] = f"{place['worst_condition']} on {place['environment']}"
-    return row
+    row |= {"scope": "all", "environment": "", "conditions": table["conditions"].min()}
+    return row | table.filter(like="percent").mean(skipna=False).to_dict()
 
 
 def analyse_robustness(runs, metric="return"):
@@ -225,11 +199,11 @@ def analyse_robustness(runs, metric="return"):
     for _, family in primary[primary["p"].notna()].groupby([*STUDY, "elsewhere"]):
         scores.loc[family.index, "p_holm"] = holm(family["p"].to_numpy(float))
     note, score_note = "", "Scores: relative to the clean return."
-    if metric == SUCCESS:  # never percent of a rate; the worst tenth of episodes is 0 or 100
+    if metric == SUCCESS:  # never percent of a rate
         note = "Rates are in percent of the episodes, differences in percentage points."
         score_note = note
         for frame in (scores, table):
-            frame[frame.filter(regex="_percent$|^cvar$|^worst_condition$").columns] = np.nan
+            frame[frame.filter(regex="_percent$").columns] = np.nan
     sentences = robustness_sentences(scores.loc[primary.index], metric)
     more = {"section": "robustness", "only_csv": ("t", "pooled_std", "smallest_p")}
     score = table_of("robustness_score", scores[SCORE_COLUMNS], note=score_note, **more)

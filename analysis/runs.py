@@ -16,7 +16,6 @@ import pandas as pd
 
 from analysis import folders
 from analysis.folders import PHASES, SEARCH, DamageError
-from analysis.statistics import percent_of
 from noisy_wrappers import BASELINE, Configuration
 
 STUDY = ["algorithm", "exp_name", "phase"]  # the columns that name a study: see study_name
@@ -296,13 +295,6 @@ class Study:
     def name(self):
         """Its name for people."""
         return study_name(*self.key)
-
-    def percent(self, e):
-        """Return what a difference of 1 is in percent of the baseline's mean in an environment.
-
-        A rate of success has no percent: differences of rates are in percentage points.
-        """
-        return np.nan if self.metric == SUCCESS else percent_of(1.0, self.sample(BASELINE, e))
 
     def all_equal(self):
         """Return the environments where all tests of two or more runs are equal: {name: value}."""

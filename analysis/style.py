@@ -16,7 +16,6 @@ STYLE = {
 matplotlib.rcParams.update(STYLE)
 WIDTH = 10  # inches of most figures
 WIDTHS = (5.2, 8, WIDTH)  # with one to three panels in a row
-NARROW_WIDTH = 4.2  # inches of those for a telephone
 HEIGHT = 3.6  # inches, at least
 # Colour-blind readers tell these apart (Okabe and Ito, 2008); report.html.jinja has them, too.
 BETTER, WORSE, UNCLEAR = "#0072B2", "#D55E00", "#8C8C8C"

@@ -1,7 +1,6 @@
 """The tables of analyze.py: their rows, made of a Study's returns, their columns and captions."""
 
 from itertools import product
-from math import ceil
 
 import numpy as np
 import pandas as pd
@@ -10,13 +9,13 @@ from scipy import stats
 from analysis import statistics, verdicts
 from analysis.folders import CONFIRMATION, PHASES, SEARCH
 from analysis.formatting import P_VALUE, PLAIN, SHARE, TENTH, WHOLE, Table
-from analysis.luck import CONSISTENT_PERCENT, DRAWS, add_luck, luck_of_study
+from analysis.luck import add_luck, luck_of_studies
 from analysis.paper import compare_tables
 from analysis.runs import KEYS, STUDY, SUCCESS, study_name
 from analysis.verdicts import ALL_EQUAL, counted, listed, seeds_of
 from noisy_wrappers import BASELINE
 
-SEEDS_FOR_INTERACTION = 3  # of each of the four configurations
+CONSISTENT_PERCENT = 80  # of the environments, as in the paper
 PROBABILITY = ("probability_of_improvement", "probability_low", "probability_high")
 IQM_CHANGE = ("iqm_change_percent", "iqm_change_low", "iqm_change_high")
 # What a comparison does not tell where all returns are equal
@@ -32,7 +31,7 @@ _COLUMNS = {
         noisy_std difference improvement_percent p p_adjusted luck_median luck_95 p_luck
         n n_baseline chosen_from""",
     "consistency": """noise noise_rate percent_of_environments
-        average_improvement_percent std_improvement_percent p p_adjusted p_luck
+        average_improvement_percent std_improvement_percent p p_adjusted
         environments without_percent n fails_at_every_rate""",
     "success": """environment noise noise_rate mean std baseline_mean baseline_std difference
         p p_adjusted n n_baseline""",
@@ -46,19 +45,17 @@ _COLUMNS = {
 COLUMNS = {name: [*STUDY, *text.split()] for name, text in _COLUMNS.items()}
 COLUMNS["judged"] = [*dict.fromkeys(COLUMNS["summary"] + COLUMNS["statistics"])]
 _COLUMNS_WITH = {
-    WHOLE: """n n_baseline n_baseline_most environments conditions chosen_from configurations
-        seeds seeds_needed steps_to_baseline percent_of_environments best_beyond_luck consistent
-        consistent_beyond_luck consistently_worse consistently_worse_beyond_luck""",
+    WHOLE: """n n_baseline n_baseline_most environments conditions chosen_from seeds seeds_needed
+        steps_to_baseline percent_of_environments""",
     P_VALUE: """p p_adjusted p_holm smallest_p smallest_p_adjusted p_luck p_luck_of_best
-        paper_p_luck p_consistent p_consistently_worse""",
+        paper_p_luck""",
     SHARE: "probability_of_improvement probability_low probability_high effect_size t",
-    TENTH: "difference_se consistent_by_luck consistently_worse_by_luck",
+    TENTH: "difference_se",
     PLAIN: "steps_millions",
 }
 FORMATS = {name: form for form, names in _COLUMNS_WITH.items() for name in names.split()}
 STATISTICS_ONLY_CSV = ("iqm", "iqm_low", "iqm_high", "t", "pooled_std", "environments")
 STATISTICS_ONLY_CSV += ("seeds_needed", "comparisons", "smallest_p", "smallest_p_adjusted")
-LUCK_ONLY_CSV = ("consistent_by_luck_95", "consistently_worse_by_luck_95")
 
 # --------------------------------------------------------------------------------------------- rows
 
@@ -182,39 +179,6 @@ def early_rows(study):
                 }
 
 
-def interaction_rows(study):
-    """Yield, for two noises and both at once: how much more do they change than their sum?
-
-    I = J(A + B) - J(A) - J(B) + J(0) of the mean final returns, in every environment where all
-    four have at least SEEDS_FOR_INTERACTION seeds, with a 95 % interval; then relative to |J(0)|.
-    """
-    for (e, environment), config in product(enumerate(study.environments), study.returns):
-        parts = config.parts
-        if len(parts) != 2 or parts[0] == parts[1]:
-            continue
-        samples = [study.sample(part, e) for part in (config, *parts, BASELINE)]
-        if min(map(len, samples)) < SEEDS_FOR_INTERACTION:
-            continue
-        both, first, second, alone = samples
-        value, error, low, high = statistics.contrast(samples, [1, -1, -1, 1])
-        percent = study.percent(e)
-        yield {
-            **row_keys(study, environment, config),
-            "n": min(map(len, samples)),
-            "both_mean": both.mean(),
-            "first_mean": first.mean(),
-            "second_mean": second.mean(),
-            "baseline_mean": alone.mean(),
-            "interaction": value,
-            "interaction_low": low,
-            "interaction_high": high,
-            "standard_error": error,
-            "interaction_percent": value * percent,
-            "percent_low": low * percent,
-            "percent_high": high * percent,
-        }
-
-
 # ------------------------------------------------------------------------------------------- tables
 
 
@@ -254,7 +218,7 @@ def adjust(rows):
 
 
 def family_notes(judged):
-    """Say where the number of seeds is too small to show a difference, if corrected."""
+    """Say where there are too few seeds for a difference that is significant, if corrected."""
     notes = []
     compared = judged[judged["verdict"].notna() & (judged["verdict"] != ALL_EQUAL)]
     keys = ["comparisons", "smallest_p"]
@@ -263,25 +227,15 @@ def family_notes(judged):
         best = best.drop_duplicates(["scope", "environment"]).sort_index()
         for (size, smallest), same in best.groupby(keys, sort=False, dropna=False):
             places = same["environment"].mask(same["scope"] == "all", "all")
-            where = f"{study_name(*study)}, {', '.join(places)}"
             seeds = counted(min(same["n"].min(), same["n_baseline"].min()), "seed")
+            start = f"{study_name(*study)}, {', '.join(places)}: with {seeds}"
+            possible = f"smallest possible p: {smallest:.2g}"
             if smallest > statistics.LEVEL:
+                notes.append(f"{start} no difference can be significant ({possible}).")
+            elif round(size * smallest, 9) > statistics.LEVEL:
                 notes.append(
-                    f"{where}: with {seeds} no difference can be significant (smallest possible p: "
-                    f"{smallest:.2g})."
-                )
-            elif (needed := ceil(round(size * smallest / statistics.LEVEL, 9))) > 1:
-                can = (
-                    "differences can be significant after the correction only if at least "
-                    f"{needed} of them are"
-                )
-                if study[-1] == CONFIRMATION:  # Holm's, not Benjamini and Hochberg's
-                    others = compared.loc[compared["phase"] == CONFIRMATION, "smallest_p"]
-                    alone = " alone" if others.nunique() > 1 else ""
-                    can = f"no difference can be significant{alone} after the correction"
-                notes.append(
-                    f"{where}: with {seeds} and {size:.0f} comparisons, {can} (smallest possible "
-                    f"p: {smallest:.2g}, corrected for one alone {min(1, size * smallest):.2g})."
+                    f"{start} and {size:.0f} comparisons no difference alone can be significant "
+                    f"after the correction ({possible}, corrected {min(1, size * smallest):.2g})."
                 )
     return notes
 
@@ -310,8 +264,6 @@ CAPTIONS = {
     "consistent": f"""Noise that matches or beats no noise in at least {CONSISTENT_PERCENT} % of two
 or more environments. Average improvement \u00b1 standard deviation over environments.""",
     "consistently_worse": "Noise that is worse than no noise in each of two or more environments.",
-    "luck": f"""How many rows the tables above would have if no noise did anything, from
-{DRAWS:,} simulated sweeps.""",
     "early_performance": """Mean test return \u00b1 standard deviation during training, by noise
 rate (0.00: no noise), with the number of seeds in brackets.""",
     "summary": """Final test return of every configuration: mean \u00b1 standard deviation over n
@@ -320,8 +272,6 @@ seeds, and the difference from no noise. Here p is not corrected.""",
 95 % interval, and its test. The effect size is the difference in standard deviations.""",
     "success": """Success rate in the final test, in percent of its episodes: mean \u00b1 standard
 deviation over n seeds, and the difference from no noise in percentage points.""",
-    "interactions": """What two combined noises do beyond the sum of their effects, with 95 %
-intervals. Above zero, both at once are better than the sum.""",
     "choice": """How the noise was chosen: each round of the search drops the worse half, and fresh
 seeds confirm the winner or not.""",
     "robustness_score": """Primary figure of robustness: the mean return under noise that was not in
@@ -329,7 +279,6 @@ training, of policies trained with noise and without.""",
     "robustness": """The return under every test condition: mean \u00b1 standard deviation over n
 seeds, and difference from the policies trained without noise.""",
     "missing": "Runs that are in no table and no figure, with their seeds.",
-    "compare_luck": """The same for the paper's tables.""",
     "compare": "The paper's table (environments v2, 1,000,000 steps) beside ours.",
 }
 CAPTIONS = {name: " ".join(text.split()) for name, text in CAPTIONS.items()}
@@ -364,8 +313,7 @@ def make_tables(studies, paper=None):
     good, bad = split_consistency(consistency)
     returns = (row for study in studies for row in early_rows(study))
     early = pd.DataFrame(returns, columns=COLUMNS["early_performance"])
-    lucks = {study.key: luck_of_study(study) for study in judging}
-    best, good, bad, luck = add_luck(lucks, best, good, bad)
+    best = add_luck(best, luck_of_studies(judging))
     failing = bad[bad["fails_at_every_rate"] == "yes"][[*STUDY, "noise"]].drop_duplicates()
     failing = "; ".join(f"{noise} ({study_name(*study)})" for *study, noise in failing.values)
     failing = f"Worse at every rate that was tried: {failing or 'none'}."
@@ -377,27 +325,19 @@ def make_tables(studies, paper=None):
         table_of("best", best[COLUMNS["best"]], view=best_view(best), note=note),
         table_of("consistent", good, note=note),
         table_of("consistently_worse", bad, note=f"{failing} {note}".strip()),
-        table_of("luck", luck, only_csv=LUCK_ONLY_CSV),
         table_of("statistics", table, **shape),
         table_of("early_performance", early, rates_beside=True),
     ]
-    interactions = pd.DataFrame(row for study in judging for row in interaction_rows(study))
-    if len(interactions):
-        tables.append(table_of("interactions", interactions))
     for algorithm, table in alone.groupby("algorithm"):
         more = {"name": f"summary_{algorithm}", "note": percent_note(table, studies[0].metric)}
         tables.append(table_of("summary", table[COLUMNS["summary"]], **more))
     if paper:
         lengths = {study.key: study.steps[-1] for study in studies}
         steps = ", ".join(f"{study_name(*key)} {n:,}" for key, n in lengths.items())
-        ours = alone[alone["phase"] != SEARCH], best, consistency, good, bad, early
+        ours = alone[alone["phase"] != SEARCH], consistency, early
         for name, table in compare_tables(paper, lengths, *ours):
-            section = name.removeprefix("compare_")
-            if section == "luck":
-                more = {"kind": name, "only_csv": LUCK_ONLY_CSV}
-            else:
-                more = {"kind": "compare", "note": f"Our steps: {steps}."}
-            tables.append(table_of(frame=table, section=section, name=name, **more))
+            section, note = name.removeprefix("compare_"), f"Our steps: {steps}."
+            tables.append(table_of("compare", table, name=name, section=section, note=note))
     return {table.name: table for table in tables}
 
 

@@ -6,7 +6,6 @@ import subprocess
 import numpy as np
 import pandas as pd
 import pytest
-from scipy import stats
 from test_analyze import ENDING, SCALE, row, run, write_run
 
 import analysis.figures
@@ -48,7 +47,7 @@ def test_search_and_confirmation_are_never_mixed(tmp_path, capsys):
     assert confirmed[["n", "mean", "n_baseline", "baseline_mean"]].tolist() == [5, 133, 5, 103]
     assert np.isnan(row(summary, phase=search, noise=SCALE)["improvement_percent"])
     # Only the confirmation is judged: five against five that are all higher.
-    for name in ("statistics", "best", "luck"):
+    for name in ("statistics", "best"):
         assert set(tables[name]["phase"]) == {fresh}
     assert row(tables["statistics"], noise=SCALE)["p"] == pytest.approx(2 / 252)
     printed = capsys.readouterr().out
@@ -184,37 +183,3 @@ def test_figures_of_experiments_with_similar_names_have_names_of_their_own(tmp_p
     figures = analysis.figures.figures(studies, analysis.tables.make_tables(studies))
     names = {drawing.name for drawing in figures}
     assert len(figures) == len(names) and {"effects_SAC_lr_1", "effects_SAC_lr_1_again"} <= names
-
-
-def test_interactions_by_hand(tmp_path):
-    cells = {
-        ((), ()): [100, 104, 108],  # mean 104, variance 16
-        ((SCALE,), (0.5,)): [110, 120, 130],  # mean 120, variance 100
-        ((PUSH,), (1.0,)): [90, 92, 94, 96],  # mean 93, variance 20 / 3
-        ((PUSH, SCALE), (1.0, 0.5)): [140, 150, 160],  # mean 150, variance 100
-        ((PUSH, SCALE), (1.0, 0.2)): [1, 2, 3],  # there is no 0.2 alone
-        ((ENDING, SCALE), (1.0, 0.5)): [1, 2, 3],
-        ((ENDING,), (1.0,)): [1, 2],  # too few seeds
-    }
-    for (noise, rate), finals in cells.items():
-        for seed, final in enumerate(finals):
-            write_run(tmp_path / "runs", [final], noise=noise, rate=rate, seed=seed)
-    [found] = run(tmp_path)["interactions"].to_dict("records")
-    assert found["noise"] == f"{PUSH} + {SCALE}" and found["noise_rate"] == "1.00 + 0.50"
-    assert found["n"] == 3 and found["environment"] == "Hopper-v5"
-    assert found["interaction"] == 150 - 120 - 93 + 104  # 41
-    parts = np.array([16 / 3, 100 / 3, 20 / 3 / 4, 100 / 3])
-    error = np.sqrt(parts.sum())
-    freedom = parts.sum() ** 2 / (parts**2 / [2, 2, 3, 2]).sum()
-    half = stats.t.ppf(0.975, freedom) * error
-    assert found["standard_error"] == pytest.approx(error)
-    assert found["interaction_low"] == pytest.approx(41 - half)
-    assert found["interaction_high"] == pytest.approx(41 + half)
-    assert found["interaction_percent"] == pytest.approx(41 / 1.04)
-    assert found["percent_high"] == pytest.approx((41 + half) / 1.04)
-    assert "Two noises combined" in (tmp_path / "results/report.html").read_text()
-
-
-def test_no_interactions_without_combinations(tmp_path):
-    write_run(tmp_path / "runs", [1.0])
-    assert "interactions" not in run(tmp_path)

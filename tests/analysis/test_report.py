@@ -119,7 +119,7 @@ def test_a_picture_comes_first_and_only_tables_scroll(width, results, tmp_path):
     inner, needed, nameless, scrolling, broken, sizes, beside, picture_first = answer
     assert inner == width and needed <= width and picture_first
     assert nameless == scrolling == broken == 0
-    assert max(sizes) <= (width if width < 700 else 1200)  # pictures for a telephone are narrow
+    assert max(sizes) <= 1200
     folded = sorted(path.name for path in results.glob("curves_*.svg"))
     assert sorted(beside) == folded and len(folded) == 2
 

@@ -46,12 +46,8 @@ def test_it_is_ordered_by_noise_and_by_its_rates_as_numbers():
     assert sorted(texts[::-1], key=rate_order) == texts
 
 
-def test_its_parts_wrappers_and_kinds():
+def test_its_wrappers_and_kinds():
     config = Configuration.read([ENDING, SCALE], [1.0, 0.5])
-    assert config.parts == [
-        Configuration.read([ENDING], [1.0]),
-        Configuration.read([SCALE], [0.5]),
-    ]
     assert config.wrappers == ["RandomEarlyTermination", "RandomUniformScaleReward"]
     assert config.kinds == {"dynamics", "reward"} and BASELINE.kinds == set()
 

@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 import noisy_wrappers
-from noisy_wrappers import WRAPPERS
 
 
 def test_doctests():
@@ -16,15 +15,12 @@ def test_doctests():
     assert results.attempted > 20
 
 
-def test_public_names():
+def test_the_version_is_that_of_the_changelog_and_the_citation():
     version = noisy_wrappers.__version__
     assert re.fullmatch(r"\d+\.\d+\.\d+", version)
     root = Path(noisy_wrappers.__file__).parent
     assert f"\nversion: {version}\n" in (root / "CITATION.cff").read_text()
     assert f"\n## [{version}] - " in (root / "CHANGELOG.md").read_text()
-    for name in noisy_wrappers.__all__:
-        assert getattr(noisy_wrappers, name).__doc__
-    assert set(WRAPPERS) < set(noisy_wrappers.__all__)
 
 
 def test_import_needs_neither_torch_nor_mujoco():
