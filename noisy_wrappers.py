@@ -2074,6 +2074,27 @@ def success_rate(outcomes: Iterable[float]) -> dict[str, float]:
     return {} if np.isnan(values).all() else {"success_rate": float((values > 0).mean())}
 
 
+def check_numbers(args: Mapping[str, Any]) -> None:
+    """Check the numbers among a script's arguments, {name: value}.
+
+    >>> check_numbers({"gamma": 1.1})
+    Traceback (most recent call last):
+    ValueError: --gamma must be at most 1, not 1.1
+
+    Raises:
+        ValueError: one is out of its range, or NaN.
+    """
+    at_most = {"gamma": 1, "gae_lambda": 1, "tau": 1, "torch_threads": os.cpu_count()}
+    for name, value in args.items():
+        if type(value) not in (int, float):
+            continue
+        may_be_zero = type(value) is float or name in ("seed", "eval_frequency", "learning_starts")
+        low, high = 0 if may_be_zero else 1, at_most.get(name, 2**63 - 1)
+        if not low <= value <= high:
+            wanted = f"at most {high}" if value > high else f"at least {low}"
+            raise ValueError(f"--{name.replace('_', '-')} must be {wanted}, not {value}")
+
+
 def note_versions(config: dict[str, Any], matmul_precision: str) -> list[str]:
     """Note in a run's configuration which versions it uses; say what changed since it began.
 

@@ -425,28 +425,15 @@ def read_args():
     return tyro.cli(Args, args=words, description=f"{__doc__}\n{noises}")
 
 
-def check_numbers(args):
-    """Fail if a number is out of its range."""
-    at_most = {"gamma": 1, "gae_lambda": 1, "tau": 1, "torch_threads": os.cpu_count()}
-    for name, value in asdict(args).items():
-        if type(value) not in (int, float):
-            continue
-        may_be_zero = type(value) is float or name in ("seed", "eval_frequency", "learning_starts")
-        low, high = 0 if may_be_zero else 1, at_most.get(name, 2**63 - 1)
-        if not low <= value <= high:
-            wanted = f"at most {high}" if value > high else f"at least {low}"
-            fail(f"--{name.replace('_', '-')} must be {wanted}, not {value}")
-
-
 @contextlib.contextmanager
 def make_envs(args):
     """Yield the arguments in full, the noisy environment and a clean one; close both at the end."""
-    check_numbers(args)
     if args.exp_name in ("", ".", ".."):
         fail(f"--exp-name must be a name, not {args.exp_name!r}")
     if args.cuda and not torch.cuda.is_available():
         fail("--cuda: PyTorch finds no GPU; leave it out to run on the CPU")
     try:
+        noisy.check_numbers(asdict(args))
         env_id = noisy.canonical_env_id(args.env_id)
         noise, noise_rate = noisy.Configuration.read(args.noise, args.noise_rate).texts
     except ValueError as error:

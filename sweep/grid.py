@@ -4,6 +4,7 @@ options.py reads the arguments, __main__.py shows how far the runs have come.
 """
 
 import ast
+import contextlib
 import csv
 import difflib
 import functools
@@ -16,7 +17,13 @@ from typing import NamedTuple
 
 from analysis.errors import fail
 from analysis.folders import PHASES, DamageError, read_config, read_result, runs_of
-from noisy_wrappers import BASELINE, MAY_DIFFER_IN_A_RUN, Configuration, run_name
+from noisy_wrappers import (
+    BASELINE,
+    MAY_DIFFER_IN_A_RUN,
+    Configuration,
+    check_numbers,
+    run_name,
+)
 
 PROJECT = Path(__file__).resolve().parent.parent
 SEEDS = {"sac": range(1, 6), "td3": range(1, 6), "ppo": range(1, 11)}  # the paper's
@@ -159,6 +166,11 @@ def script_options(script, words):
         options[name] = option_value(name, text, known[name][0])
     if options["overwrite"]:
         fail("--overwrite would start interrupted runs afresh: delete their folders instead")
+    threads = {"torch-threads": 1}  # another machine may have more cores
+    try:
+        check_numbers({name.replace("-", "_"): n for name, n in (options | threads).items()})
+    except ValueError as error:
+        fail(error)
     return options
 
 
@@ -171,10 +183,12 @@ def option_value(name, text, annotation):
         if text not in choices:
             fail(f"--{name} must be one of {', '.join(choices)}, not {text!r}")
         return text
-    try:
-        return (float if "float" in annotation else int)(text)
-    except ValueError:
-        fail(f"--{name} takes a {'whole ' * ('int' in annotation)}number, not {text!r}")
+    whole = "float" not in annotation
+    with contextlib.suppress(ValueError, OverflowError):
+        number = float(text) if "e" in text.lower() or not whole else int(text)  # 1e6 is whole
+        if not whole or number == int(number):
+            return int(number) if whole else number
+    return fail(f"--{name} takes a {'whole ' * whole}number, not {text!r}")
 
 
 # ----------------------------------------------------------------------------------------- the runs

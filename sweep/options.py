@@ -85,7 +85,10 @@ def check(args):
     if args.preset == "choose" and args.seeds:
         fail("choose picks its own seeds: leave out --seeds; see --budget and --confirm")
     for script in map(script_of, args.algos):
-        rollout = script_options(script, tuple(args.extra)).get("num-steps", 0)
+        options = script_options(script, tuple(args.extra))
+        rollout, least = options.get("num-steps", 0), 2 * options.get("num-minibatches", 0)
+        if rollout < least:
+            fail(f"--num-steps must be at least 2 * --num-minibatches ({least}), not {rollout}")
         if args.total_timesteps < rollout:
             fail(
                 f"--total-timesteps must be at least {rollout} for PPO (its --num-steps), not "

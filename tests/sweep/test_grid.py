@@ -298,7 +298,10 @@ def test_misspelt_options_are_refused_where_nothing_is_to_do(tmp_path):
         "--gamma": "--gamma needs a value",
         "--compile=False": "--compile takes no value: write --compile or --no-compile",
         "--tau abc": "--tau takes a number, not 'abc'",
-        "--batch-size 1e3": "--batch-size takes a whole number, not '1e3'",
+        "--batch-size 1.5e0": "--batch-size takes a whole number, not '1.5e0'",
+        "--batch-size inf": "--batch-size takes a whole number, not 'inf'",
+        "--batch-size 0": "--batch-size must be at least 1, not 0",
+        "--gamma 1.1": "--gamma must be at most 1, not 1.1",
         "--matmul-precision low": "--matmul-precision must be one of highest, medium, bf16, not "
         "'low'",
     }.items():
@@ -307,15 +310,16 @@ def test_misspelt_options_are_refused_where_nothing_is_to_do(tmp_path):
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_the_grid_reads_options_as_the_scripts_do(algorithm):
+def test_the_grid_reads_options_as_the_scripts_do(algorithm, monkeypatch):
     script = import_module(f"{algorithm}_continuous_noisy")
     for words in (
         "",
         "--gamma 0.5 --eval_episodes=3 --no-compile --matmul_precision medium",
         "--gamma=.5 --gamma 1 --cuda --no_overwrite --max-episode-steps 1_000",
-        "--max-episode-steps None --gamma -inf --torch-threads=2",
+        "--max-episode-steps None --gamma 0 --torch-threads=1000 --checkpoint-frequency 1e5",
     ):
-        read = vars(tyro.cli(script.Args, args=words.split()))
+        monkeypatch.setattr("sys.argv", ["script", *words.split()])
+        read = vars(script.read_args())
         wanted = {name.replace("_", "-"): value for name, value in read.items()}
         wanted = {name: wanted[name] for name in wanted.keys() - GIVEN_BY_THE_GRID.keys()}
         assert script_options(f"{algorithm}_continuous_noisy.py", tuple(words.split())) == wanted
@@ -385,6 +389,7 @@ def test_the_grid_reads_options_as_the_scripts_do(algorithm):
             "--total-timesteps must be at least 2048 for PPO (its --num-steps), not 2000",
         ),
         ("demo --total-timesteps 0", "--total-timesteps must be greater than 0, not 0"),
+        ("demo -- --num-steps 63", "--num-steps must be at least 2 * --num-minibatches (64), not"),
         ("demo -- --help", "ppo_continuous_noisy.py has no option --help"),
         ("demo -- --seed 2", "--seed is part of the grid: use --seeds, before the --"),
         ("demo -- --exp-name my_ppo", "--exp-name is part of the grid: use --runs-dir, before"),
