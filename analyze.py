@@ -204,6 +204,8 @@ def main(args):
     except ValueError as error:
         fail(error)
     out = args.out or args.runs_dir / "results"
+    if out.resolve() == args.runs_dir.resolve():  # where choice.csv may be
+        fail("--out must be another folder than --runs-dir")
     runs = read_runs(args.runs_dir)
     results = analyse(args, runs, paper, choice)
     try:

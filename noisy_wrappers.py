@@ -1056,11 +1056,14 @@ def _read_noise(text: str) -> Noise:
         if p.name not in recorded:
             call = f"super().__init__(env, noise_rate, {p.name}={p.name})"
             raise _bad_noise(text, f"its constructor must pass {p.name} on: {call}")
-    used = [p for p in parameters if recorded[p.name] != p.default]
+    positional = [p for p in parameters if p.kind is not p.KEYWORD_ONLY]
+    while positional and recorded[positional[-1].name] == positional[-1].default:
+        positional.pop()  # but not a default before another value, which would take its place
+    keywords = [p for p in parameters if p.kind is p.KEYWORD_ONLY and recorded[p.name] != p.default]
     return Noise(
         wrapper,
-        tuple(recorded[p.name] for p in used if p.kind is not p.KEYWORD_ONLY),
-        tuple((p.name, recorded[p.name]) for p in used if p.kind is p.KEYWORD_ONLY),
+        tuple(recorded[p.name] for p in positional),
+        tuple((p.name, recorded[p.name]) for p in keywords),
         "" if wrapper is WRAPPERS.get(name) else module,
     )
 
@@ -1165,7 +1168,7 @@ class Configuration:
         if not noise:
             return cls()
         rates = [re.split(":| to ", rate) for rate in str(noise_rate).split(" + ")]
-        return cls(tuple(noise.split(" + ")), tuple((float(r[0]), float(r[-1])) for r in rates))
+        return cls(tuple(split_noises(noise)), tuple((float(r[0]), float(r[-1])) for r in rates))
 
     @property
     def texts(self) -> tuple[list[str], list[float | str]]:
@@ -1263,7 +1266,7 @@ def rate_order(noise_rate: str) -> tuple[tuple[float, float], ...]:
 
 def split_noises(text: str) -> list[str]:
     """Split "A(..) + B(..)", as one entry of an option combines noises; each may end in "@rate"."""
-    return re.split(r"\s*\+\s*(?=[A-Za-z_])", text.strip())
+    return re.split(r"\s*\+\s*(?=[\w.:]+\()", text.strip())
 
 
 def _listed(name: str, values: Any, example: str) -> list[Any]:
@@ -1730,8 +1733,8 @@ def _import_module(module: str, problem: str) -> None:
 
     ``problem`` is what an error says first, as "there is no environment 'a:b'".
     """
-    path = sys.path[:]
-    sys.path[:] = module_path()
+    path, searched = sys.path[:], module_path()
+    sys.path[:] = searched
     top = module.partition(".")[0]
     try:
         if not all(map(str.isidentifier, module.split("."))):
@@ -1752,8 +1755,8 @@ def _import_module(module: str, problem: str) -> None:
     except Exception as error:
         _raise_if_of_mujoco(error, module)
         raise
-    finally:
-        sys.path[:] = path
+    finally:  # what the module has added stays
+        sys.path[:] = path + [folder for folder in sys.path if folder not in searched]
 
 
 def _raise_if_of_mujoco(error: Exception, name: str) -> None:

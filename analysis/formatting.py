@@ -119,7 +119,9 @@ def shown(table):
     is not its script's; a row of all environments says so.
     """
     frame = table.frame if table.view is None else table.view
-    frame = frame.reset_index(drop=True).drop(columns=list(table.only_csv))
+    frame = frame.reset_index(drop=True)
+    known = spreads(frame)
+    frame = frame.drop(columns=list(table.only_csv))
     if "scope" in frame:
         frame["environment"] = frame["environment"].mask(frame.pop("scope") == "all", "all")
     if "exp_name" in frame:
@@ -127,7 +129,7 @@ def shown(table):
         frame["exp_name"] = frame["exp_name"].mask(frame["exp_name"] == names, "")
     empty = frame.columns[(frame.isna() | frame.eq("")).all()]
     frame = frame.drop(columns=empty.intersection(["exp_name", "phase", "without_percent"]))
-    known, cells = spreads(frame), {}
+    cells = {}
     for name in frame:
         pairs = zip(frame[name], known.get(name, [None] * len(frame)), strict=True)
         form = table.formats.get(name)

@@ -963,7 +963,9 @@ def test_numbers_that_are_shown_as_one_have_the_digits_of_their_spread():
     numbers = {"difference": [12.345, 12.345, NAN], "difference_low": [11.111, NAN, NAN]}
     numbers |= {"difference_high": [13.579, NAN, NAN], "pooled_std": [0.1, 123.0, NAN]}
     numbers |= {"baseline_mean": [12.345, 12.345, NAN], "baseline_std": [0.123, NAN, NAN]}
-    text = analysis.formatting.shown(analysis.formatting.Table("", pd.DataFrame(numbers), "", ""))
+    table = analysis.formatting.Table("", pd.DataFrame(numbers), "", "", only_csv=("pooled_std",))
+    text = analysis.formatting.shown(table)
+    assert "pooled std" not in text
     assert list(text["difference"]) == ["12.3 [11.1, 13.6]", "12", "\u2013"]
     assert list(text["no noise"]) == ["12.35 \u00b1 0.12", "12.35 \u00b1 \u2013", "\u2013"]
 
@@ -1014,6 +1016,9 @@ def test_results_go_beside_the_runs(tmp_path):
     main(analyze.Args(runs_dir=tmp_path / "runs"))
     assert (tmp_path / "runs/results/report.html").exists()
     main(analyze.Args(runs_dir=tmp_path / "runs"))  # its own results are renewed
+    with pytest.raises(SystemExit):
+        main(analyze.Args(runs_dir=tmp_path / "runs", out=tmp_path / "results/../runs"))
+    assert not (tmp_path / "runs/best.csv").exists()
 
 
 def test_runs_one_folder_deeper_are_pointed_to(tmp_path, capsys):

@@ -157,6 +157,16 @@ def test_what_a_module_raises_passes_through(source, error, tmp_path, monkeypatc
     assert sys.path == path
 
 
+def test_a_module_may_add_to_the_path(tmp_path, monkeypatch):
+    """As one does whose environment imports a simulator in its constructor."""
+    (tmp_path / "my_path.py").write_text("import sys\nsys.path += ['/opt/simulator']\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    path = sys.path[:]
+    with pytest.raises(ValueError, match="Nothing"):
+        canonical_env_id("my_path:Nothing-v0")
+    assert sys.path == [*path, "/opt/simulator"]
+
+
 def test_an_assertion_is_a_refusal_only_of_a_package_that_asserts_its_versions():
     gym.register("Asserting-v0", "gymnasium_robotics.fetch:Env")
     gym.register("Own-v0", "my_envs:Env")

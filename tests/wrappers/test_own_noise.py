@@ -15,7 +15,14 @@ from cases import GenericEnv, streams
 from gymnasium.utils.env_checker import check_env
 from test_action_noise import actions_env
 
-from noisy_wrappers import Configuration, NoiseWrapper, make_noisy, parse_noise, run_name
+from noisy_wrappers import (
+    Configuration,
+    NoiseWrapper,
+    make_noisy,
+    parse_noise,
+    run_name,
+    split_noises,
+)
 
 ROOT = Path(__file__).parents[2]
 TEXT = "my_noises:StickyAction(3)"
@@ -155,6 +162,33 @@ def test_a_noise_without_arguments_needs_no_constructor(folder):
     assert str(parse_noise("my_noises:Doubled()")) == "my_noises:Doubled()"
     # one of this project's has one name, wherever it comes from
     assert str(parse_noise("my_noises:RandomActionDelay(1)")) == "RandomActionDelay(1)"
+
+
+def test_a_default_before_another_argument_stays(folder):
+    (folder / "my_noises.py").write_text(
+        "from noisy_wrappers import RewardNoise\n\n\n"
+        "class Between(RewardNoise):\n"
+        "    def __init__(self, env, noise_rate, high=3, low=1, text=''):\n"
+        "        super().__init__(env, noise_rate, high=high, low=low, text=text)\n\n"
+        "    def _perturb(self, reward):\n"
+        "        return reward + self.noise.uniform(self.parameters['low'], 3)\n"
+    )
+    for written, canonical in {
+        "Between(3, 2)": "Between(3, 2)",
+        "Between(low=2)": "Between(3, 2)",
+        "Between(2, 1)": "Between(2)",
+        "Between(3)": "Between()",
+        "Between(text='a + b')": "Between(3, 1, 'a + b')",
+    }.items():
+        noise = parse_noise(f"my_noises:{written}")
+        assert str(noise) == f"my_noises:{canonical}"
+        assert (
+            noise(GenericEnv(), 1.0).parameters
+            == parse_noise(str(noise))(GenericEnv(), 1.0).parameters
+        )
+    config = Configuration.read([str(noise)], [0.5])
+    assert Configuration.parse(*config.columns) == config
+    assert split_noises(f"{noise}+RandomActionDelay(1)") == [str(noise), "RandomActionDelay(1)"]
 
 
 def test_the_observation_and_reward_bases_are_for_everybody(folder):
