@@ -126,8 +126,15 @@ done
 
 [ -n "${PYTHON:-}" ] || [ ! -x .venv/bin/python ] || PYTHON=.venv/bin/python
 export PYTHON=${PYTHON:-python}
-# An environment of the user's own lies where the command was given
-[ "$caller" = "$(pwd -P)" ] || export PYTHONPATH="${PYTHONPATH:+$PYTHONPATH:}$caller"
+# An environment of the user's own lies where the command was given, or where PYTHONPATH says from
+# there
+path=''
+while IFS= read -rd : folder; do
+  case $folder in '' | /*) ;; *) folder=$caller/$folder ;; esac
+  path+=${path:+:}$folder
+done <<<"${PYTHONPATH:+$PYTHONPATH:}"
+[ "$caller" = "$(pwd -P)" ] || path+=${path:+:}$caller
+[ -z "$path" ] || export PYTHONPATH=$path
 lacking=$("$PYTHON" -c "import sys, importlib.util as u
 print(*[name for name in sys.argv[1:] if not u.find_spec(name)], sep=', ')" \
   gymnasium mujoco torch tyro tensorboard 2>/dev/null) ||
@@ -153,7 +160,7 @@ first=${todo%%$'\t'*}
 [ -z "$remote_dir" ] || [ "${first#/}" = "$first" ] ||
   fail "--remote-dir needs a --runs-dir in the project's folder, not ${first%/*}"
 # Whatever becomes of the reader of a pipe ("| head"), nothing is started
-if [ -n "$dry_run" ]; then cut -f2 <<<"$todo" || true; exit; fi
+if [ -n "$dry_run" ]; then printf %s "$todo" | cut -f2 || true; exit; fi
 [ -n "$todo" ] || { show report; exit; }
 
 case $executor in

@@ -152,9 +152,10 @@ def find_runs(paths):
         found = [path] if is_run(path) else runs_of(path)
         if not os.path.lexists(path) or (len(paths) == 1 and not found):
             fail(f"{path} is neither a run nor a folder of runs")
-        folders |= dict.fromkeys(map(Path.absolute, found))
+        for folder in found:
+            folders.setdefault(folder.resolve(), folder.absolute())
     runs, damaged = [], {}
-    for folder in folders:
+    for folder in folders.values():
         try:
             config = read_config(folder) if has_begun(folder) else None
             if config and read_result(folder, config):

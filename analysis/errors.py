@@ -3,6 +3,7 @@
 import os
 import re
 import sys
+import sysconfig
 import traceback
 from pathlib import Path
 
@@ -14,6 +15,7 @@ PROJECT = Path(__file__).resolve().parents[1]
 # These call what users write, and are not the place of its errors
 PROGRAMS = {PROJECT / name for name in ("evaluate.py", "noisy_wrappers.py", "sweep/environment.py")}
 PROGRAMS |= {PROJECT / f"{name}_continuous_noisy.py" for name in ("sac", "td3", "ppo")}
+LIBRARIES = ("site-packages", "dist-packages", sysconfig.get_path("stdlib"))
 
 
 def fail(message, code=2):
@@ -36,7 +38,7 @@ def with_place(error, plain=()):
     if isinstance(error, plain):
         return reason(error)
     frames = traceback.extract_tb(error.__traceback__)
-    own = [frame for frame in frames if "site-packages" not in frame.filename]
+    own = [frame for frame in frames if not any(part in frame.filename for part in LIBRARIES)]
     place = frames[-1] if Path(own[-1].filename).resolve() in PROGRAMS else own[-1]
     return f"{in_words(error)} ({place.filename}, line {place.lineno})"
 

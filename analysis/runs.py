@@ -28,7 +28,7 @@ RUN_COLUMNS += ["steps", "returns", "success_rates"]
 CHOICE_COLUMNS = ["algorithm", "environment", "phase", "round", "noise", "noise_rate"]
 CHOICE_COLUMNS += ["seeds", "score", "survives"]
 ROBUSTNESS_COLUMNS = ["noise", "noise_rate", "episode", "episodic_return", "episodic_length"]
-VERSION = r"(?P<name>.*?)(?:-v(?P<version>\d+))?$"  # of an environment's id, if it has one
+VERSION = r"(?P<name>.*?)(?:-v(?P<version>\d{1,9}))?$"  # of an environment's id, if it has one
 OLDER = "environments"  # before their version, in `phase`: see read_runs
 
 

@@ -258,7 +258,8 @@ def main(view, caller, argv):
 if __name__ == "__main__":
     names = {"encoding": sys.getfilesystemencoding(), "errors": sys.getfilesystemencodeerrors()}
     if sys.argv[1] in ("list", "dry-run"):  # folders as they are: bash starts their runs
-        sys.stdout.reconfigure(**names)
+        sys.stdout = open(os.dup(1), "w", **names)  # noqa: SIM115
+        os.dup2(2, 1)  # what native code of a user's module prints is no run, either
     else:
         take_over_terminal()
     try:

@@ -607,7 +607,7 @@ def test_more_seeds_for_the_baseline_or_for_one_noise_are_nothing_missing(tmp_pa
 
 
 def test_only_the_older_versions_of_an_environment_are_labelled(tmp_path):
-    for env in ("Hopper-v5", "Walker2d-v9", "Walker2d-v10", "Ant", "Ant-v4"):
+    for env in ("Hopper-v5", "Walker2d-v9", "Walker2d-v10", "Ant", "Ant-v4", f"Day-v{'9' * 20}"):
         write_run(tmp_path, [10], env=env)
     runs = analysis.runs.read_runs(tmp_path).set_index("environment")["phase"]
     assert runs["Walker2d-v9"] == "environments v9"

@@ -260,6 +260,15 @@ def test_two_processes_on_one_run_lose_nothing(runs):
     assert [path.name for path in run_dir.glob(".robustness*")] == [".robustness.lock"]
 
 
+def test_a_run_is_found_once_by_whatever_path(runs, tmp_path):
+    folder = one(runs, "PPO")
+    (tmp_path / "link").symlink_to(runs)
+    paths = [folder, runs, tmp_path / "link", folder / ".." / folder.name]
+    found, _ = evaluate.find_runs(paths)
+    assert [run.folder for run in found].count(folder) == 1
+    assert len(found) == len({run.folder.resolve() for run in found})
+
+
 def test_the_longer_of_two_results_is_kept(runs):
     [finished], _ = evaluate.find_runs([one(runs, "PPO")])
     short, long = [(1.0, 1, 1.0)], [(1.0, 1, 1.0), (2.0, 2, 0.0)]

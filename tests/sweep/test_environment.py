@@ -2,8 +2,10 @@
 
 import contextlib
 import json
+import os
 import re
 import shlex
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -17,6 +19,7 @@ from sweep.environment import Environment, ask, remember, remembered, run_second
 from sweep.grid import make_run
 from sweep.options import parse_args
 
+ROOT = Path(__file__).parents[2]
 SCALE = "RandomUniformScaleObservation(0.8, 1.2)"
 LATE = "RandomEarlyTermination(50)"
 KNOWN = Environment(0.001, 200, 100, 3, True, {})
@@ -176,6 +179,21 @@ def test_what_a_noise_prints_is_no_command(tmp_path, monkeypatch):
     assert shown.code == 0 and "loaded!" in shown.err
     folders = [Path(line.split("\t")[0]).name for line in shown.out.splitlines()]
     assert [name.partition("_s1_")[0] for name in folders] == ["baseline", "p1.0"]
+
+
+@pytest.mark.slow
+def test_what_native_code_prints_is_no_command(tmp_path):
+    """From a folder with a package in src/, which a relative PYTHONPATH names."""
+    (tmp_path / "src").mkdir()
+    text = "import os\n\nos.write(1, b'pybullet build time\\n')\n"
+    (tmp_path / "src/native_envs.py").write_text(text)
+    words = ["custom", "--algos", "ppo", "--envs", "native_envs:Hopper-v5", "--seeds", "1"]
+    env = os.environ | {"PYTHONPATH": "src"}
+    command = [ROOT / "benchmark.sh", *words, "--runs-dir", "runs", "--dry-run"]
+    shown = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True)
+    assert shown.returncode == 0 and "pybullet build time" in shown.stderr
+    [command] = shown.stdout.splitlines()
+    assert command.startswith(f"env PYTHONPATH={tmp_path}/src:{tmp_path} ")
 
 
 # WHAT IT COSTS
