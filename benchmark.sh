@@ -33,7 +33,6 @@ Grid options replace a preset's values
              each noise is run at each rate; 1.0:0.0 falls linearly during training
   --noises "RandomNormalNoisyReward(1.0)@0.1+RandomEarlyTermination(50)@0.2"
              a rate for each noise; --noise-rates does not apply here
-  --combine  with custom: also run every pair of the noises, combined
   --total-timesteps 1e6
   --runs-dir runs
              folder of the runs, relative to the current folder (choose: runs/choose, demo:

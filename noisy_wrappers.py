@@ -2096,6 +2096,11 @@ def check_numbers(args: Mapping[str, Any]) -> None:
         if not low <= value <= high:
             wanted = f"at most {high}" if value > high else f"at least {low}"
             raise ValueError(f"--{name.replace('_', '-')} must be {wanted}, not {value}")
+    if "num_steps" in args:  # PPO's
+        steps, least, most = args["num_steps"], 2 * args["num_minibatches"], args["total_timesteps"]
+        if not least <= steps <= most:
+            limits = f"2 * --num-minibatches ({least}) to --total-timesteps ({most})"
+            raise ValueError(f"--num-steps must be from {limits}, not {steps}")
 
 
 def note_versions(config: dict[str, Any], matmul_precision: str) -> list[str]:

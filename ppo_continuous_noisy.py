@@ -255,9 +255,6 @@ def make_policy(agent, observation_stats, env):
 
 def learn(args, env, test_env, stop):
     """Train one agent; return False if stop(), asked whenever an episode ends, ended it early."""
-    if not 2 * args.num_minibatches <= args.num_steps <= args.total_timesteps:
-        limits = f"2 * --num-minibatches ({2 * args.num_minibatches}) to --total-timesteps"
-        fail(f"--num-steps must be from {limits} ({args.total_timesteps}), not {args.num_steps}")
     torch.set_num_threads(args.torch_threads)
     device = torch.device("cuda" if args.cuda else "cpu")
     run = Run(args, "PPO", use_matmul_precision(args.matmul_precision, device), env)

@@ -22,7 +22,7 @@ import numpy as np
 import noisy_wrappers as noisy
 from analysis.errors import fail, with_place
 from analysis.folders import read_json
-from sweep.grid import PROJECT, script_of, script_options
+from sweep.grid import PROJECT
 
 # Seconds of learning for each step, without the environment's own, and what each number of an
 # observation adds to them: docs/sweeps.md says on which machine
@@ -130,11 +130,11 @@ def ask_all(args, configurations):
     configurations: {env_id: [Configuration]}. Exits with a line for each environment that cannot
     be trained in, and for each algorithm that cannot act there.
     """
-    options = script_options(script_of(args.algos[0]), tuple(args.extra))
+    steps = args.options[args.algos[0]]["max_episode_steps"]
     answers, reasons = {}, []
     for env_id, noises in configurations.items():
         try:
-            answer = ask(env_id, noises, options["max-episode-steps"])
+            answer = ask(env_id, noises, steps)
         except (Exception, SystemExit) as error:  # others may be wrong, too
             reason = with_place(error, (*noisy.refusals(env_id), noisy.NotFiniteError))
             reasons.append(f"no algorithm can be trained in {env_id}: {reason}")
@@ -158,12 +158,12 @@ def ask_all(args, configurations):
 
 def run_seconds(run, environment):
     """Return about how many seconds a run takes: learning, the environment's steps, tests."""
-    steps, frequency = run.total_timesteps, run.options["eval-frequency"]
+    steps, frequency = run.total_timesteps, run.options["eval_frequency"]
     if frequency is None:
         frequency = max(1, min(constant(run.command[0], "EVAL_FREQUENCY"), steps // 10))
     tests = math.ceil(steps / frequency) if frequency else 1
-    test_steps = tests * run.options["eval-episodes"] * environment.episode_steps
-    learned = max(0, steps - run.options.get("learning-starts", 0))
+    test_steps = tests * run.options["eval_episodes"] * environment.episode_steps
+    learned = max(0, steps - run.options.get("learning_starts", 0))
     base, for_each = LEARNING[run.kind[0]]
     learning = learned * (base + for_each * environment.observed)
     return START_UP + learning + (steps + test_steps) * environment.step_seconds

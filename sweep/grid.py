@@ -3,11 +3,7 @@
 options.py reads the arguments, __main__.py shows how far the runs have come.
 """
 
-import ast
-import contextlib
 import csv
-import difflib
-import functools
 import itertools
 import os
 import re
@@ -17,13 +13,7 @@ from typing import NamedTuple
 
 from analysis.errors import fail
 from analysis.folders import PHASES, DamageError, read_config, read_result, runs_of
-from noisy_wrappers import (
-    BASELINE,
-    MAY_DIFFER_IN_A_RUN,
-    Configuration,
-    check_numbers,
-    run_name,
-)
+from noisy_wrappers import BASELINE, MAY_DIFFER_IN_A_RUN, Configuration, run_name
 
 PROJECT = Path(__file__).resolve().parent.parent
 SEEDS = {"sac": range(1, 6), "td3": range(1, 6), "ppo": range(1, 11)}  # the paper's
@@ -86,15 +76,6 @@ PRESETS = {  # the grid options that a preset sets
     "custom": {},
     "choose": {"runs_dir": "runs/choose"},  # apart: analyze.py judges its runs otherwise
 }
-GIVEN_BY_THE_GRID = {  # options of the scripts, and those of the sweep that set them
-    "env-id": "--envs",
-    "seed": "--seeds",
-    "noise": "--noises",
-    "noise-rate": "--noise-rates",
-    "total-timesteps": "--total-timesteps",
-    "runs-dir": "--runs-dir",
-    "exp-name": "--runs-dir",  # a sweep's folders are told apart by where they lie
-}
 
 
 class PlannedRun(NamedTuple):
@@ -105,93 +86,13 @@ class PlannedRun(NamedTuple):
     seed: int
     total_timesteps: int
     command: list[str]  # the script and its arguments
-    options: dict[str, object]  # the script's own, by name: what "--" gives, else the defaults
+    options: dict[str, object]  # the script's own arguments, as options.script_options reads them
     damage: str = ""  # what is already known to be wrong with its files
-
-
-# ---------------------------------------------------------------------------- the scripts' options
 
 
 def script_of(algorithm):
     """Return the file of an algorithm's training script."""
     return f"{algorithm}_continuous_noisy.py"
-
-
-@functools.cache
-def defaults(script):
-    """Return {option: (type, default)} of a script, from its text: importing it takes seconds.
-
-    The type is as it is written there. Options that the grid gives are left out.
-    """
-    nodes = ast.parse((PROJECT / script).read_text("utf-8")).body
-    [args] = [node for node in nodes if isinstance(node, ast.ClassDef) and node.name == "Args"]
-    fields = {node.target.id.replace("_", "-"): node for node in args.body[1:]}
-    return {
-        name: (ast.unparse(field.annotation), ast.literal_eval(field.value))
-        for name, field in fields.items()
-        if name not in GIVEN_BY_THE_GRID
-    }
-
-
-@functools.cache
-def script_options(script, words):
-    """Return {option: value} of a script that is started with these words after the "--".
-
-    Exits with one line about a word that the script would refuse, or that belongs to the grid: a
-    typing error is not worth 9,100 failed runs.
-    """
-    known = defaults(script)
-    options = {name: default for name, (_, default) in known.items()}
-    words = iter(words)
-    for word in words:
-        if not word.startswith("--"):
-            fail(f"{word!r} after the -- belongs to no option of {script}")
-        name, equals, text = word[2:].partition("=")
-        name = name.replace("_", "-")
-        flag = name.removeprefix("no-")
-        if name in GIVEN_BY_THE_GRID:
-            fail(f"--{name} is part of the grid: use {GIVEN_BY_THE_GRID[name]}, before the --")
-        if isinstance(options.get(flag), bool):
-            if equals:
-                fail(f"--{name} takes no value: write --{flag} or --no-{flag}")
-            options[flag] = name == flag
-            continue
-        if name not in options:
-            near = difflib.get_close_matches(name, options, n=1)
-            hint = f"; did you mean --{near[0]}?" if near else ""
-            fail(f"{script} has no option --{name}{hint}")
-        text = text if equals else next(words, "--")
-        if not text or text.startswith("--"):
-            fail(f"--{name} needs a value")
-        options[name] = option_value(name, text, known[name][0])
-    if options["overwrite"]:
-        fail("--overwrite would start interrupted runs afresh: delete their folders instead")
-    threads = {"torch-threads": 1}  # another machine may have more cores
-    try:
-        check_numbers({name.replace("-", "_"): n for name, n in (options | threads).items()})
-    except ValueError as error:
-        fail(error)
-    return options
-
-
-def option_value(name, text, annotation):
-    """Read an option's value as the script does; annotation: its type, such as "int | None"."""
-    if "None" in annotation and text == "None":
-        return None
-    if annotation.startswith("Literal"):
-        choices = ast.literal_eval(annotation.removeprefix("Literal"))
-        if text not in choices:
-            fail(f"--{name} must be one of {', '.join(choices)}, not {text!r}")
-        return text
-    whole = "float" not in annotation
-    with contextlib.suppress(ValueError, OverflowError):
-        number = float(text) if "e" in text.lower() or not whole else int(text)  # 1e6 is whole
-        if not whole or number == int(number):
-            return int(number) if whole else number
-    return fail(f"--{name} takes a {'whole ' * whole}number, not {text!r}")
-
-
-# ----------------------------------------------------------------------------------------- the runs
 
 
 def preset_pairs(preset, algorithm, env_id):
@@ -213,8 +114,6 @@ def configurations(args, algorithm, env_id):
     if args.noises or args.noise_rates:
         entries = args.noises or [[(noise, None)] for noise in dict(pairs)]
         rates = args.noise_rates or list(dict.fromkeys(own for _, own in pairs))
-    if args.combine:
-        entries = entries + [a + b for a, b in itertools.combinations(entries, 2)]
     crossed = [pairs for pairs in entries if any(rate is None for _, rate in pairs)]
     if crossed and not rates:
         fail('--noises needs --noise-rates, or a rate with each noise, as in "NOISE@0.1"')
@@ -248,8 +147,7 @@ def make_run(args, algorithm, env_id, configuration, seed, phase=""):
         command += ["--noise", *noises, "--noise-rate", *map(str, rates)]
     command += ["--total-timesteps", str(steps), "--runs-dir", runs_dir, *args.extra]
     folder = Path(runs_dir, run_name(env_id, script.removesuffix(".py"), noises, rates, seed))
-    options = script_options(script, tuple(args.extra))
-    return PlannedRun(folder, (algorithm, env_id), seed, steps, command, options)
+    return PlannedRun(folder, (algorithm, env_id), seed, steps, command, args.options[algorithm])
 
 
 def grid(args):
@@ -316,12 +214,11 @@ def other_options(run, made_with):
     """
     differences = []
     for name, wanted in run.options.items():
-        field = name.replace("-", "_")
-        if field in MAY_DIFFER_IN_A_RUN or (field == "eval_frequency" and wanted is None):
+        if name in MAY_DIFFER_IN_A_RUN or (name == "eval_frequency" and wanted is None):
             continue  # where no frequency of tests is asked for, a run keeps its own
-        made = made_with.get(field, wanted)
+        made = made_with.get(name, wanted)
         if made != wanted:
-            differences.append(f"--{name} {made}, not {wanted}")
+            differences.append(f"--{name.replace('_', '-')} {made}, not {wanted}")
     return differences
 
 

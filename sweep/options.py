@@ -1,22 +1,35 @@
 """The arguments of benchmark.sh that name a grid; `./benchmark.sh --help` explains them."""
 
 import argparse
-import contextlib
+import ast
 import difflib
+import functools
 import os
 import re
 from pathlib import Path
 
 from analysis.errors import fail
-from noisy_wrappers import canonical_env_id, split_noises
-from sweep.grid import ENVS, PRESETS, SEEDS, defaults, script_of, script_options
+from noisy_wrappers import canonical_env_id, check_numbers, split_noises
+from sweep.grid import ENVS, PRESETS, PROJECT, SEEDS, script_of
 
 EXECUTOR_OPTIONS = ["--dry-run", "--executor", "--jobs", "--sshlogin", "--remote-dir"]
 EXECUTOR_OPTIONS += ["--slurm-args", "--wait", "--help"]  # benchmark.sh reads these
 
+GIVEN_BY_THE_GRID = {  # options of the scripts, and those of the sweep that set them
+    "--env-id": "--envs",
+    "--seed": "--seeds",
+    "--noise": "--noises",
+    "--noise-rate": "--noise-rates",
+    "--total-timesteps": "--total-timesteps",
+    "--runs-dir": "--runs-dir",
+    "--exp-name": "--runs-dir",  # a sweep's folders are told apart by where they lie
+}
+
 
 def parse_args(view, caller, argv):
-    """Return the grid's arguments; `extra` are the scripts' own, after "--".
+    """Return the grid's arguments; `extra` are the words after "--", for the scripts.
+
+    `options` is {algorithm: what script_options makes of them}.
 
     Exits with one line about the first argument that no run could be started with.
     """
@@ -30,7 +43,6 @@ def parse_args(view, caller, argv):
     parser.add_argument("--seeds", nargs="+", type=seeds)
     parser.add_argument("--total-timesteps", type=whole_number, default=1_000_000)
     parser.add_argument("--runs-dir", default="runs")
-    parser.add_argument("--combine", action="store_true")
     parser.add_argument("--exclude", nargs="+", type=entry, default=[])
     parser.add_argument("--budget", type=whole_number)
     parser.add_argument("--confirm", type=whole_number, default=25)
@@ -69,8 +81,6 @@ def check(args):
     for algorithm in args.algos:
         if algorithm not in SEEDS:
             fail(f"unknown algorithm {algorithm!r}; choose from {', '.join(SEEDS)}")
-    if args.total_timesteps <= 0:
-        fail(f"--total-timesteps must be greater than 0, not {args.total_timesteps}")
     try:
         args.envs = list(dict.fromkeys(map(canonical_env_id, args.envs)))
     except ValueError as error:
@@ -78,22 +88,17 @@ def check(args):
     for name in ("--exclude", "--budget", "--confirm", "--metric"):
         if name in args.given and args.preset != "choose":
             fail(f"{name} is an option of choose")
-    if args.combine and args.preset != "custom":
-        fail("--combine is an option of custom")
     if args.preset == "choose" and not {"--algos", "--envs"} <= args.given:
         fail("choose needs --algos and --envs: it chooses a noise for each of them")
     if args.preset == "choose" and args.seeds:
         fail("choose picks its own seeds: leave out --seeds; see --budget and --confirm")
-    for script in map(script_of, args.algos):
-        options = script_options(script, tuple(args.extra))
-        rollout, least = options.get("num-steps", 0), 2 * options.get("num-minibatches", 0)
-        if rollout < least:
-            fail(f"--num-steps must be at least 2 * --num-minibatches ({least}), not {rollout}")
-        if args.total_timesteps < rollout:
-            fail(
-                f"--total-timesteps must be at least {rollout} for PPO (its --num-steps), not "
-                f"{args.total_timesteps}"
-            )
+    args.options = {algorithm: script_options(algorithm, args.extra) for algorithm in args.algos}
+    for options in args.options.values():
+        ours = {"total_timesteps": args.total_timesteps, "torch_threads": 1}  # more, elsewhere
+        try:
+            check_numbers(options | ours)
+        except ValueError as error:
+            fail(error)
 
 
 def machines():
@@ -108,9 +113,57 @@ def machines():
     return None if elsewhere else len(os.sched_getaffinity(0)), elsewhere
 
 
+@functools.cache
+def parser_of(algorithm):
+    """Return a parser of a script's options, made from its text: importing it takes seconds.
+
+    Options that the grid gives are left out.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.error = lambda message: fail(message.removeprefix("argument "))
+    nodes = ast.parse((PROJECT / script_of(algorithm)).read_text("utf-8")).body
+    [args] = [node for node in nodes if isinstance(node, ast.ClassDef) and node.name == "Args"]
+    for field in args.body[1:]:
+        flag, kind = f"--{field.target.id.replace('_', '-')}", ast.unparse(field.annotation)
+        if flag in GIVEN_BY_THE_GRID:
+            continue
+        how = {"type": float if "float" in kind else whole_number}
+        if kind == "bool":
+            how = {"action": argparse.BooleanOptionalAction}
+        elif kind.startswith("Literal"):
+            how = {"choices": ast.literal_eval(kind.removeprefix("Literal"))}
+        parser.add_argument(flag, default=ast.literal_eval(field.value), **how)
+    return parser
+
+
+def script_options(algorithm, words):
+    """Return {argument: value} of a script that is started with these words after the "--".
+
+    Exits with one line about a word that the script would refuse, or that belongs to the grid: a
+    typing error is not worth 9,100 failed runs.
+    """
+    words = [re.sub("^--[^=]+", lambda flag: flag[0].replace("_", "-"), word) for word in words]
+    for flag in (word.partition("=")[0] for word in words):
+        if flag in GIVEN_BY_THE_GRID:
+            fail(f"{flag} is part of the grid: use {GIVEN_BY_THE_GRID[flag]}, before the --")
+    options, unknown = parser_of(algorithm).parse_known_args(words)
+    if unknown:
+        near = difflib.get_close_matches(unknown[0], flags_of(algorithm), n=1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        fail(f"{script_of(algorithm)} has no option {unknown[0]}{hint}")
+    if options.overwrite:
+        fail("--overwrite would start interrupted runs afresh: delete their folders instead")
+    return vars(options)
+
+
+def flags_of(algorithm):
+    """Return the options of a script that are not the grid's."""
+    return [f"--{name.replace('_', '-')}" for name in vars(parser_of(algorithm).parse_args([]))]
+
+
 def unknown_option(name, known):
     """Say what to write instead of an option that the grid does not have."""
-    of_scripts = {f"--{option}" for name in SEEDS for option in defaults(script_of(name))}
+    of_scripts = {flag for algorithm in SEEDS for flag in flags_of(algorithm)}
     if name in of_scripts:
         return f"{name} is an option of the scripts: put it at the end, after --"
     if name in EXECUTOR_OPTIONS:  # benchmark.sh reads it, unless it is written with a value
@@ -145,9 +198,12 @@ def from_project(caller, text):
 
 def whole_number(text):
     """Read "1000000" or "1e6"."""
-    with contextlib.suppress(ValueError):
-        if float(text).is_integer():
-            return int(float(text))
+    try:
+        number = float(text) if "e" in text.lower() else int(text)
+        if number == int(number):
+            return int(number)
+    except (ValueError, OverflowError):
+        pass
     raise argparse.ArgumentTypeError(f"{text!r} is not a whole number, such as 1000000 or 1e6")
 
 
