@@ -35,9 +35,6 @@ from analysis.tables import all_equal_notes, family_notes, make_tables, success_
 from analysis.verdicts import POINTS, clear_first, headlines, in_sentences, tally
 
 # Columns that a terminal may have room for, the most important ones first
-BEST_IN_SHORT = ["algorithm, environment", "noise", "noise_rate", "difference", "p_adjusted", "n"]
-BEST_IN_SHORT += ["luck_95", "p_luck_of_best", "baseline_mean", "baseline_std"]
-BEST_IN_SHORT += ["noisy_mean", "noisy_std"]
 MISSING_IN_SHORT = ["status", "reason", "seeds", "environment", "noise", "noise_rate", "run"]
 
 
@@ -129,8 +126,7 @@ def print_results(out, results):
     print()
     if len(tables["best"].frame):
         say("The best noise in each environment, which may still be worse than no noise:")
-        best = replace(tables["best"], view=tables["best"].view[BEST_IN_SHORT])
-        print(f"\n{text_table(best, width)}\n")
+        print(f"\n{text_table(tables['best'], width)}\n")
     say(results.overview)
     for note in results.notes + results.versions:
         say(f"note: {note}")

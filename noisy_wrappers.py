@@ -40,6 +40,8 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
+import time
 import traceback
 import warnings
 import zlib
@@ -768,7 +770,7 @@ class RandomEarlyTermination(NoiseWrapper):
         Nor may ``env`` record its episodes: the record would miss those that this one ends.
         """
         if any(env.has_wrapper_attr(name) for name in _OF_RECORDERS):
-            raise ValueError(_RECORDED_BENEATH_EARLY_TERMINATION)
+            raise ValueError(_RECORDED)
         self.each_step = _flag("each_step", each_step)
         self.truncate = _flag("truncate", truncate)
         if not each_step:
@@ -1318,12 +1320,8 @@ _BEFORE_STATISTICS = ("dynamics", "action")
 _OF_RECORDERS = ("return_queue", "get_episode_rewards")
 _RECORDED = (
     "this environment records its episodes already (in info['episode'], as RecordEpisodeStatistics "
-    "and Monitor do): take that off, or use make_noisy(..., record_statistics=False)"
-)
-_RECORDED_BENEATH_EARLY_TERMINATION = (
-    "this environment records its episodes already, and the record would miss those that "
-    "RandomEarlyTermination ends: apply that first, as in Monitor(make_noisy(env, "
-    "['RandomEarlyTermination(50)'], [0.5], record_statistics=False)), and the other noises after"
+    "and Monitor do): take that off, or use make_noisy(..., record_statistics=False); apply "
+    "RandomEarlyTermination before such a record, which would miss the episodes that it ends"
 )
 
 
@@ -2124,6 +2122,34 @@ def note_versions(config: dict[str, Any], matmul_precision: str) -> list[str]:
                 changes.append(f"{name} is {value} now; this run had {used} so far")
                 old[name] = f"{used}, {value}"
     return changes
+
+
+def clean_compiler_cache() -> None:
+    """Remove the empty libraries that a killed PyTorch leaves in its cache (pytorch#102539)."""
+    from torch._inductor.runtime.cache_dir_utils import cache_dir  # which takes seconds
+
+    with contextlib.suppress(OSError):  # another process removed a folder
+        for path in Path(cache_dir()).rglob("*.so"):
+            with contextlib.suppress(OSError):  # or it
+                if path.stat().st_size == 0 and time.time() - path.stat().st_mtime > 60:
+                    path.unlink()
+
+
+def compiler_failure(error: Exception) -> str:
+    """Return in a line why PyTorch could not compile, or "" for any other error of a script."""
+    compiling = type(error).__module__.startswith(("torch._dynamo", "torch._inductor"))
+    if not compiling or "--no-compile" in sys.argv:  # then it is of the environment
+        return ""
+    text = str(getattr(error, "inner_exception", error)).strip()
+    return text.partition("\n")[0] or type(error).__name__
+
+
+def start_again() -> None:
+    """Start the program again with a new cache for the compiler, the next time without it."""
+    cache = f"torchinductor_{os.getpid()}_"  # os.execv keeps the process number
+    options = ["--no-compile"] if cache in os.environ.get("TORCHINDUCTOR_CACHE_DIR", "") else []
+    os.environ["TORCHINDUCTOR_CACHE_DIR"] = tempfile.mkdtemp(prefix=cache)
+    os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:], *options])
 
 
 def handle_signals(handler: Callable[[int, Any], None]) -> None:

@@ -18,7 +18,6 @@ import math
 import os
 import signal
 import sys
-import tempfile
 import time
 import warnings
 import zipfile
@@ -479,31 +478,6 @@ def use_matmul_precision(precision, device):
     return precision
 
 
-def prepare_compiler():
-    """Remove the empty libraries that killed compilers leave in the cache (pytorch#102539)."""
-    from torch._inductor.runtime.cache_dir_utils import cache_dir  # which takes seconds
-
-    say("compiling ...")
-    torch.compiler.reset()  # forget what earlier runs of this process compiled
-    with contextlib.suppress(OSError):  # another process removed a folder
-        for path in Path(cache_dir()).rglob("*.so"):
-            with contextlib.suppress(OSError):  # or it
-                if path.stat().st_size == 0 and time.time() - path.stat().st_mtime > 60:
-                    path.unlink()
-
-
-def start_again(error):
-    """If compiling failed, start again with a new cache for the compiler, and then without it."""
-    compiling = type(error).__module__.startswith(("torch._dynamo", "torch._inductor"))
-    if compiling and "--no-compile" not in sys.argv:  # else it is of the environment
-        reason = str(getattr(error, "inner_exception", error)).strip()
-        say(f"not compiled, starting again: {reason.partition(chr(10))[0]}")
-        cache = f"torchinductor_{os.getpid()}_"  # os.execv keeps the process number
-        options = ["--no-compile"] if cache in os.environ.get("TORCHINDUCTOR_CACHE_DIR", "") else []
-        os.environ["TORCHINDUCTOR_CACHE_DIR"] = tempfile.mkdtemp(prefix=cache)
-        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:], *options])
-
-
 class Run:
     """The run's folder: what is written into it, and read again to resume."""
 
@@ -520,12 +494,11 @@ class Run:
         if self.folder.is_symlink():
             fail(f"{self.folder} is a link: remove it, or choose another --exp-name or --runs-dir")
         in_use = fail_on(BlockingIOError, f"{self.folder} is in use by another process")
-        no_locks = fail_on(OSError, f"--runs-dir: the file system of {self.folder} has no locks")
         with fail_on(OSError, "--runs-dir"):
             self.folder.mkdir(parents=True, exist_ok=True)
             lock = os.open(self.folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
             self.lock = os.fdopen(lock)
-            with no_locks, in_use:
+            with in_use:
                 fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
             result, _, self.checkpoint, *_ = ours = [self.folder / name for name in self.FILES]
             old = [path.with_suffix(".tmp") for path in ours]  # of a process that was killed
@@ -553,7 +526,9 @@ class Run:
             for change in noisy.note_versions(self.config, precision):
                 say(change)
             if args.compile:
-                prepare_compiler()
+                say("compiling ...")
+                torch.compiler.reset()  # forget what earlier runs of this process compiled
+                noisy.clean_compiler_cache()
 
     def _old_config(self):
         path = self.folder / "config.json"
@@ -765,7 +740,9 @@ if __name__ == "__main__":
             finished = train(read_args(), lambda: noisy.handle_signals(stop_run) or bool(signals))
     except Exception as error:
         if not signals:  # the environment's processes may have got the signal, too
-            start_again(error)
+            if reason := noisy.compiler_failure(error):
+                say(f"not compiled, starting again: {reason}")
+                noisy.start_again()
             raise
     if not finished:
         say("stopped; run the same command again to resume")

@@ -53,7 +53,7 @@ MERGED = {
     "IQM change %": "{iqm_change_percent} [{iqm_change_low}, {iqm_change_high}]",
     "difference": "{difference} [{difference_low}, {difference_high}]",
     "P(improvement)": "{probability_of_improvement} [{probability_low}, {probability_high}]",
-    "luck 95 % (p)": "{luck_95} ({p_luck_of_best})",
+    "luck 95 % (p)": "{luck_95} ({p_luck})",
     "score % (baseline)": "{score_percent} ({baseline_score_percent})",
 }
 

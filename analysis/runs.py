@@ -95,8 +95,7 @@ def read_run(folder):
         row["noise_rate"] = config["configuration"].noise_rate
         result = folders.read_result(folder, config)
         if result is None:
-            reason = f"no result.json; {progress(folder)}"
-            return row | {"status": "unfinished", "reason": reason}
+            return row | {"status": "unfinished", "reason": "no result.json"}
         steps, returns, rates = read_evaluations(folder, config["episodes"], config["total"])
         if not np.isclose(returns[-1], result["final_return_mean"], rtol=1e-3, atol=1e-3):
             raise DamageError("eval.csv and result.json disagree on the final return")
@@ -206,15 +205,6 @@ def read_choice(runs_dir, metric="return"):
     pairs = zip(choice["noise"], choice["noise_rate"], strict=True)
     choice["noise_rate"] = [Configuration.parse(*pair).noise_rate for pair in pairs]
     return choice
-
-
-def progress(folder):
-    """Say in words how far an unfinished run is."""
-    try:
-        last = (folder / "eval.csv").read_text("utf-8").rsplit("\n", 2)[-2]
-        return f"evaluated up to step {int(last.split(',')[0]):,}"
-    except (OSError, ValueError, IndexError):
-        return "no evaluation yet"
 
 
 def missing_runs(runs):

@@ -20,9 +20,9 @@ PROBABILITY = ("probability_of_improvement", "probability_low", "probability_hig
 IQM_CHANGE = ("iqm_change_percent", "iqm_change_low", "iqm_change_high")
 # What a comparison does not tell where all returns are equal
 UNKNOWN = ("t", "p", "difference_low", "difference_high", "difference_percent", *IQM_CHANGE)
-BEST_VIEW = ["algorithm, environment", "noise", "noise_rate", "baseline_mean", "baseline_std"]
-BEST_VIEW += ["noisy_mean", "noisy_std", "difference", "p_adjusted", "luck_95", "p_luck_of_best"]
-BEST_VIEW += ["n"]
+# The best noises as people read them; a terminal may lack room for the last columns
+BEST_VIEW = ["algorithm, environment", "noise", "noise_rate", "difference", "p_adjusted", "n"]
+BEST_VIEW += ["luck_95", "p_luck", "baseline_mean", "baseline_std", "noisy_mean", "noisy_std"]
 # After those that name a study
 _COLUMNS = {
     "summary": """environment noise noise_rate n mean std n_baseline baseline_mean
@@ -47,8 +47,7 @@ COLUMNS["judged"] = [*dict.fromkeys(COLUMNS["summary"] + COLUMNS["statistics"])]
 _COLUMNS_WITH = {
     WHOLE: """n n_baseline n_baseline_most environments conditions chosen_from seeds seeds_needed
         steps_to_baseline percent_of_environments""",
-    P_VALUE: """p p_adjusted p_holm smallest_p smallest_p_adjusted p_luck p_luck_of_best
-        paper_p_luck""",
+    P_VALUE: "p p_adjusted p_holm smallest_p smallest_p_adjusted p_luck paper_p_luck",
     SHARE: "probability_of_improvement probability_low probability_high effect_size t",
     TENTH: "difference_se",
     PLAIN: "steps_millions",
@@ -351,6 +350,6 @@ def best_view(best):
     names = [f"{study_name(*key)}, {env}" for *key, env in best[[*STUDY, "environment"]].values]
     seeds = [seeds_of(*pair) for pair in best[["n", "n_baseline"]].values]
     said = [verdicts.difference(row) for row in best.itertuples()]
-    view = best.assign(difference=said, p_luck_of_best=best["p_luck"], n=seeds)
+    view = best.assign(difference=said, n=seeds)
     view["algorithm, environment"] = names
     return view[BEST_VIEW]

@@ -72,11 +72,6 @@ def steps_left(progress):
     return 0 if done else max(0, progress.run.total_timesteps - progress.log.step)
 
 
-def running(progresses):
-    """Return those of the runs that are running, perhaps elsewhere."""
-    return [progress for progress in progresses if progress.state in (RUNNING, PROBABLY)]
-
-
 def summary(progresses):
     """Return one line: how many runs are in which state, how fast it goes, how long it takes."""
     count = Counter(progress.state for progress in progresses)
@@ -88,7 +83,7 @@ def summary(progresses):
             for key in (progress.run.kind, None):
                 speeds.setdefault(key, []).append(progress.log.steps_per_second)
     speed = {key: harmonic_mean(values) for key, values in speeds.items()}
-    on_their_way = running(progresses)
+    on_their_way = [p for p in progresses if p.state in (RUNNING, PROBABLY)]
     if on_their_way and speed:
         seconds = sum(steps_left(p) / speed.get(p.run.kind, speed[None]) for p in progresses)
         left = timedelta(seconds=round(seconds / len(on_their_way)))
@@ -163,15 +158,6 @@ def show_status(args, runs, choices):
     silent = [p for p in progresses if p.state == RUNNING and p.reason]
     rows = [(f"{p.state}, {p.reason}", str(p.log.path), p.log.last_line) for p in silent]
     table("running, but silent:", rows)
-    slowest = []
-    for progress in running(progresses):
-        log = progress.log
-        if log.steps_per_second:
-            shown = f"{log.steps_per_second}/s", str(log.step), str(progress.run.folder)
-            slowest.append((steps_left(progress) / log.steps_per_second, *shown))
-    slowest.sort(reverse=True)
-    rows = [(str(timedelta(seconds=round(left))), *shown) for left, *shown in slowest[:5]]
-    table("slowest of those running (time left, steps per second, step):", rows)
     if choices:
         from sweep import choose
 

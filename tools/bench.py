@@ -15,8 +15,8 @@ program starts once, reports three times to warm up, and then runs in blocks of 
 "core %" is the share of the core that the process got; below 97 the machine was busy.
 With --clock cpu only time on the core counts, which depends less on other processes.
 --against-... runs other programs and ours in turn, one block each. "ours / its" is the median of
-the ratios of neighbouring blocks; "from" and "to" are the 95 % interval of this median (with fewer
-than six pairs: the smallest and the largest ratio). CleanRL's pinned Gymnasium has -v4 environments
+the ratios of neighbouring blocks; "from" and "to" are the 95 % interval of this median, from six
+pairs on. CleanRL's pinned Gymnasium has -v4 environments
 (Humanoid-v4: 376 observations, -v5: 348). SBX gets the sizes of our networks, batches and updates;
 it logs nothing, and in PPO it normalizes neither observations nor rewards.
 --jobs N compares N runs side by side, on a core each, with one alone.
@@ -26,7 +26,6 @@ import argparse
 import contextlib
 import itertools
 import json
-import math
 import os
 import runpy
 import shutil
@@ -225,15 +224,10 @@ def ours_and_others(algo, env_id, options):
         yield Program("SBX", core, "_sbx", algo, env_id, python=python)
 
 
-def interval_of_median(values):
-    """Return a 95 % confidence interval of the median: two of the sorted values."""
-    ordered = sorted(values)  # the number below the true median is binomial, nearly normal
-    rank = max(0, math.floor((len(ordered) - 1.96 * math.sqrt(len(ordered))) / 2))
-    return ordered[rank], ordered[-1 - rank]
-
-
 def compare(algo, env_id, options):
     """Run ours and the others, if there are any, alternately."""
+    from scipy.stats import quantile_test  # here, since the children's interpreters may not have it
+
     programs, rows = [], []
     with contextlib.ExitStack() as stack:
         for program in ours_and_others(algo, env_id, options):
@@ -245,7 +239,7 @@ def compare(algo, env_id, options):
                 measure(options, program)
     for program in programs:
         ratios = [a / b for a, b in zip(programs[0].speeds, program.speeds, strict=True)]
-        low, high = interval_of_median(ratios)
+        low, high = quantile_test(ratios).confidence_interval()  # of the median
         row = {
             "program": program.name,
             "steps/s": median(program.speeds),
@@ -318,7 +312,7 @@ def parse(argv):
 
 def main(argv):
     """Measure and print."""
-    from tabulate import tabulate  # here, since the children's interpreters may not have it
+    from tabulate import tabulate
 
     options, rows = parse(argv), []
     mode = side_by_side if options.jobs else compare

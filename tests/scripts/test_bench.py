@@ -98,13 +98,6 @@ def test_a_block_lasts_long_enough_and_counts_from_its_start(clock, speed, monke
     assert (program.speeds, program.shares) == ([speed], [0.25])
 
 
-def test_the_interval_of_a_median():
-    # ranks from the table of the sign test at 95 %: 6 and 15 of 20, 10 and 21 of 30
-    assert bench.interval_of_median(range(20, 0, -1)) == (6, 15)
-    assert bench.interval_of_median(range(1, 31)) == (10, 21)
-    assert bench.interval_of_median([2, 3, 1]) == (1, 3)
-
-
 def test_programs_run_in_turn(tmp_path, monkeypatch):
     log = tmp_path / "log"
     folders = [checkout(tmp_path / name, SCRIPT.format(log=log, name=name)) for name in "ab"]

@@ -630,9 +630,7 @@ def test_a_file_system_without_locks_is_one_line(algorithm, tmp_path, capsys, mo
     with pytest.raises(SystemExit) as error:
         train(algorithm, options(algorithm, tmp_path))
     assert error.value.code == 2
-    line = capsys.readouterr().err
-    assert line.startswith(f"error: --runs-dir: the file system of {tmp_path}/")
-    assert line.endswith("has no locks: [Errno 37] No locks available\n")
+    assert capsys.readouterr().err == "error: --runs-dir: [Errno 37] No locks available\n"
 
 
 @pytest.mark.slow

@@ -369,7 +369,7 @@ def run_block(script):
 
 def test_repeated_helpers_are_word_for_word_identical():
     everywhere = "make_env fail fail_on say read_args make_envs train evaluate "
-    everywhere += "use_matmul_precision prepare_compiler start_again Run"
+    everywhere += "use_matmul_precision Run"
     off_policy = "mlp in_numpy TwinLinear Critic ReplayBuffer updater"
     by_design = {"Args", "Actor", "load_policy", "critic_loss", "actor_loss", "learn"}
     found = [definitions(script) for script in (sac, td3, ppo)]
