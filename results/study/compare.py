@@ -95,6 +95,8 @@ def comparisons(runs):
     for key, group in runs.groupby(keys):
         sides = group.groupby("seed")["seed"].transform("size")
         group = group[sides == sides.max()]  # the whole seeds
+        if group["seed"].nunique() < 2:  # one has no deviation
+            continue
         without = group.loc[group["noise"] == "", "test"].to_numpy()
         for (noise, rate), same in group[group["noise"] != ""].groupby(["noise", "rate"]):
             row = dict(zip(keys, key, strict=True)) | {"noise": noise, "rate": rate}
