@@ -123,16 +123,19 @@ done
   fail "--slurm-args and --wait belong to --executor slurm"
 [ "${grid[0]:-}" != choose ] || wait=1 # for each batch of runs: their returns decide on the next
 
+# Relative paths count from the folder of the command
+case ${PYTHON:-} in '' | /*) ;; */*) PYTHON=$caller/$PYTHON ;; esac
 [ -n "${PYTHON:-}" ] || [ ! -x .venv/bin/python ] || PYTHON=.venv/bin/python
 export PYTHON=${PYTHON:-python}
-# An environment of the user's own lies where the command was given, or where PYTHONPATH says from
-# there
 path=''
 while IFS= read -rd : folder; do
   case $folder in '' | /*) ;; *) folder=$caller/$folder ;; esac
   path+=${path:+:}$folder
 done <<<"${PYTHONPATH:+$PYTHONPATH:}"
-[ "$caller" = "$(pwd -P)" ] || path+=${path:+:}$caller
+# A module of the user's lies there, too. It is not looked for where none is named: a file of this
+# folder, such as types.py, may have the name of a module of Python's.
+own='(^| )[^ ]*[A-Za-z_][A-Za-z0-9_.]*:'
+[[ ! "${grid[*]}" =~ $own ]] || [ "$caller" = "$(pwd -P)" ] || path+=${path:+:}$caller
 [ -z "$path" ] || export PYTHONPATH=$path
 lacking=$("$PYTHON" -c "import sys, importlib.util as u
 print(*[name for name in sys.argv[1:] if not u.find_spec(name)], sep=', ')" \
@@ -174,6 +177,7 @@ case $executor in
   slurm) command -v sbatch >/dev/null || fail "--executor slurm needs sbatch, on a Slurm cluster" ;;
 esac
 command -v flock >/dev/null || fail "benchmark.sh needs flock (Debian: apt-get install util-linux)"
+command -v ps >/dev/null || fail "benchmark.sh needs ps (Debian: apt-get install procps)"
 
 sweep=$HOSTNAME-$$-$(date +%Y%m%d%H%M%S)
 logs=${first%/*}/logs list=${first%/*}/logs/lines-$sweep.tsv

@@ -37,6 +37,7 @@ class Choice(NamedTuple):
     returns: dict[tuple[Configuration, int], float]  # of the finished ones: returns, or the metric
     spread: float  # standard deviation over seeds of the search's last tests; NaN if unknown
     run_seconds: float | None  # about what a run takes, if anything tells
+    problem: str = ""  # why it cannot continue
 
     @property
     def name(self):
@@ -66,9 +67,15 @@ def choices(args):
         if (unfit := unfit_noises(answer.tried)) and not args.noises:
             text = f"{env_id}: left out, because they cannot act there: {unfit}"
             print(text, file=sys.stderr)
-        if args.view == "list":
-            remember(args.runs_dir, env_id, known[env_id])
-    return [follow(args, *pair, known[pair[1]]) for pair in pairs]
+    found = [follow(args, *pair, known[pair[1]]) for pair in pairs]
+    for env_id in noises if args.view == "list" else ():
+        remember(args.runs_dir, env_id, known[env_id])
+    problems = [f"{choice.name}: {choice.problem}" for choice in found if choice.problem]
+    if len(problems) == len(found):
+        fail("\nerror: ".join(problems), code=1)
+    for problem in problems:  # the others go on
+        print(f"warning: {problem}", file=sys.stderr)
+    return [choice for choice in found if not choice.problem]
 
 
 def untried(args, env_id, environment):
@@ -80,7 +87,9 @@ def untried(args, env_id, environment):
     tried = environment.tried if environment else {}
     noises = candidates(args, args.algos[0], env_id)
     fit = None if args.noises else environment
-    if not any(follow(args, algorithm, env_id, fit).returns for algorithm in args.algos):
+    kept = candidates(args, args.algos[0], env_id, fit.tried if fit else {})
+    walks = (walk(args, algorithm, env_id, kept, len(kept)) for algorithm in args.algos)
+    if not any(returns for _, _, _, returns in walks):
         return noises
     return [n for n in noises if n.noise not in tried or (args.noises and tried[n.noise])]
 
@@ -108,6 +117,9 @@ def follow(args, algorithm, env_id, environment):
     last_seed = sum(seeds for _, seeds in schedule)
     if last_seed >= halving.FIRST_CONFIRMATION_SEED:
         fail(f"--budget {budget} is too large: the best noises would run with {last_seed} seeds")
+    fresh = range(halving.FIRST_CONFIRMATION_SEED, halving.FIRST_CONFIRMATION_SEED + args.confirm)
+    for seed in fresh:  # which other choices in this folder may have run: with the same options?
+        read(make_run(args, algorithm, env_id, BASELINE, seed, CONFIRMATION))
     state, runs, tests, returns = walk(args, algorithm, env_id, noises, budget)
     folders = {steps: runs[key].folder for key, (steps, _) in tests.items()}
     if len(folders) > 1:  # then their scores do not compare
@@ -121,16 +133,14 @@ def follow(args, algorithm, env_id, environment):
     if environment and seconds is None:
         seconds = run_seconds(next(iter(runs.values())), environment)
     kind = algorithm, env_id
-    choice = Choice(kind, len(noises), schedule, state, runs, returns, spread, seconds)
-    results = set().union(*(values for _, values in tests.values()))
+    results, problem = set().union(*(values for _, values in tests.values())), ""
     if len(results) == 1 and (state.rounds or not state.due):
-        fail(
-            f"{choice.name}: {what_all_runs_do(*results, args.metric)} in "
-            f"{args.total_timesteps:,} steps (runs: {len(returns)}), so further runs would say "
-            "nothing about noise; change --total-timesteps, or leave this out",
-            code=1,
+        problem = (
+            f"{what_all_runs_do(*results, args.metric)} in {args.total_timesteps:,} steps (runs: "
+            f"{len(returns)}), so further runs would say nothing about noise; change "
+            "--total-timesteps, or leave this out"
         )
-    return choice
+    return Choice(kind, len(noises), schedule, state, runs, returns, spread, seconds, problem)
 
 
 def walk(args, algorithm, env_id, noises, budget):

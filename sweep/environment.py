@@ -6,6 +6,7 @@ takes until finished runs tell. `remember` keeps the answer, because `status` ma
 
 import contextlib
 import functools
+import heapq
 import json
 import math
 import re
@@ -59,7 +60,9 @@ def ask(env_id, configurations=(), max_episode_steps=None):
             limit = env.spec.max_episode_steps
             seconds, steps, length = time_steps(env, limit, deadline)
             env.reset()  # a failure after this one is the noise's
-            tried = {n.noise: why_unfit(env, n, limit, deadline) for n in configurations}
+            tried = {}
+            for n in configurations:  # at every rate: it may fail at one of them
+                tried[n.noise] = tried.get(n.noise) or why_unfit(env, n, limit, deadline)
             return Environment(
                 step_seconds=seconds,
                 timed_steps=steps,
@@ -210,12 +213,20 @@ def time_left(batches, jobs, elsewhere=False):
     """
     text = f"about {hours_of(sum(map(sum, batches)))} core-hours are left"
     if jobs:
-        clock = sum(max(sum(batch) / jobs, max(batch)) for batch in batches if batch)
+        clock = sum(clock_time(batch, jobs) for batch in batches)
         runs = "1 run" if jobs == 1 else f"{jobs} runs"
         text += f", {hours_of(clock)} hours on the clock with {runs} at a time"
     if elsewhere:
         text += "; timed on this machine, others may be faster or slower"
     return text
+
+
+def clock_time(batch, jobs):
+    """Return how long a batch of runs takes, `jobs` at a time; batch: the seconds of each run."""
+    ends = [0.0] * jobs
+    for seconds in batch:
+        heapq.heapreplace(ends, ends[0] + seconds)  # where the next place is free
+    return max(ends)
 
 
 # --------------------------------------------------------------------------------------- the memory

@@ -225,7 +225,7 @@ def other_options(run, made_with):
 def command_line(run):
     """Return a run's command, complete: it can be pasted into a shell in the project's folder."""
     words = [os.environ.get("PYTHON", "python"), *run.command]
-    noises = any(re.match(r"[\w.]+:[A-Za-z_]", word) for word in run.command)  # module:Name(...)
+    noises = any(re.match(r"[\w.]+:[^\W\d]", word) for word in run.command)  # module:Name(...)
     own = ":" in run.kind[1] or noises
     if own and "PYTHONPATH" in os.environ:  # where a module of the user's lies
         words = ["env", f"PYTHONPATH={os.environ['PYTHONPATH']}", *words]

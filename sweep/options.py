@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 
 from analysis.errors import fail
-from noisy_wrappers import canonical_env_id, check_numbers, split_noises
+from noisy_wrappers import canonical_env_id, check_numbers, safe_name, split_noises
 from sweep.grid import ENVS, PRESETS, PROJECT, SEEDS, script_of
 
 EXECUTOR_OPTIONS = ["--dry-run", "--executor", "--jobs", "--sshlogin", "--remote-dir"]
@@ -43,7 +43,7 @@ def parse_args(view, caller, argv):
     parser.add_argument("--seeds", nargs="+", type=seeds)
     parser.add_argument("--total-timesteps", type=whole_number, default=1_000_000)
     parser.add_argument("--runs-dir", default="runs")
-    parser.add_argument("--exclude", nargs="+", type=entry, default=[])
+    parser.add_argument("--exclude", nargs="+", action="extend", type=entry, default=[])
     parser.add_argument("--budget", type=whole_number)
     parser.add_argument("--confirm", type=whole_number, default=25)
     parser.add_argument("--metric", choices=("return", "success_rate"), default="return")
@@ -85,6 +85,8 @@ def check(args):
         args.envs = list(dict.fromkeys(map(canonical_env_id, args.envs)))
     except ValueError as error:
         fail(f"--envs: {error}")
+    if len(set(map(safe_name, args.envs))) < len(args.envs):
+        fail("--envs: two of these would have the same folders; rename one, or take them apart")
     for name in ("--exclude", "--budget", "--confirm", "--metric"):
         if name in args.given and args.preset != "choose":
             fail(f"{name} is an option of choose")

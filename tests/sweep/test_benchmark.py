@@ -863,6 +863,14 @@ def test_an_environment_and_runs_in_the_callers_folder(tmp_path, stub):
     pasted = f"{line} --no-compile --eval-episodes 1"
     subprocess.run(pasted, shell=True, check=True, cwd=ROOT)
     assert result.exists()
+    # A module of Python's own name is in nobody's way, and PYTHON may be relative, too.
+    (tmp_path / "types.py").write_text("raise ImportError")
+    (tmp_path / "env").symlink_to(Path(sys.executable).parents[1])
+    python = Path("env/bin", Path(sys.executable).name)
+    words = ["demo", "--dry-run", "--noises", "RandomNormalNoisyReward(1)@1:0"]
+    env = ENV | {"PYTHON": str(python)}
+    shown = run(*words, cwd=tmp_path, script=ROOT / "benchmark.sh", env=env)
+    assert shown.code == 0 and shown.out.startswith(f"{tmp_path / python} ppo_"), shown.err
     # In the project, the path stays relative.
     inside = run("demo", "--dry-run", cwd=ROOT / "docs", script=ROOT / "benchmark.sh")
     assert inside.out.splitlines()[0].endswith("--runs-dir docs/runs/demo")

@@ -298,7 +298,7 @@ def test_records_of_choice_csv():
 
 
 def arguments(text, tmp_path):
-    words = [*text.split(" | "), "--total-timesteps", "4000", "--runs-dir", str(tmp_path)]
+    words = ["--total-timesteps", "4000", *text.split(" | "), "--runs-dir", str(tmp_path)]
     args = parse_args("status", "/", ["choose", *words])
     return args
 
@@ -434,6 +434,22 @@ def test_choose_stops_where_all_tests_are_equal(tmp_path, monkeypatch, capsys):
     assert f"error: {told}" in capsys.readouterr().err
 
 
+def test_an_environment_where_all_tests_are_equal_stops_no_other(tmp_path, monkeypatch, capsys):
+    real = stub_run.episodes_of
+    same = [[-50.0] * 10] * 10
+    monkeypatch.setattr(
+        stub_run, "episodes_of", lambda *run: same if "Car" in run[1] else real(*run)
+    )
+    envs = "Pendulum-v1 | MountainCarContinuous-v0"
+    args = arguments(f"--algos | ppo | --envs | {envs} | {THREE}", tmp_path)
+    batches(args)
+    [verdict] = conclude(args)
+    assert verdict.startswith("PPO on Pendulum-v1: ")
+    told = "warning: PPO on MountainCarContinuous-v0: all tests of all runs return -50.00 in"
+    assert told in capsys.readouterr().err
+    assert len({line["environment"] for line in read(tmp_path / "choice.csv")}) == 1
+
+
 def test_the_readme_says_what_it_takes_by_default(tmp_path):
     text = " ".join((Path(__file__).parents[2] / "README.md").read_text().split())
     pattern = r"takes (\d+) runs of a .*: about (\d+) core-hours with PPO and (\d+) with SAC in a"
@@ -475,6 +491,9 @@ def test_an_excluded_noise_is_no_other_choice(tmp_path):
     excluded = f"{words} | --exclude | RandomEarlyTermination(50)@1"
     [choice] = choose.choices(arguments(excluded, tmp_path))
     assert len(choice.returns) == 19
+    excluded += f" | --exclude | {A}@1"  # as `report` prints it, a line for each noise that fails
+    [choice] = choose.choices(arguments(excluded, tmp_path))
+    assert len(choice.returns) == 18
 
 
 def test_what_the_confirmation_can_show(tmp_path):
@@ -511,11 +530,15 @@ def test_what_the_confirmation_can_show(tmp_path):
     assert lines(two) == [line]
 
 
-def test_a_second_choice_takes_the_same_fresh_seeds(tmp_path):
+def test_a_second_choice_takes_the_same_fresh_seeds(tmp_path, capsys):
     words = f"--algos | ppo | --envs | Pendulum-v1 | --noises | {A}@1 | --confirm | "
     assert [len(batch) for batch in batches(arguments(words + "4", tmp_path))] == [8]
     [more] = batches(arguments(words + "6", tmp_path))
     assert {re.search(r"_s(\d+)_", name)[1] for name in more} == {"1005", "1006"}
+    other = words.replace(A, "RandomMixupObservation(0.5)") + "6"
+    with pytest.raises(SystemExit):  # at once, not after its search
+        choose.choices(arguments(f"{other} | --total-timesteps | 8000", tmp_path))
+    assert "holds a finished run of 4000 steps" in capsys.readouterr().err
 
 
 @pytest.mark.slow

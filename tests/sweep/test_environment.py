@@ -6,6 +6,7 @@ import os
 import re
 import shlex
 import subprocess
+import textwrap
 from pathlib import Path
 
 import pytest
@@ -196,6 +197,27 @@ def test_what_native_code_prints_is_no_command(tmp_path):
     assert command.startswith(f"env PYTHONPATH={tmp_path}/src:{tmp_path} ")
 
 
+def test_a_noise_is_refused_that_fails_at_any_rate(tmp_path, monkeypatch):
+    text = """
+        import noisy_wrappers
+
+        class Fails(noisy_wrappers.RewardNoise):
+            def _perturb(self, reward):
+                raise KeyError("mine")
+    """
+    (tmp_path / "failing_noises.py").write_text(textwrap.dedent(text))
+    monkeypatch.syspath_prepend(tmp_path)
+    noises = [Configuration.read(["failing_noises:Fails()"], [rate]) for rate in (1.0, 1e-9)]
+    [reason] = ask("toy_envs:Tiny-v0", noises).tried.values()
+    assert reason.startswith("KeyError: 'mine' (")
+
+
+def test_the_budget_is_that_of_the_noises_that_can_act(tmp_path):
+    words = ["--budget", "12", "--runs-dir", tmp_path]  # of 20; 10 cannot act
+    shown = choose("CategoryObservation", *words)
+    assert shown.code == 0 and shown.out.count("\n") == 10, shown.err
+
+
 # WHAT IT COSTS
 
 
@@ -213,7 +235,7 @@ def test_the_seconds_of_a_run():
 def test_time_left():
     batches = [[3600.0] * 5, [7200.0], []]
     assert time_left(batches, 2) == (
-        "about 7.0 core-hours are left, 4.5 hours on the clock with 2 runs at a time"
+        "about 7.0 core-hours are left, 5.0 hours on the clock with 2 runs at a time"
     )
     assert time_left([[400.0]], None, elsewhere=True) == (
         "about 0.1 core-hours are left; timed on this machine, others may be faster or slower"
