@@ -96,9 +96,12 @@ def write_results(out, results, latex):
     for drawing in drawn:
         write_figure(out, drawing, latex)
     write_report(out, results, drawn)
-    names = {*results.tables, *(drawing.name for drawing in drawn)}
-    old = sorted({path.stem for path in [*out.glob("*.csv"), *out.glob("*.svg")]} - names)
-    if old:
+    ends = [".csv", ".svg", *([".tex", ".pdf"] if latex else [])]
+    names = [*results.tables, *(drawing.name for drawing in drawn)]
+    written = {name + end for name in names for end in ends}
+    kinds = {".csv", ".svg", ".tex", ".pdf"}
+    old = {path.name for path in out.iterdir() if path.suffix in kinds} - written
+    if old := sorted(old):
         told = f"{out} also holds files that this analysis did not write: {', '.join(old)}"
         results.notes.append(told)
 
@@ -200,8 +203,8 @@ def main(args):
     except ValueError as error:
         fail(error)
     out = args.out or args.runs_dir / "results"
-    if out.resolve() == args.runs_dir.resolve():  # where choice.csv may be
-        fail("--out must be another folder than --runs-dir")
+    if out.resolve() == args.runs_dir.resolve() or is_run(out):  # where other tables may be
+        fail("--out must be a folder of its own, not that of the runs or of one of them")
     runs = read_runs(args.runs_dir)
     results = analyse(args, runs, paper, choice)
     try:

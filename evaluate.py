@@ -68,6 +68,7 @@ from noisy_wrappers import (
     NotFiniteError,
     SpaceError,
     canonical_env_id,
+    kept_generators,
     make_flat,
     module_path,
     outcome,
@@ -75,7 +76,6 @@ from noisy_wrappers import (
     refusals,
     rounded,
     seed_globals,
-    seeded_globals,
     split_noises,
 )
 
@@ -330,14 +330,15 @@ def play_episodes(env, policy, number, seed):
     Success is 1 or 0, or NaN where the environment does not tell it.
     """
     results = []
-    for episode in range(number):
-        with seeded_globals(seed + episode):
+    with kept_generators(env):
+        for episode in range(number):
+            seed_globals(seed + episode)
             observation, _ = env.reset(seed=seed + episode)
             terminated = truncated = False
             while not (terminated or truncated):
                 observation, _, terminated, truncated, info = env.step(policy(observation))
-        record = info["episode"]  # the return is a sum of numbers or of arrays
-        results.append((np.asarray(record["r"]).item(), int(record["l"]), outcome(info)))
+            record = info["episode"]  # the return is a sum of numbers or of arrays
+            results.append((np.asarray(record["r"]).item(), int(record["l"]), outcome(info)))
     return results
 
 

@@ -1062,12 +1062,24 @@ def _read_noise(text: str) -> Noise:
     while positional and recorded[positional[-1].name] == positional[-1].default:
         positional.pop()  # but not a default before another value, which would take its place
     keywords = [p for p in parameters if p.kind is p.KEYWORD_ONLY and recorded[p.name] != p.default]
-    return Noise(
+    noise = Noise(
         wrapper,
         tuple(recorded[p.name] for p in positional),
         tuple((p.name, recorded[p.name]) for p in keywords),
         "" if wrapper is WRAPPERS.get(name) else module,
     )
+    try:  # what is written must make the same noise again
+        _, _, args, kwargs = _read_call(str(noise))
+        same = wrapper(_ProbeEnv(), 1.0, *args, **kwargs).parameters == recorded
+    except (TypeError, ValueError):
+        same = False
+    if not same:
+        raise _bad_noise(
+            text,
+            "its constructor must name its arguments (no *args or **kwargs) and pass them on as "
+            f"they came; {noise} would be another noise",
+        )
+    return noise
 
 
 def _read_call(text: str) -> tuple[str, str, list[Any], dict[str, Any]]:
@@ -1193,7 +1205,7 @@ class Configuration:
         """The rates as tables and the paper have them: "0.05"; the baseline's is "0.00"."""
         written = []
         for rate in self.rates or [(0.0, 0.0)]:
-            start, end = (f"{r:.2f}" if round(r, 2) == r else f"{r:g}" for r in rate)
+            start, end = (f"{r:.2f}" if round(r, 2) == r else str(r) for r in rate)
             written.append(start if rate[0] == rate[1] else f"{start} to {end}")
         return " + ".join(written)
 
@@ -1268,7 +1280,8 @@ def rate_order(noise_rate: str) -> tuple[tuple[float, float], ...]:
 
 def split_noises(text: str) -> list[str]:
     """Split "A(..) + B(..)", as one entry of an option combines noises; each may end in "@rate"."""
-    return re.split(r"\s*\+\s*(?=[\w.:]+\()", text.strip())
+    outside_quotes = r"""(?=(?:[^'"]|'[^']*'|"[^"]*")*$)"""
+    return re.split(rf"\s*\+\s*(?=[\w.:]+\(){outside_quotes}", text.strip())
 
 
 def _listed(name: str, values: Any, example: str) -> list[Any]:
@@ -1713,7 +1726,7 @@ def _without_arrays(value: Any) -> Any:
     """Turn an array, also in nested dicts, into lists or a number of Python's own types."""
     if isinstance(value, dict):
         return {name: _without_arrays(part) for name, part in value.items()}
-    return value.tolist() if isinstance(value, np.ndarray) else value
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
 # ---------------------------------------------------------------------------- modules of the user's
@@ -1946,6 +1959,9 @@ def remarks(env_id: str, env: Env, step_limit: int) -> list[str]:
     registered = gym.spec(env_id.rpartition(":")[2]).max_episode_steps
     if registered is None and env.spec and env.spec.max_episode_steps == step_limit:
         found.append(f"{env_id} declares no time limit, so --max-episode-steps is {step_limit:,}")
+    running = gym.wrappers.NormalizeObservation | gym.wrappers.NormalizeReward
+    if any(isinstance(layer, running) for layer in _layers(env)):
+        found.append(f"{env_id} normalizes with statistics of its own, which tests do not share")
     return found
 
 
@@ -2026,19 +2042,20 @@ def seed_globals(seed: int) -> None:
 
 
 @contextlib.contextmanager
-def seeded_globals(seed: int) -> Iterator[None]:
-    """Seed them as :func:`seed_globals` does for some lines of code, and restore them after it.
+def kept_generators(env: Env) -> Iterator[None]:
+    """Restore after some lines of code the global generators, and those that an environment holds.
 
-    >>> with seeded_globals(1):
-    ...     first = random.random()
-    >>> with seeded_globals(1):
-    ...     random.random() == first
+    >>> first = random.getstate()
+    >>> with kept_generators(gym.make("Pendulum-v1")):
+    ...     seed_globals(1)
+    >>> random.getstate() == first
     True
     """
     torch: Any = sys.modules.get("torch")
     python, numpy = random.getstate(), np.random.get_state()
     pytorch = torch.get_rng_state() if torch else None
-    seed_globals(seed)
+    held = _held_generators(env)
+    streams = {place: copy.deepcopy(_stream(generator)) for place, generator in held.items()}
     try:
         yield
     finally:
@@ -2046,6 +2063,8 @@ def seeded_globals(seed: int) -> Iterator[None]:
         np.random.set_state(numpy)
         if torch:
             torch.set_rng_state(pytorch)
+        for place, generator in held.items():
+            _set_stream(generator, streams[place])
 
 
 def outcome(info: Mapping[str, Any]) -> float:
@@ -2175,8 +2194,8 @@ def reset_worker_signals() -> None:
 class EnvState:
     """What an environment carries from one episode to the next, to resume training.
 
-    That is the random generators of the environment, of its action space, and among the attributes
-    of its wrappers, of itself and of an environment inside it; the random streams and the counters
+    That is the random generators of the environment, of its action space, and those that its
+    wrappers, itself or an environment inside it hold; the random streams and the counters
     of its noise wrappers, the returns that RecordEpisodeStatistics remembers, and the global
     generators of ``random`` and NumPy, from which an environment may draw. Further ``generators``
     are kept with them. After loading, call :func:`set_progress` again. An environment that carries
@@ -2203,22 +2222,10 @@ class EnvState:
         return [generator for generator in found if isinstance(generator, of_numpy)]
 
     def _attributes(self) -> dict[str, Any]:
-        """Return the generators of an environment beside its np_random, by their places."""
-        layers = [*_layers(self.env), self.env.unwrapped]
-        holders = {f"{i}": layer for i, layer in enumerate(layers)}
-        for place, layer in [*holders.items()]:
-            for name, value in vars(layer).items():
-                if isinstance(value, gym.Env) and value not in layers:
-                    inside = [*_layers(value), value.unwrapped]
-                    holders |= {f"{place}.{name}.{i}": part for i, part in enumerate(inside)}
-        known, found = [id(generator) for generator in self._generators()], {}
-        kinds = np.random.Generator | np.random.RandomState | random.Random
-        for place, holder in holders.items():
-            for name, value in {} if isinstance(holder, NoiseWrapper) else vars(holder).items():
-                fixed = isinstance(value, kinds) and not isinstance(value, random.SystemRandom)
-                if fixed and id(value) not in known:
-                    found[f"{place}.{name}"] = value
-        return found
+        """Return the generators that an environment holds beside its np_random, by their places."""
+        known = [id(generator) for generator in self._generators()]
+        held = _held_generators(self.env)
+        return {place: held[place] for place in held if id(held[place]) not in known}
 
     def _returns(self) -> deque[float]:
         recorded = self.env.has_wrapper_attr("return_queue")
@@ -2231,7 +2238,7 @@ class EnvState:
             "numpy": _without_arrays(np.random.get_state(legacy=False)),
             "generators": [_stream(generator) for generator in self._generators()],
             "attributes": {place: _stream(held) for place, held in self._attributes().items()},
-            "noise": [wrapper.state_dict() for wrapper in noise_wrappers(self.env).values()],
+            "noise": [_without_arrays(w.state_dict()) for w in noise_wrappers(self.env).values()],
             "returns": [float(value) for value in self._returns()],
         }
 
@@ -2253,6 +2260,39 @@ class EnvState:
             wrapper.load_state_dict(part)
         self._returns().clear()
         self._returns().extend(state["returns"])
+
+
+def _held_generators(env: Env) -> dict[str, Any]:
+    """Return the random generators that an environment holds, by their places."""
+    layers = [*_layers(env), env.unwrapped]
+    holders = {f"{i}": layer for i, layer in enumerate(layers)}
+    for place, layer in [*holders.items()]:
+        for name, value in vars(layer).items():
+            if isinstance(value, gym.Env) and value not in layers:
+                inside = [*_layers(value), value.unwrapped]
+                holders |= {f"{place}.{name}.{i}": part for i, part in enumerate(inside)}
+    found, kinds = {}, np.random.Generator | np.random.RandomState | random.Random
+    for place, holder in holders.items():
+        for name, value in _members(holder):
+            if isinstance(value, kinds) and not isinstance(value, random.SystemRandom):
+                found[f"{place}.{name}"] = value
+    return found
+
+
+def _members(holder: Any, depth: int = 3) -> Iterator[tuple[str, Any]]:
+    """Yield what an object holds, also in its containers, its spaces and its package's objects."""
+    package = type(holder).__module__.partition(".")[0]
+    parts = vars(holder) if hasattr(holder, "__dict__") else holder
+    for name, value in [*(parts.items() if isinstance(parts, dict) else enumerate(parts))]:
+        if isinstance(holder, NoiseWrapper) and name in ("_gate", "noise"):
+            continue  # which state_dict has
+        yield str(name), value
+        few = isinstance(value, list | tuple | dict) and len(value) <= 1000
+        own = type(value).__module__.partition(".")[0] == package and hasattr(value, "__dict__")
+        goes_on = few or own or isinstance(value, gym.Space)
+        if depth and goes_on and not isinstance(value, gym.Env):
+            for inner, part in _members(value, depth - 1):
+                yield f"{name}.{inner}", part
 
 
 def _stream(generator: Any) -> Any:

@@ -435,8 +435,9 @@ def evaluate(policy, env, episodes, stop=lambda: False):
     """Play test episodes -> (N, 3): returns, lengths, noisy.outcome; None if stopped."""
     long = env.spec.max_episode_steps >= STEP_LIMIT  # there, and only there, stop() ends a test
     results = np.zeros((episodes, 3))
-    for episode in range(episodes):
-        with noisy.seeded_globals(TEST_SEED + episode):
+    with noisy.kept_generators(env):
+        for episode in range(episodes):
+            noisy.seed_globals(TEST_SEED + episode)
             observation, _ = env.reset(seed=TEST_SEED + episode)
             terminated = truncated = False
             while not (terminated or truncated):
@@ -489,7 +490,7 @@ class Run:
                 path.unlink(missing_ok=True)
         self.is_finished = result.exists()
         if any(path.exists() for path in ours):
-            self.config = self._old_config()
+            self.config = self._old_config(algorithm)
         else:
             if args.eval_frequency is None:
                 args.eval_frequency = max(1, min(EVAL_FREQUENCY, args.total_timesteps // 10))
@@ -511,16 +512,19 @@ class Run:
                 torch.compiler.reset()  # forget what earlier runs of this process compiled
                 noisy.clean_compiler_cache()
 
-    def _old_config(self):
+    def _old_config(self, algorithm):
         path = self.folder / "config.json"
         with self._reading(path):
             config = json.loads(path.read_text())
+            made_by = config["algorithm"]
             # one that an older version did not have is no difference
             old = {name: config["args"].get(name, own) for name, own in asdict(self.args).items()}
         if self.args.eval_frequency is None:
             self.args.eval_frequency = old["eval_frequency"]
         new = {k: v for k, v in asdict(self.args).items() if k not in noisy.MAY_DIFFER_IN_A_RUN}
         differ = [f"{name} {old[name]}, not {new[name]}" for name in new if old[name] != new[name]]
+        if made_by != algorithm:
+            differ = [f"algorithm {made_by}, not {algorithm}"]
         if differ:
             advice = "choose another --exp-name or --runs-dir; --overwrite deletes that run"
             fail(f"{self.folder} holds a run with {'; '.join(differ)}: {advice}")

@@ -75,7 +75,7 @@ def effects_figure(rows, metric):
     if not is_forest:
         beyond = "both" if rows[column].abs().max() > limit else "neither"
         place = {"fraction": 0.02, "pad": 0.01, "extend": beyond}
-        fig.colorbar(image, ax=axes, label=f"{quantity} ({unit})", **place)
+        fig.colorbar(image, ax=axes, label=unit, **place)
     return fig
 
 

@@ -1,5 +1,6 @@
 """The figures of analyze.py."""
 
+import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -278,7 +279,7 @@ def heatmap_figure(name, grid, dots, limit, form):
     ax.set_xticks(range(len(columns)), columns, fontsize=8, **place)
     ax.set_yticks(range(len(lines)), lines, fontsize=8)
     ax.set(xlabel=grid.columns.name, ylabel=grid.index.name)
-    ax.set_title(name, fontsize=9)
+    ax.set_title(textwrap.fill(name, 60), fontsize=9)
     return fig
 
 

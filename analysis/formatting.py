@@ -72,6 +72,8 @@ def spreads(frame):
         if name == "difference" and "pooled_std" in frame:
             spread = spread.fillna(frame["pooled_std"])
         found |= dict.fromkeys(parts, spread)
+    if "std" in found:
+        found.setdefault("difference", found["std"])
     if "difference" in found:
         found["detectable"] = found["difference"]
     if "baseline_std" in found and "noisy_std" in found:

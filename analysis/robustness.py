@@ -58,7 +58,22 @@ def read_robustness(runs_dir, runs, metric="return"):
     table = pd.DataFrame(rows, columns=RUN_COLUMNS)
     place = [table["environment"], table["condition"]]
     told = table["mean"].notna().groupby(place).transform("any")
-    return table[told].fillna({"mean": 0.0}), notes
+    table = table[told].fillna({"mean": 0.0})
+    return table, notes + incomplete_notes(table)
+
+
+def incomplete_notes(runs):
+    """Say where runs were not tested under all conditions, as when evaluate.py was interrupted."""
+    notes = []
+    for (*study, environment), group in runs.groupby([*STUDY, "environment"]):
+        played = group.groupby(["configuration", "seed"])["condition"].nunique()
+        number = group["condition"].nunique()
+        if few := (played < number).sum():
+            notes.append(
+                f"{study_name(*study)} on {environment}: {few} of {len(played)} tested runs lack "
+                f"some of the {number} test conditions; a condition counts where all runs have it"
+            )
+    return notes
 
 
 def read_episodes(path, metric="return"):
@@ -163,7 +178,12 @@ def environment_score(runs, config):
     if CLEAN not in x or CLEAN not in y:
         return None
     complete = pd.concat([x, y]).notna().all()
-    conditions = [name for name in complete.index[complete] if is_unseen(name, config)]
+    conditions = [
+        name
+        for name in complete.index[complete]
+        # a reward noise of one's own, say, changes no return
+        if is_unseen(name, config) and not (x[name].equals(x[CLEAN]) and y[name].equals(y[CLEAN]))
+    ]
     if not conditions:
         return None
     clean, percent = y[CLEAN].mean(), percent_of(1.0, y[CLEAN])

@@ -292,7 +292,7 @@ class Study:
         for e, env in enumerate(self.environments):
             tests = np.concatenate([values[..., e] for values in self.returns.values()], axis=1)
             tests = tests[:, np.isfinite(tests[-1])]
-            if tests.shape[1] > 1 and (tests == tests[0, 0]).all():
+            if tests.shape[1] > 1 and np.ptp(tests) <= 1e-12 * abs(tests).max():
                 found[env] = tests[0, 0]
         return found
 
@@ -348,7 +348,7 @@ def make_studies(runs, metric="return"):
             study.returns[run.configuration][:, *place] = getattr(run, column)[shared]
         for e, env in enumerate(envs):
             if study.phase != SEARCH and len(study.sample(BASELINE, e)) == 0:
-                notes.append(f"{name}: no finished baseline on {env}, so no improvement there")
+                notes.append(f"{name}: no finished baseline on {env}, so no comparison there")
         if study.phase.startswith(OLDER):
             notes.append(
                 f"{name} is apart, because averages over environments take the newest version of "

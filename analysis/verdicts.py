@@ -117,7 +117,8 @@ def sentence(row, unit=""):
     """Say in one sentence what a row of statistics shows; unit: of the difference."""
     where = row["environment"]
     if row["scope"] == "all":
-        where = f"all {row['environments']:.0f} environments together"
+        number = row["environments"]
+        where = f"{'both' if number == 2 else f'all {number:.0f}'} environments together"
     study = study_name(*row[STUDY])
     start = f"{study} on {where} with {row['noise']} at rate {row['noise_rate']}"
     if row["verdict"] == ALL_EQUAL:
@@ -127,7 +128,7 @@ def sentence(row, unit=""):
     evidence = f"{difference(row, unit)}, p {p_value(row['p'])}{smallest(row)}"
     if row["verdict"] == UNCLEAR:
         return f"{start} shows {UNCLEAR}: {evidence}{power(row)}.{borderline(row)}"
-    alone = ", the only comparison" if row["comparisons"] == 1 else ""
+    alone = ", the only comparison there" if row["comparisons"] == 1 else ""
     evidence += alone or corrected(row["p_adjusted"], row["comparisons"], "comparison")
     return f"{start} is {row['verdict']} than no noise: {evidence}.{borderline(row)}"
 

@@ -44,7 +44,7 @@ def test_better_needs_the_corrected_p():
     assert list(said["verdict"]) == ["better"]
     assert list(said["sentence"]) == [
         f"{WHO} 0.10 is better than no noise: +100.0 [97.2, 102.8] (+96 %), p < 0.001, "
-        "the only comparison."
+        "the only comparison there."
     ]
     five = np.arange(100.0, 105)
     same = {f"0.{i}0": five for i in range(3, 10)}
@@ -87,7 +87,7 @@ def test_few_seeds():
     _, said = judge([10.0, 11, 12, 13], {"0.10": [110.0, 111, 112, 113]})
     assert said["sentence"].iloc[0] == (
         f"{WHO} 0.10 is better than no noise: +100.0 (+870 %), p = 0.029 (smallest possible: "
-        "0.029), the only comparison."
+        "0.029), the only comparison there."
     )
     _, said = judge([10.0, 11, 12], {"0.10": [110.0, 111, 112]})
     [text] = said["sentence"]

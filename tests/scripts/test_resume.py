@@ -609,6 +609,9 @@ def test_a_folder_of_another_configuration_is_refused_until_overwritten(
     assert not differing(outcome(path.parent), alone(algorithm))
     line = refused(algorithm, [*words, "--gamma", "0.5"], capsys)  # finished: likewise
     assert "gamma" in line
+    config = path.with_name("config.json")  # of a run with the same --exp-name
+    config.write_text(config.read_text().replace('"PPO"', '"SAC"'))
+    assert "holds a run with algorithm SAC, not PPO: " in refused(algorithm, words, capsys)
 
 
 @one_script

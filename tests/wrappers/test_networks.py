@@ -16,6 +16,7 @@ from noisy_wrappers import (
     FiniteNumbers,
     NotFiniteError,
     SpaceError,
+    kept_generators,
     make_flat,
     make_noisy,
     noise_wrappers,
@@ -205,14 +206,24 @@ def test_an_env_state_has_only_pythons_own_types(make_generator):
     assert env.unwrapped.np_random.normal(size=5).tolist() == expected
 
 
-class Drawing(gym.Env):
-    """Draws from generators that are attributes, one of an environment inside it."""
+class Simulator:
+    """Part of an environment, with a generator of its own."""
 
-    observation_space = gym.spaces.Box(-9, 9, (4,), np.float64)
+    def __init__(self):
+        self.rng = np.random.default_rng(0)
+
+
+class Drawing(gym.Env):
+    """Draws from generators that it holds, in many ways, and one that a helper or space holds."""
+
+    observation_space = gym.spaces.Box(-9, 9, (7,), np.float64)
     action_space = gym.spaces.Box(-1, 1, (1,))
 
     def __init__(self):
         self.robot = gym.make("Pendulum-v1")
+        self.simulator, self.goals = Simulator(), gym.spaces.Box(-1, 1, (1,))
+        self.several = {"of one kind": [np.random.default_rng(i) for i in range(2)]}
+        self.goals.seed(0)
         self.dice = random.SystemRandom()  # nothing can restore it, and nothing fails
 
     def reset(self, *, seed=None, options=None):
@@ -222,6 +233,8 @@ class Drawing(gym.Env):
             self.python = random.Random(seed)
             self.robot.reset(seed=seed)
         drawn = [self.rng.normal(), self.old.normal(), self.python.random()]
+        drawn += [self.simulator.rng.normal(), self.goals.sample()[0]]
+        drawn.append(self.several["of one kind"][1].normal())
         return np.array([*drawn, self.robot.reset()[0][0]]), {}
 
 
@@ -235,6 +248,9 @@ def test_an_env_state_has_the_generators_among_the_attributes():
     EnvState(other).load_state_dict(saved)
     np.testing.assert_array_equal(other.reset()[0], second)
     assert (first != second).all()
+    with kept_generators(other):
+        third, _ = other.reset()
+    np.testing.assert_array_equal(other.reset()[0], third)
     del saved["attributes"]  # of a checkpoint that an earlier version wrote
     EnvState(other).load_state_dict(saved)
 

@@ -17,6 +17,7 @@ from test_action_noise import actions_env
 
 from noisy_wrappers import (
     Configuration,
+    EnvState,
     NoiseWrapper,
     make_noisy,
     parse_noise,
@@ -107,6 +108,20 @@ def test_it_is_a_wrapper_like_the_others(folder):
             "        super().__init__(env, noise_rate, longest=x)",
             "must pass x on: super().__init__(env, noise_rate, x=x)",
         ),
+        (
+            "my_noises:Child(2)",
+            "class Child(StickyAction):\n"
+            "    def __init__(self, *args, **kwargs):\n"
+            "        super().__init__(*args, **kwargs)",
+            "must name its arguments (no *args or **kwargs) and pass them on as they came",
+        ),
+        (
+            "my_noises:Degrees(90)",
+            "class Degrees(StickyAction):\n"
+            "    def __init__(self, env, noise_rate, longest):\n"
+            "        super().__init__(env, noise_rate, longest / 2)",
+            "my_noises:Degrees(45.0) would be another noise",
+        ),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line(folder, text, code, message):
@@ -189,6 +204,33 @@ def test_a_default_before_another_argument_stays(folder):
     config = Configuration.read([str(noise)], [0.5])
     assert Configuration.parse(*config.columns) == config
     assert split_noises(f"{noise}+RandomActionDelay(1)") == [str(noise), "RandomActionDelay(1)"]
+
+
+def test_a_noise_with_a_state_of_its_own_resumes(folder):
+    (folder / "my_noises.py").write_text(
+        "import numpy as np\nfrom noisy_wrappers import RewardNoise\n\n\n"
+        "class Walk(RewardNoise):\n"
+        "    def __init__(self, env, noise_rate):\n"
+        "        super().__init__(env, noise_rate)\n"
+        "        self.more = np.random.default_rng(7)\n"
+        "        self.at = np.zeros(1)\n\n"
+        "    def _perturb(self, reward):\n"
+        "        self.at = self.at + self.more.normal(size=1)\n"
+        "        return reward + self.at.item()\n\n"
+        "    def state_dict(self):\n"
+        "        return {**super().state_dict(), 'at': self.at, 'last': self.at[0]}\n\n"
+        "    def load_state_dict(self, state):\n"
+        "        super().load_state_dict(state)\n"
+        "        self.at = np.array(state['at'])\n"
+    )
+    envs = [make_noisy(GenericEnv(), ["my_noises:Walk()"], [1.0]) for _ in range(2)]
+    envs[0].reset(seed=1)
+    envs[0].step(0)
+    saved = json.loads(json.dumps(EnvState(envs[0]).state_dict()))
+    envs[1].reset(seed=1)
+    EnvState(envs[1]).load_state_dict(saved)
+    first, second = ([env.reset(), env.step(0)[1]][1] for env in envs)
+    assert first == second
 
 
 def test_the_observation_and_reward_bases_are_for_everybody(folder):
