@@ -130,7 +130,9 @@ def parser_of(algorithm):
         if flag in GIVEN_BY_THE_GRID:
             continue
         how = {"type": float if "float" in kind else whole_number}
-        if kind == "bool":
+        if "None" in kind:
+            how = {"type": functools.partial(unless_none, how["type"])}
+        elif kind == "bool":
             how = {"action": argparse.BooleanOptionalAction}
         elif kind.startswith("Literal"):
             how = {"choices": ast.literal_eval(kind.removeprefix("Literal"))}
@@ -207,6 +209,14 @@ def whole_number(text):
     except (ValueError, OverflowError):
         pass
     raise argparse.ArgumentTypeError(f"{text!r} is not a whole number, such as 1000000 or 1e6")
+
+
+def unless_none(read, text):
+    """Read "None", or what `read` reads."""
+    try:
+        return None if text == "None" else read(text)
+    except ValueError:  # without a message of its own
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
 
 
 def seeds(text):

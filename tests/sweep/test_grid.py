@@ -289,6 +289,8 @@ def test_misspelt_options_are_refused_where_nothing_is_to_do(tmp_path):
         "--compile=False": "--compile/--no-compile: ignored explicit argument 'False'",
         "--tau abc": "--tau: invalid float value: 'abc'",
         "--batch-size 1.5e0": "--batch-size: '1.5e0' is not a whole number, such as 1000000 or 1e6",
+        "--eval-frequency often": "--eval-frequency: 'often' is not a whole number, such as "
+        "1000000 or 1e6",
         "--batch-size 0": "--batch-size must be at least 1, not 0",
         "--gamma 1.1": "--gamma must be at most 1, not 1.1",
         "--matmul-precision low": "--matmul-precision: invalid choice: 'low' (choose from highest, "
@@ -306,7 +308,8 @@ def test_the_grid_reads_options_as_the_scripts_do(algorithm, monkeypatch):
         "",
         "--gamma 0.5 --eval_episodes=3 --no-compile --matmul_precision medium",
         "--gamma=.5 --gamma 1 --cuda --no_overwrite --max-episode-steps 1_000",
-        "--gamma 0 --torch-threads=1000 --checkpoint-frequency 1e5",
+        "--gamma 0 --torch-threads=1000 --checkpoint-frequency 1e5 --eval-frequency None",
+        "--eval-frequency=2e3 --max-episode-steps None",
     ):
         monkeypatch.setattr("sys.argv", ["script", *words.split()])
         read = vars(script.read_args())
@@ -379,6 +382,7 @@ def test_the_grid_reads_options_as_the_scripts_do(algorithm, monkeypatch):
         ),
         ("demo --total-timesteps 0", "--total-timesteps must be at least 1, not 0"),
         ("demo -- --num-steps 63", "--num-steps must be from 2 * --num-minibatches (64) to"),
+        ("demo -- --target-kl abc", "--target-kl: 'abc' is not a number"),
         ("demo -- --help", "ppo_continuous_noisy.py has no option --help"),
         ("demo -- --seed 2", "--seed is part of the grid: use --seeds, before the --"),
         ("demo -- --exp-name my_ppo", "--exp-name is part of the grid: use --runs-dir, before"),
