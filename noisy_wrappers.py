@@ -1631,11 +1631,12 @@ def _interval(low: float, high: float, least: float = -math.inf) -> tuple[float,
 
 def _whole_interval(low: int | None, high: int | None, least: int) -> tuple[int, int]:
     """Check two numbers of steps; the second is the first by default."""
-    ends = [_without_arrays(end) for end in (low, low if high is None else high)]
-    for name, end in zip(("low", "high"), ends, strict=True):
+    given = (low, low if high is None else high)
+    ends = list(map(_without_arrays, given))
+    for name, end, value in zip(("low", "high"), ends, given, strict=True):
         whole = isinstance(end, numbers.Integral) and not isinstance(end, bool)
         if not (whole and least <= end < 2**63):  # Generator.integers draws 64-bit integers
-            raise ValueError(f"{name} must be an integer in [{least}, 2**63), got {end!r}")
+            raise ValueError(f"{name} must be an integer in [{least}, 2**63), got {value!r}")
     low, high = map(int, ends)
     if low > high:
         raise ValueError(f"low must not exceed high, got low={low}, high={high}")
@@ -2055,7 +2056,7 @@ def kept_generators(env: Env) -> Iterator[None]:
     python, numpy = random.getstate(), np.random.get_state()
     pytorch = torch.get_rng_state() if torch else None
     held = _held_generators(env)
-    streams = {place: copy.deepcopy(_stream(generator)) for place, generator in held.items()}
+    streams = {place: _stream(generator) for place, generator in held.items()}
     try:
         yield
     finally:

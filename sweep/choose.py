@@ -119,7 +119,7 @@ def follow(args, algorithm, env_id, environment):
         fail(f"--budget {budget} is too large: the best noises would run with {last_seed} seeds")
     fresh = range(halving.FIRST_CONFIRMATION_SEED, halving.FIRST_CONFIRMATION_SEED + args.confirm)
     for seed in fresh:  # which other choices in this folder may have run: with the same options?
-        read(make_run(args, algorithm, env_id, BASELINE, seed, CONFIRMATION))
+        result(make_run(args, algorithm, env_id, BASELINE, seed, CONFIRMATION))
     state, runs, tests, returns = walk(args, algorithm, env_id, noises, budget)
     folders = {steps: runs[key].folder for key, (steps, _) in tests.items()}
     if len(folders) > 1:  # then their scores do not compare

@@ -84,8 +84,7 @@ def test_bad_parameters():
             WRAPPERS[name](constant_env(), rate, *args, **kwargs)
         message = str(error.value)
         assert re.search(rf"\b{parameter}\b", message), (name, args, kwargs, message)
-        plain = value.item() if isinstance(value, np.generic) else value
-        assert repr(value) in message or repr(plain) in message, (name, args, kwargs, message)
+        assert repr(value) in message, (name, args, kwargs, message)
 
 
 @pytest.mark.parametrize("text", NOISES)
