@@ -191,10 +191,9 @@ def candidates(args, algorithm, env_id, tried=()):
     """
     noises = dict.fromkeys(configurations(args, algorithm, env_id))
     noises.pop(BASELINE, None)  # at rate 0 a noise is none
-    for pairs in args.exclude:
-        if any(rate is None for _, rate in pairs):
-            fail('--exclude needs a rate with each noise, as in "NOISE@0.1"')
-        excluded = configuration_of(pairs)
+    if any(rate is None for pairs in args.exclude for _, rate in pairs):
+        fail('--exclude needs a rate with each noise, as in "NOISE@0.1"')
+    for excluded in set(map(configuration_of, args.exclude)):
         if excluded not in noises:
             fail(f"--exclude: {excluded} is not among the noises")
         del noises[excluded]

@@ -95,8 +95,9 @@ def check(args):
     if args.preset == "choose" and args.seeds:
         fail("choose picks its own seeds: leave out --seeds; see --budget and --confirm")
     args.options = {algorithm: script_options(algorithm, args.extra) for algorithm in args.algos}
+    ours = {"total_timesteps": args.total_timesteps, "torch_threads": 1}  # more, elsewhere
+    ours["seed"] = max((seeds[-1] for seeds in args.seeds or ()), default=0)
     for options in args.options.values():
-        ours = {"total_timesteps": args.total_timesteps, "torch_threads": 1}  # more, elsewhere
         try:
             check_numbers(options | ours)
         except ValueError as error:

@@ -491,7 +491,8 @@ def test_an_excluded_noise_is_no_other_choice(tmp_path):
     excluded = f"{words} | --exclude | RandomEarlyTermination(50)@1"
     [choice] = choose.choices(arguments(excluded, tmp_path))
     assert len(choice.returns) == 19
-    excluded += f" | --exclude | {A}@1"  # as `report` prints it, a line for each noise that fails
+    # as `report` prints it, a line for each noise that fails
+    excluded += f" | --exclude | {A}@1 | {A}@1.0"
     [choice] = choose.choices(arguments(excluded, tmp_path))
     assert len(choice.returns) == 18
 

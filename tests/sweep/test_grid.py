@@ -364,6 +364,7 @@ def test_the_grid_reads_options_as_the_scripts_do(algorithm, monkeypatch):
         ),
         ("demo --seeds 1,2,3", "separated by spaces: 1 2 3 or 1-3, not '1,2,3'"),
         ("demo --seeds 1-", "not '1-'"),
+        (f"demo --seeds 1-{2**63}", f"--seed must be at most {2**63 - 1}, not {2**63}"),
         ("demo --total-timesteps 1.5", "'1.5' is not a whole number, such as 1000000 or 1e6"),
         ("demo --total-timesteps inf", "'inf' is not a whole number"),
         ("demo --seed 1", "unknown option --seed; did you mean --seeds?"),
