@@ -177,6 +177,7 @@ def write_table(out, table, latex=False):
     (out / f"{table.name}.md").write_text(f"{table.caption}\n\n{markdown}\n{note}", "utf-8")
     lines = tabulate(text.values, text.columns, tablefmt="latex_longtable", disable_numparse=True)
     caption = table.caption.replace("%", r"\%")
+    lines = lines.replace("{}", f"{{{len(text.columns) * 'l'}}}", 1)  # if it has no rows
     lines = lines.replace("\n", f"\n\\caption{{{caption}}}\\\\\n", 1)
     for sign, command in (("\u00b1", r"$\pm$"), ("\u2013", "--"), (" < ", " $<$ ")):
         lines = lines.replace(sign, command)

@@ -71,7 +71,8 @@ def incomplete_notes(runs):
         if few := (played < number).sum():
             notes.append(
                 f"{study_name(*study)} on {environment}: {few} of {len(played)} tested runs lack "
-                f"some of the {number} test conditions; a condition counts where all runs have it"
+                f"some of the {number} test conditions; a condition counts where all runs that are "
+                "compared have it"
             )
     return notes
 
@@ -252,7 +253,7 @@ def robustness_sentences(scores, metric):
             limit = f"; {verdicts.counted(row.n, 'seed')} against {row.n_baseline} cannot show any"
         elif not verdicts.significant(row.p) and row.detectable > 0:
             found = rounded(row.detectable, verdicts.spread_of(row)) + unit
-            limit = f"; a difference of {found} would have been seen (80 % power)"
+            limit = f"; a difference of {found} could have been seen (80 % power before Holm)"
         if pd.notna(row.clean_change_percent):
             evidence += f"; clean return {verdicts.percent(row.clean_change_percent)}"
         yield f"{start}: {shown} ({evidence}){limit}.{verdicts.borderline(row)}"

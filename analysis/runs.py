@@ -134,22 +134,27 @@ def leave_out_different(runs):
             differing = folders.difference(own, usual)
             if differing:
                 said = ", ".join(f"{name} is {own[name]}, not {usual[name]}" for name in differing)
-                said += f" as in most runs of {exp_name}: give such runs another --exp-name"
+                said += (
+                    f" as in the runs of {exp_name} that count: give such runs another --exp-name"
+                )
                 runs.loc[index, ["status", "reason"]] = ["different", said]
 
 
 def usual_settings(settings):
-    """Return the most frequent value of every argument of a study.
+    """Return the most frequent arguments of a study.
 
     settings: a dict for each run. An argument that a run lacks, because an older version made it,
-    is no difference. Of equally frequent values, that of the longest runs is taken.
+    is no difference: it has that argument's most frequent value. Of equally frequent ones, those of
+    the longest runs are taken.
     """
-    counts = defaultdict(Counter)  # argument -> how many runs have a value, as text
-    for run in sorted(settings, key=lambda run: -run.get("total_timesteps", 0)):
+    longest_first = sorted(settings, key=lambda run: -run.get("total_timesteps", 0))
+    values = defaultdict(Counter)  # argument -> how many runs have a value, as text
+    for run in longest_first:
         for name, value in run.items():
-            counts[name][json.dumps(value)] += 1
-    # of equals, the first one counted
-    return {name: json.loads(values.most_common(1)[0][0]) for name, values in counts.items()}
+            values[name][json.dumps(value)] += 1
+    usual = {name: json.loads(counts.most_common(1)[0][0]) for name, counts in values.items()}
+    whole = Counter(json.dumps(usual | run) for run in longest_first)
+    return json.loads(whole.most_common(1)[0][0])  # of equals, the first one counted
 
 
 def set_older_versions_apart(runs):
@@ -162,8 +167,8 @@ def set_older_versions_apart(runs):
     version = parts["version"].fillna(-1).astype(int)
     finished = version.where(ours["status"] == "finished")  # NaN if it is not
     newest = finished.groupby([*(ours[name] for name in STUDY), parts["name"]]).transform("max")
-    older = parts.loc[version < newest, "version"].fillna("")
-    runs.loc[older.index, "phase"] = f"{OLDER} v" + older
+    older = parts.loc[version < newest, "version"]
+    runs.loc[older.index, "phase"] = f"{OLDER} " + ("v" + older).fillna("without version")
 
 
 def failed_without_a_folder(runs_dir):

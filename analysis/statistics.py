@@ -206,16 +206,15 @@ def welch_t(values, chosen):
         return np.nan_to_num(difference / error, nan=0, posinf=inf, neginf=-inf)
 
 
-@np.errstate(invalid="ignore")  # inf - inf
 def permutation_t(x, y):
-    """Two-sided permutation test with Welch's t, over environments with the mean of their t.
+    """Two-sided permutation test with Welch's t, over environments with the mean of its scores.
 
     Exact where the two distributions are equal, and for many seeds valid where only the means are
     (Janssen, 1997, https://doi.org/10.1016/S0167-7152(97)00043-6; Chung and Romano, 2013,
     https://doi.org/10.1214/13-AOS1090). The runs of each environment are divided on their own.
 
-    x, y: samples of the same environments -> t, p, the smallest p that is possible with so many
-    seeds; t and p are NaN where an environment has fewer than two seeds on a side.
+    x, y: samples of the same environments -> t or the mean score, p, the smallest p that is
+    possible with so many seeds; all but the last NaN where there are fewer than two on a side.
     """
     pairs = list(zip(columns(x), columns(y), strict=True))
     sizes = [(len(a), len(b)) for a, b in pairs]
@@ -226,19 +225,29 @@ def permutation_t(x, y):
         welch_t(np.concatenate(pair)[:, None], partitions(*size))[:, 0]
         for pair, size in zip(pairs, sizes, strict=True)
     ]
+    if len(ts) > 1:
+        ts = list(map(normal_scores, ts))
     if len(ts) == 1 or ways <= MOST_PARTITIONS:
         null = reduce(lambda a, b: np.add.outer(a, b).ravel(), ts)
     else:
         rng = np.random.default_rng(0)
         null = sum(np.append(t[0], drawn(t, rng)) for t in ts)
-    null = np.nan_to_num(null, nan=0, posinf=inf, neginf=-inf)
     above, below = tails(null)
     smallest = 2 / min(ways, 1 + RANDOM_PARTITIONS)
     return null[0] / len(pairs), min(1.0, 2 * min(above, below)), min(1.0, smallest)
 
 
+def normal_scores(t):
+    """Return the normal quantile of the rank of each t (partitions,) in one environment.
+
+    So every environment counts alike. t itself is huge, or infinite, where runs hardly differ.
+    """
+    ranks = scipy.stats.rankdata(np.round(t, 9))  # equal up to rounding is equal
+    return scipy.special.ndtri((ranks - 0.5) / len(t))
+
+
 def drawn(t, rng):
-    """Draw RANDOM_PARTITIONS of one environment's t, in another order than in the others."""
+    """Draw RANDOM_PARTITIONS of one environment's scores, in another order than in the others."""
     if len(t) > RANDOM_PARTITIONS:  # they are random, after the actual one
         return rng.permutation(t[1:])
     return rng.choice(t, RANDOM_PARTITIONS)
@@ -247,7 +256,7 @@ def drawn(t, rng):
 def tails(null):
     """Return the shares of t (partitions, ...) that are at least, and at most, the first one."""
     # equal up to rounding is equal
-    margin = 1e-9 * np.where(np.isfinite(null[0]), abs(null[0]), 0)
+    margin = 1e-9 * np.where(np.isfinite(null[0]), 1 + abs(null[0]), 0)
     return (null >= null[0] - margin).mean(axis=0), (null <= null[0] + margin).mean(axis=0)
 
 
@@ -262,9 +271,9 @@ class Comparison(NamedTuple):
     difference_low: float  # its 95 % interval
     difference_high: float
     difference_percent: float  # of |mean without noise|; over environments the mean
-    effect_size: float  # the difference in pooled_std; over environments the mean
+    effect_size: float  # the difference in pooled_std; over environments the median
     pooled_std: float  # sqrt((variance with noise + variance without) / 2)
-    t: float  # Welch's; over environments the mean
+    t: float  # Welch's; over environments the mean of normal_scores
     p: float
     smallest_p: float  # that is possible with these numbers of seeds
     detectable: float  # difference that these seeds find with 80 % power, before a correction
@@ -280,7 +289,7 @@ def compare(x, y):
     percents = list(map(percent_of, differences, ys))
     with np.errstate(divide="ignore", invalid="ignore"):
         effects = np.where(differences == 0, 0 * stds, differences / stds)
-        effect = effects.mean()  # of inf and -inf there is none
+        effect = np.median(effects)  # of inf and -inf there is none
     difference = low = high = std = detectable = needed = nan
     n, m = min(map(len, xs)), min(map(len, ys))
     if len(pairs) == 1:
@@ -300,7 +309,7 @@ def steps_to_reach(curves, steps, target):
     curves = curves[:, np.isfinite(curves).all(axis=0)]
     means = curves.mean(axis=1)
     # The last mean of the baseline is its own target, but rounding depends on the order of a sum.
-    reached = np.flatnonzero((means >= target) | np.isclose(means, target, rtol=1e-9))
+    reached = np.flatnonzero((means >= target) | np.isclose(means, target, rtol=1e-9, atol=0))
     return steps[reached[0]] if len(reached) else np.nan
 
 

@@ -71,9 +71,9 @@ def difference(row, unit=""):
     unit: of the difference, such as POINTS.
     """
     if pd.isna(row.difference):
-        text = f"{row.effect_size:+z.2f} standard deviations on average"
+        text = f"{row.effect_size:+z.2f} standard deviations (median of the environments)"
         if pd.isna(row.effect_size):
-            text = "effects that have no mean"
+            text = "effects that have no median"
     else:
         spread = spread_of(row)
         text = rounded(row.difference, spread)
@@ -117,8 +117,7 @@ def sentence(row, unit=""):
     """Say in one sentence what a row of statistics shows; unit: of the difference."""
     where = row["environment"]
     if row["scope"] == "all":
-        number = row["environments"]
-        where = f"{'both' if number == 2 else f'all {number:.0f}'} environments together"
+        where = f"{row['environments']:.0f} environments together"
     study = study_name(*row[STUDY])
     start = f"{study} on {where} with {row['noise']} at rate {row['noise_rate']}"
     if row["verdict"] == ALL_EQUAL:
@@ -184,7 +183,7 @@ def luck_sentence(best):
     if best.empty:
         return ""
     if not (best["difference"] > 0).any():
-        return "Nothing that was tried has a higher mean return than no noise."
+        return "Nothing that was tried has a higher mean than no noise."
     tried = set(best["chosen_from"])
     number = "as many" if len(tried) > 1 else f"{max(tried):.0f}"
     rivals = f"the best of {number} useless noises would"
@@ -216,7 +215,7 @@ def headlines(statistics, best):
         noises = counted(len(rows.drop_duplicates(["noise", "noise_rate"])), "noise")
         tried = f"{noises} in {counted(alone['environment'].nunique(), 'environment')}"
         if together:
-            tried += f", {together} in all environments together"
+            tried += f", {together} in several environments together"
         if len(rows) > 1:
             tried = f"{counted(len(rows), 'comparison')} ({tried})"
         found = rows["verdict"].value_counts()

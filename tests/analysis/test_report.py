@@ -184,7 +184,7 @@ def test_the_counts_at_the_top_are_those_of_the_list(tmp_path):
     run(tmp_path)
     page = (tmp_path / "results/report.html").read_text()
     top, listed = page.split("</h1>")[1].split("<ul>", 1)
-    assert "3 comparisons (1 noise in 2 environments, 1 in all environments together)" in top
+    assert "3 comparisons (1 noise in 2 environments, 1 in several environments together)" in top
     assert "3 better" in top and listed.split("</ul>")[0].count("<li>") == 3
 
 
@@ -205,7 +205,7 @@ def test_of_many_versions_is_said_at_the_end(tmp_path):
             [-5, 0],
             [0.9, 1],
             [3, 3],
-            "Nothing that was tried has a higher mean return than no noise.",
+            "Nothing that was tried has a higher mean than no noise.",
         ),
         ([5], [0.3], [1], "The best noise looks no better than one useless noise might."),
         (

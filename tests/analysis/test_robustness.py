@@ -204,7 +204,7 @@ def test_sentences_say_what_the_seeds_could_have_shown(tmp_path, capsys):
     run(tmp_path, out="four")
     error = np.std([78, 79, 81, 82], ddof=1) / 2 / 2  # of the score: the mean of two conditions
     shift = analysis.statistics.detectable_shift(4, 4) / np.sqrt(0.5)
-    limit = f"; a difference of {shift * error:.2f} would have been seen (80 % power)."
+    limit = f"; a difference of {shift * error:.2f} could have been seen (80 % power before Holm)."
     assert limit in capsys.readouterr().out
     for folder in (tmp_path / "runs").glob(f"*{PUSH}*__[34]"):
         shutil.rmtree(folder)
@@ -284,7 +284,7 @@ def test_heatmap(tmp_path):
     [note] = notes
     assert note == (
         "PPO on Hopper-v5: 4 of 12 tested runs lack some of the 8 test conditions; a condition "
-        "counts where all runs have it"
+        "counts where all runs that are compared have it"
     )
 
     ax = drawn[heatmap].draw().axes[0]

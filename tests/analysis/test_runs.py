@@ -51,6 +51,14 @@ def reasons(runs):
     return dict(zip(different["seed"], different["reason"], strict=True))
 
 
+def test_a_study_has_arguments_that_some_of_its_runs_have(tmp_path):
+    for seed in range(1, 11):
+        gamma, values = (0.99, [10, 20]) if seed <= 4 else (0.9, [5] if seed <= 7 else [5, 6, 7])
+        write_run(tmp_path / "runs", values, seed=seed, gamma=gamma)
+    runs = read_runs(tmp_path / "runs")
+    assert set(runs.loc[runs["status"] == "finished", "seed"]) == {1, 2, 3, 4}
+
+
 def test_the_most_frequent_arguments_of_an_exp_name_are_its_study(tmp_path, capsys):
     for seed in (1, 2, 3):
         write_run(tmp_path / "runs", [10, 20], seed=seed)
@@ -61,8 +69,8 @@ def test_the_most_frequent_arguments_of_an_exp_name_are_its_study(tmp_path, caps
     runs = read_runs(tmp_path / "runs")
     [reason] = reasons(runs).values()
     assert reason == (
-        "gamma is 0.9, not 0.99, total_timesteps is 10000, not 20000 as in most runs of "
-        "sac_continuous_noisy: give such runs another --exp-name"
+        "gamma is 0.9, not 0.99, total_timesteps is 10000, not 20000 as in the runs of "
+        "sac_continuous_noisy that count: give such runs another --exp-name"
     )
     studies, _ = make_studies(runs)
     assert [study.name for study in studies] == ["SAC", "SAC [trial]"]

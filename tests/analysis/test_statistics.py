@@ -75,7 +75,8 @@ def test_over_environments_every_one_is_divided_on_its_own():
             for chosen in combinations(range(len(values)), len(a)):
                 split = values[list(chosen)], np.delete(values, chosen)
                 ts.append(stats.ttest_ind(*split, equal_var=False).statistic)
-            null = np.add.outer(null, ts).ravel()
+            scores = stats.norm.ppf((stats.rankdata(ts) - 0.5) / len(ts))
+            null = np.add.outer(null, scores).ravel()
         assert len(null) == 10 * 35
         tails = (null >= null[0] - 1e-9).mean(), (null <= null[0] + 1e-9).mean()
         t, p, smallest = statistics.permutation_t(stacked(*x), stacked(*y))
@@ -101,9 +102,28 @@ def test_random_divisions_where_there_are_too_many(monkeypatch):
 
 def test_infinite_ts_of_two_environments_cancel():
     x, y = stacked([1, 1, 1], [0, 0, 0]), stacked([0, 0, 0], [1, 1, 1])
-    assert statistics.permutation_t(x, y)[:2] == (0, 1)
+    t, p, _ = statistics.permutation_t(x, y)
+    assert t == pytest.approx(0) and p == 1
     found = statistics.compare(x, y)
     assert found.p == 1 and np.isnan(found.effect_size)
+
+
+def test_an_environment_where_runs_hardly_differ_decides_no_more_than_others():
+    rng = np.random.default_rng(1)
+    worse = [(rng.normal(60, 10, 5), rng.normal(100, 10, 5)) for _ in range(4)]
+    for spread in (0, 1e-6, 0.01):
+        better = 201 + spread * rng.normal(size=5), 200 + spread * rng.normal(size=5)
+        comparison = statistics.compare(
+            *(stacked(*side) for side in zip(*worse, better, strict=True))
+        )
+        assert comparison.t < 0 and comparison.effect_size < -1
+        assert comparison.p < 0.01
+
+
+def test_noise_that_always_solves_what_was_never_solved_is_as_clear_as_can_be():
+    x, y = stacked(*5 * [[100] * 5]), stacked(*5 * [[0] * 5])
+    comparison = statistics.compare(x, y)
+    assert comparison.p == comparison.smallest_p == pytest.approx(2e-5)
 
 
 # ------------------------------------------------------------------------------------- comparisons
