@@ -120,8 +120,13 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     kind: ClassVar[str]  # what it perturbs: "observation", "reward", "action" or "dynamics"
 
     def __init__(self, env: Env, noise_rate: float | str, **parameters: Any):
-        """Raise ValueError unless noise_rate is in [0, 1] or "start:end" of two such rates."""
+        """Raise ValueError unless noise_rate is in [0, 1] or "start:end" of two such rates.
+
+        Nor may ``env`` reset itself, by ``gymnasium.wrappers.Autoreset``.
+        """
         gym.Wrapper.__init__(self, env)
+        if any(isinstance(layer, gym.wrappers.Autoreset) for layer in _layers(env)):
+            raise ValueError("noise must see every reset: apply gymnasium.wrappers.Autoreset last")
         self.schedule = _schedule(noise_rate)
         self._training_progress = 0.0
         self._noise_rate = self.schedule[0]
@@ -303,7 +308,7 @@ class ObservationNoise(NoiseWrapper):
             return observation, info
         given = self._numbers(observation)
         noisy = self._with_numbers(observation, self._perturb(given))
-        if (self._numbers(noisy) != given).any():
+        if not np.array_equal(self._numbers(noisy), given, equal_nan=True):
             info = self.mark(info)
         return noisy, info
 
@@ -512,6 +517,8 @@ class RandomMixupObservation(ObservationNoise):
 
     def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
         assert self._previous is not None
+        if self.factor in (0, 1):  # 0 * inf would be NaN
+            return (observation if self.factor else self._previous).copy()
         mixture = self.factor * observation + (1 - self.factor) * self._previous
         low, high = np.minimum(observation, self._previous), np.maximum(observation, self._previous)
         return np.clip(mixture, low, high)  # rounding must not leave the observation space
@@ -558,7 +565,7 @@ class RewardNoise(NoiseWrapper):
         if self.acts():
             given: Any = reward.item() if isinstance(reward, np.ndarray) else reward
             reward = self._perturb(given)
-            if reward != given:
+            if reward != given and not math.isnan(given):
                 info = self.mark(info)
         return observation, reward, terminated, truncated, info
 
@@ -873,9 +880,10 @@ class RandomDynamics(NoiseWrapper):
         super().__init__(env, noise_rate, low=self.low, high=self.high, fields=self.fields)
         if any(isinstance(layer, RandomDynamics) for layer in _noise_layers(env)):
             raise ValueError("this environment has RandomDynamics already: name all fields in one")
-        self._changed: Any = None  # the model that is not as it was, and its values before
+        self._chosen = False  # the episode
         self._scratch: Any = None  # a model, and data to compute with
         if not isinstance(env, _ProbeEnv):
+            self._restore()  # what another wrapper has left of this environment
             model = self._model()
             for field in self.fields:
                 if not getattr(model, field).any():
@@ -891,17 +899,18 @@ class RandomDynamics(NoiseWrapper):
         if seed is not None:
             self._seed(seed)  # before the environment's own reset, which needs the new model
         model = self._model()
-        factors = {
-            field: self.noise.uniform(self.low, self.high, len(getattr(model, field)))
-            for field in self.fields
-        }
-        chosen = self.acts() and any((values != 1).any() for values in factors.values())
-        if chosen:
+        factors = self._draw(model)
+        self._chosen = self.acts() and any((values != 1).any() for values in factors.values())
+        if self._chosen:
             self._scale(model, factors)
             scaled = {field: getattr(model, field).copy() for field in self.fields}
         observation, info = self.env.reset(seed=seed, options=options)
-        if chosen:
-            if self._model() is not model:  # the environment has built a new one
+        if self._chosen:
+            if self._model() is not model:  # the environment has built or taken another one
+                self._restore()
+                rows = {field: len(getattr(self._model(), field)) for field in self.fields}
+                if rows != {field: len(values) for field, values in factors.items()}:
+                    factors = self._draw(self._model())
                 self._scale(self._model(), factors)
             elif own := [name for name in scaled if (getattr(model, name) != scaled[name]).any()]:
                 raise ValueError(
@@ -914,9 +923,16 @@ class RandomDynamics(NoiseWrapper):
     def step(self, action: Any) -> Step:
         """Step the environment; every step of a chosen episode is a perturbed one."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        if self._changed:
+        if self._chosen:
             info = self.mark(info)
         return observation, reward, terminated, truncated, info
+
+    def _draw(self, model: Any) -> dict[str, NDArray[Any]]:
+        """Return factors for all rows of the fields."""
+        return {
+            field: self.noise.uniform(self.low, self.high, len(getattr(model, field)))
+            for field in self.fields
+        }
 
     def _model(self) -> Any:
         """Return the environment's mujoco.MjModel."""
@@ -939,7 +955,8 @@ class RandomDynamics(NoiseWrapper):
         arrays = {name: getattr(model, name, None) for name in (*scaled, *_DERIVED_FIELDS)}
         nominal = {name: array.copy() for name, array in arrays.items() if array is not None}
         statistics = {name: np.copy(getattr(model.stat, name)) for name in _STATISTICS}
-        self._changed = model, nominal, statistics
+        # the environment has them, because another wrapper of it may have to restore them
+        self.unwrapped._unscaled_model = model, nominal, statistics
         for name, values in scaled.items():
             arrays[name][:] = (nominal[name].T * values).T
         # In data of its own, made once: the environment's are left as they are until its reset.
@@ -950,13 +967,13 @@ class RandomDynamics(NoiseWrapper):
             setattr(model.stat, name, statistics[name])
 
     def _restore(self) -> None:
-        if self._changed:
-            model, nominal, statistics = self._changed
+        if changed := getattr(self.unwrapped, "_unscaled_model", None):
+            model, nominal, statistics = changed
             for name, values in nominal.items():
                 getattr(model, name)[:] = values
             for name, value in statistics.items():
                 setattr(model.stat, name, value)
-            self._changed = None
+            self.unwrapped._unscaled_model = None
 
 
 # -------------------------------------------------------------------- noises in words, and combined
@@ -1476,7 +1493,9 @@ def _words(noise: str) -> str:
     """Return a noise as a part of a file's name; different noises have different ones."""
     plain = noise.replace("=(", "=").replace("', '", "-").replace("'", "")  # keys=a-b
     words = safe_name("_".join(re.findall(r"[^(), ]+", plain)))
-    if re.sub(r"'[A-Za-z_][A-Za-z0-9_.]*'", "", noise).count("'"):  # a key that is no plain name
+    name, _, arguments = noise.partition("(")
+    odd = "'" in re.sub(r"'[A-Za-z_][A-Za-z0-9_.]*'", "", noise)  # a key that is no plain name
+    if odd or (":" in name and re.search(r"""[(\[{'"]""", arguments)):  # own, not numbers only
         words += "_" + hashlib.sha256(noise.encode()).hexdigest()[:8]
     return words
 
@@ -1679,8 +1698,8 @@ def _fields(fields: Any) -> tuple[str, ...]:
         if field not in _USUAL_FIELDS and not _is_field(field):
             usual = ", ".join(_USUAL_FIELDS)
             raise ValueError(
-                f"fields: {field!r} is not given in MuJoCo's model for each body, geom, joint, "
-                f"degree of freedom, actuator or tendon; usual are {usual}"
+                f"fields: {field!r} cannot be scaled for each body, geom, contact pair, joint, "
+                f"degree of freedom, actuator or tendon of MuJoCo's model; usual are {usual}"
             )
     if {"body_mass", "body_inertia"} <= set(found):
         raise ValueError("fields: body_mass takes body_inertia along, so name one of them")
@@ -1692,8 +1711,11 @@ def _is_field(name: Any) -> bool:
         import mujoco
     except ImportError:  # then there is no environment to apply it to, either
         return False
-    rows = ("body_", "geom_", "jnt_", "dof_", "actuator_", "tendon_")
-    if not isinstance(name, str) or not name.startswith(rows) or name in _DERIVED_FIELDS:
+    rows = ("body_", "geom_", "pair_", "jnt_", "dof_", "actuator_", "tendon_")
+    shapes = ("pos", "quat", "size", "axis", "aabb", "rbound")  # others depend on these
+    if not isinstance(name, str) or not name.startswith(rows) or name.endswith(shapes):
+        return False
+    if name in _DERIVED_FIELDS:
         return False
     array = getattr(mujoco.MjModel.from_xml_string("<mujoco/>"), name, None)
     return isinstance(array, np.ndarray) and array.dtype == np.float64
@@ -2199,8 +2221,8 @@ class EnvState:
     wrappers, itself or an environment inside it hold; the random streams and the counters
     of its noise wrappers, the returns that RecordEpisodeStatistics remembers, and the global
     generators of ``random`` and NumPy, from which an environment may draw. Further ``generators``
-    are kept with them. After loading, call :func:`set_progress` again. An environment that carries
-    anything else from one episode to the next does not resume exactly.
+    are kept with them. After loading, call :func:`set_progress`, or assign a rate, again. An
+    environment that carries anything else from one episode to the next does not resume exactly.
 
     >>> env = make_noisy(gym.make("Pendulum-v1"), ["RandomNormalNoisyObservation(1)"], [0.5])
     >>> _ = env.reset(seed=1)

@@ -136,6 +136,55 @@ def test_a_model_that_is_built_in_reset():
     np.testing.assert_array_equal(env.model.body_mass, mass)
 
 
+class Choosing(Cart):
+    """An environment with two models, or several of different size, one for each episode."""
+
+    def __init__(self, *worlds):
+        super().__init__()
+        worlds = worlds or (MODEL, MODEL.replace('size="0.05"', 'size="0.06"'))
+        self.models = [mujoco.MjModel.from_xml_string(text) for text in worlds]
+        self.episode = -1
+        self.choose()
+
+    def choose(self):
+        self.episode += 1
+        self.model = self.models[self.episode % len(self.models)]
+        self.data = mujoco.MjData(self.model)
+
+    def reset(self, **kwargs):
+        self.choose()
+        return super().reset(**kwargs)
+
+
+def test_models_that_reset_chooses_from():
+    env = Choosing()
+    masses = [model.body_mass.copy() for model in env.models]
+    noisy = RandomDynamics(env, 1.0, 1.3, 1.3)
+    for episode in range(5):
+        noisy.reset(seed=0)
+        chosen = (episode + 1) % 2
+        np.testing.assert_array_equal(env.models[chosen].body_mass, 1.3 * masses[chosen])
+        np.testing.assert_array_equal(env.models[1 - chosen].body_mass, masses[1 - chosen])
+
+
+def test_a_model_of_another_size_has_factors_of_its_own():
+    ball = '<body name="second" pos="1 1 2"><geom size="0.1"/></body></worldbody>'
+    env = Choosing(MODEL, MODEL.replace("</worldbody>", ball))
+    noisy = RandomDynamics(env, 1.0, 0.5, 1.5)
+    bodies = [len(noisy.reset(seed=1)[1]["dynamics"]["body_mass"]) for _ in range(4)]
+    assert bodies == [len(env.models[i].body_mass) for i in (1, 0, 1, 0)] and len({*bodies}) == 2
+
+
+def test_an_environment_may_be_wrapped_again():
+    env = Cart()
+    nominal = values(env.model)
+    for factor in (0.5, 1.0, 2.0):
+        RandomDynamics(env, 1.0, factor, factor).reset(seed=0)
+        np.testing.assert_array_equal(env.model.body_mass, factor * nominal["body_mass"])
+    RandomDynamics(env, 0.0, 0.5, 1.5)
+    assert changed(nominal, env.model) == set()
+
+
 class Heavier(Cart):
     """An environment that sets the mass of its cart at every reset."""
 
@@ -143,6 +192,16 @@ class Heavier(Cart):
         self.episode = getattr(self, "episode", 0) + 1
         self.model.body_mass[1] = self.episode
         return super().reset(**kwargs)
+
+
+def test_contact_pairs_have_a_friction_of_their_own():
+    pair = '<contact><pair geom1="a" geom2="b"/></contact></mujoco>'
+    text = MODEL.replace('<geom type="box"', '<geom name="a" type="box"')
+    text = text.replace('<geom type="capsule"', '<geom name="b" type="capsule"')
+    env = Choosing(text.replace("</mujoco>", pair))
+    friction = env.model.pair_friction.copy()
+    RandomDynamics(env, 1.0, 0.5, 0.5, fields=("pair_friction",)).reset(seed=0)
+    np.testing.assert_array_equal(env.model.pair_friction, 0.5 * friction)
 
 
 def test_fields_that_reset_sets_itself_are_refused():
@@ -187,6 +246,9 @@ def test_environments_that_it_cannot_change():
     for field in ("tendon_damping", "jnt_stiffness"):  # there is no tendon; all are 0
         with pytest.raises(ValueError, match=f"has no {field}, or zeros only"):
             RandomDynamics(gym.make("Hopper-v5"), 0.1, 0.5, 1.5, fields=(field,))
+    for field in ("geom_size", "geom_quat", "body_pos", "jnt_axis"):
+        with pytest.raises(ValueError, match=f"'{field}' cannot be scaled"):
+            RandomDynamics(Cart(), 0.1, 0.5, 1.5, fields=(field,))
     with pytest.raises(ValueError, match="body_mass takes body_inertia along"):
         RandomDynamics(Cart(), 0.1, 0.5, 1.5, fields=("body_inertia", "body_mass"))
     once = RandomNormalNoisyReward(RandomDynamics(Cart(), 0.1, 0.5, 1.5), 0.1, 1)

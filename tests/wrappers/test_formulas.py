@@ -160,6 +160,20 @@ def test_noise_that_changes_nothing_is_not_applied(text):
     assert env.times_applied == 0 < env.opportunities
 
 
+@pytest.mark.parametrize("text", ["RandomDropoutObservation(1)", "RandomNormalNoisyReward(1)"])
+def test_nan_that_stays_nan_is_not_changed(text):
+    env = build(text, constant_env(np.nan), 1.0)
+    env.reset(seed=0)
+    assert "noise" not in env.step(0)[-1]
+
+
+@pytest.mark.parametrize("factor", [0.0, 0.5, 1.0])
+def test_mixup_of_infinite_observations_is_infinite(factor):
+    env = RandomMixupObservation(constant_env(np.inf), 1.0, factor)
+    env.reset()
+    assert env.step(0)[0].tolist() == [np.inf] * 3
+
+
 @pytest.mark.parametrize("reuse", [False, True])
 @pytest.mark.parametrize(
     ("factor", "recursive", "episodes"),

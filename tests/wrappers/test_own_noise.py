@@ -206,6 +206,18 @@ def test_a_default_before_another_argument_stays(folder):
     assert split_noises(f"{noise}+RandomActionDelay(1)") == [str(noise), "RandomActionDelay(1)"]
 
 
+def test_different_arguments_are_different_folders(folder):
+    calls = ["A(1, 2)", "A((1, 2))", "A(1, (2,))", "A(1)", "A((1,))", "A(None)", "A('None')"]
+    calls += ["A(True)", "A('True')", "A('x', 1)", "A('x_1')", "A('a', 'b')", "A(('a', 'b'))"]
+    (folder / "my_noises.py").write_text(
+        "from noisy_wrappers import RewardNoise\n\n\nclass A(RewardNoise):\n"
+        "    def __init__(self, env, noise_rate, a, b=None):\n"
+        "        super().__init__(env, noise_rate, a=a, b=b)\n"
+    )
+    names = {run_name("Hopper-v5", "ppo", [f"my_noises:{call}"], [0.5], 1) for call in calls}
+    assert len(names) == len(calls)
+
+
 def test_a_noise_with_a_state_of_its_own_resumes(folder):
     (folder / "my_noises.py").write_text(
         "import numpy as np\nfrom noisy_wrappers import RewardNoise\n\n\n"

@@ -107,6 +107,12 @@ SCALES = "RandomNormalNoisyObservation((0.1, 0.2, 0.0), loc=1.0)"
 
 
 @pytest.mark.filterwarnings("ignore:.*WARN")
+def test_an_environment_that_resets_itself_is_refused():
+    env = gym.wrappers.Autoreset(gym.make("Pendulum-v1"))
+    with pytest.raises(ValueError, match="noise must see every reset: apply .*Autoreset last"):
+        make_noisy(env, ["RandomActionDelay(2)"], [0.5])
+
+
 def test_a_scale_for_each_dimension():
     assert str(parse_noise("RandomNormalNoisyObservation(loc=1, scale=(.1, 0.20, -0.0))")) == SCALES
     env = parse_noise(SCALES)(gym.make("Pendulum-v1"), 1.0)
