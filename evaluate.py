@@ -291,23 +291,23 @@ def tell(bad):
 def play(run, condition, args):
     """Play episodes; return what play_episodes does."""
     with load(run) as (env, policy):
-        return play_episodes(add_noise(env, condition), policy, args.episodes, args.seed)
+        results = play_episodes(add_noise(env, condition), policy, args.episodes, args.seed)
+    if args.seed == Args.seed:
+        store(run, run.key(condition), results)
+    return results
 
 
 def draw(run, condition, args):
-    """Play an episode in a window or into a video: its result, or in words why it cannot."""
+    """Play an episode in a window or into a video; return its result."""
     place = f"__{slug(run.elsewhere)}" if run.elsewhere else ""
     name = f"{run.folder.name}__{condition.slug or 'clean'}{place}.mp4"
-    try:
-        with load(run, "human" if args.render else "rgb_array") as (env, policy):
-            noisy_env = add_noise(env, condition)
-            if args.video:
-                [result] = record(noisy_env, policy, args.seed, args.video / name)
-            else:
-                [result] = play_episodes(noisy_env, policy, 1, args.seed)
-            return result
-    except Exception as error:  # of any library that draws, or of the environment
-        return with_place(error)
+    with load(run, "human" if args.render else "rgb_array") as (env, policy):
+        noisy_env = add_noise(env, condition)
+        if args.video:
+            [result] = record(noisy_env, policy, args.seed, args.video / name)
+        else:
+            [result] = play_episodes(noisy_env, policy, 1, args.seed)
+        return result
 
 
 def record(env, policy, seed, path):
@@ -342,22 +342,37 @@ def play_episodes(env, policy, number, seed):
     return results
 
 
+def attempt(play, run, condition, args):
+    """Return what play(run, condition, args) returns, or in words why it cannot."""
+    try:
+        return play(run, condition, args)
+    except Exception as error:  # of the environment, or of any library that draws
+        return with_place(error, (NotFiniteError, SpaceError))
+
+
 def play_all(play, tasks, args):
-    """Yield all tasks, (run, condition), in their order, with what play(*task, args) returns."""
+    """Yield all tasks, (run, condition), in their order, with what `attempt` returns of each."""
     with tqdm(tasks, unit="condition", disable=None) as bar:
         if args.jobs == 1 or args.render:
             for task in bar:
-                yield task, play(*task, args)
+                yield task, attempt(play, *task, args)
             return
         context = multiprocessing.get_context("spawn")  # PyTorch does not survive a fork
         ignore = (signal.SIGINT, signal.SIG_IGN)  # at Ctrl-C they finish what they play
         with ProcessPoolExecutor(args.jobs, context, signal.signal, ignore) as pool:
-            futures = [pool.submit(play, *task, args) for task in tasks]
+            futures = [pool.submit(attempt, play, *task, args) for task in tasks]
             try:
                 for task, future in zip(bar, futures, strict=True):
                     yield task, future.result()
             finally:
                 pool.shutdown(cancel_futures=True)
+
+
+def end_at_once(number, frame):
+    """End with the processes of --jobs, which would go on alone; what they played is stored."""
+    for process in multiprocessing.active_children():
+        process.kill()
+    os._exit(128 + number)
 
 
 def read_stored(run):
@@ -551,19 +566,22 @@ def main(args):
         for run, condition in itertools.product(runs, conditions)
         if len(stored[run].get(run.key(condition), [])) < args.episodes
     ]
+    failed = {}
     for (run, condition), results in play_all(play, tasks, args):
         stored[run][run.key(condition)] = results
-        if storing:
-            store(run, run.key(condition), results)
-    print_table(runs, conditions, stored, args.episodes)
-    return bool(bad)
+        if isinstance(results, str):
+            failed[run.folder] = f"{condition.slug or 'clean'}: {results}"
+    tell(failed)
+    runs = [run for run in runs if run.folder not in failed]
+    if runs:
+        print_table(runs, conditions, stored, args.episodes)
+    return bool(bad or failed)
 
 
 if __name__ == "__main__":
     take_over_terminal()
+    signal.signal(signal.SIGTERM, end_at_once)
     try:
         sys.exit(main(tyro.cli(Args, description=__doc__)))
     except KeyboardInterrupt:
         fail("stopped; what was played is stored, but nothing with another --seed", code=130)
-    except (NotFiniteError, SpaceError) as error:  # from the environment
-        fail(error, code=1)

@@ -1779,7 +1779,9 @@ def _import_module(module: str, problem: str) -> None:
                 f"{problem}: a module {top!r} is loaded already, from "
                 f"{loaded.__file__}; rename yours"
             )
-        importlib.import_module(module)
+        with kept_generators():
+            seed_globals(0)  # what the module draws is the same in every run and in all tests
+            importlib.import_module(module)
     except SystemExit as error:
         raise ValueError(f"{problem}: {module} called sys.exit({error.code!r})") from error
     except ModuleNotFoundError as error:
@@ -2065,7 +2067,7 @@ def seed_globals(seed: int) -> None:
 
 
 @contextlib.contextmanager
-def kept_generators(env: Env) -> Iterator[None]:
+def kept_generators(env: Env | None = None) -> Iterator[None]:
     """Restore after some lines of code the global generators, and those that an environment holds.
 
     >>> first = random.getstate()
@@ -2077,7 +2079,7 @@ def kept_generators(env: Env) -> Iterator[None]:
     torch: Any = sys.modules.get("torch")
     python, numpy = random.getstate(), np.random.get_state()
     pytorch = torch.get_rng_state() if torch else None
-    held = _held_generators(env)
+    held = _held_generators(env) if env else {}
     streams = {place: _stream(generator) for place, generator in held.items()}
     try:
         yield
@@ -2295,6 +2297,8 @@ def _held_generators(env: Env) -> dict[str, Any]:
                 inside = [*_layers(value), value.unwrapped]
                 holders |= {f"{place}.{name}.{i}": part for i, part in enumerate(inside)}
     found, kinds = {}, np.random.Generator | np.random.RandomState | random.Random
+    if torch := sys.modules.get("torch"):
+        kinds |= torch.Generator
     for place, holder in holders.items():
         for name, value in _members(holder):
             if isinstance(value, kinds) and not isinstance(value, random.SystemRandom):
@@ -2302,8 +2306,11 @@ def _held_generators(env: Env) -> dict[str, Any]:
     return found
 
 
+_LIBRARIES = {*sys.stdlib_module_names, "numpy", "torch", "mujoco", "gymnasium", "dm_control"}
+
+
 def _members(holder: Any, depth: int = 3) -> Iterator[tuple[str, Any]]:
-    """Yield what an object holds, also in its containers, its spaces and its package's objects."""
+    """Yield what an object holds, also in its containers, its spaces and objects of no library."""
     package = type(holder).__module__.partition(".")[0]
     parts = vars(holder) if hasattr(holder, "__dict__") else holder
     for name, value in [*(parts.items() if isinstance(parts, dict) else enumerate(parts))]:
@@ -2311,8 +2318,9 @@ def _members(holder: Any, depth: int = 3) -> Iterator[tuple[str, Any]]:
             continue  # which state_dict has
         yield str(name), value
         few = isinstance(value, list | tuple | dict) and len(value) <= 1000
-        own = type(value).__module__.partition(".")[0] == package and hasattr(value, "__dict__")
-        goes_on = few or own or isinstance(value, gym.Space)
+        its_package = type(value).__module__.partition(".")[0]
+        own = its_package == package or its_package not in _LIBRARIES
+        goes_on = few or (own and hasattr(value, "__dict__")) or isinstance(value, gym.Space)
         if depth and goes_on and not isinstance(value, gym.Env):
             for inner, part in _members(value, depth - 1):
                 yield f"{name}.{inner}", part
@@ -2320,11 +2328,13 @@ def _members(holder: Any, depth: int = 3) -> Iterator[tuple[str, Any]]:
 
 def _stream(generator: Any) -> Any:
     """Return the state of a random generator; dm_control's environments have a RandomState."""
-    if isinstance(generator, random.Random):
-        return generator.getstate()
+    if isinstance(generator, np.random.Generator):
+        return _without_arrays(generator.bit_generator.state)
     if isinstance(generator, np.random.RandomState):
         return _without_arrays(generator.get_state(legacy=False))
-    return _without_arrays(generator.bit_generator.state)
+    if isinstance(generator, random.Random):
+        return generator.getstate()
+    return generator.get_state().tolist()  # PyTorch's
 
 
 def _set_stream(generator: Any, stream: Any) -> None:
@@ -2333,9 +2343,12 @@ def _set_stream(generator: Any, stream: Any) -> None:
         generator.bit_generator.state = stream
     elif isinstance(generator, np.random.RandomState):
         generator.set_state(stream)
-    else:
+    elif isinstance(generator, random.Random) or generator is random:
         version, words, normal = stream
         generator.setstate((version, tuple(words), normal))
+    else:
+        torch = sys.modules["torch"]
+        generator.set_state(torch.tensor(stream, dtype=torch.uint8))
 
 
 # The scripts' arguments that change nothing about what a run learns. A run may be resumed with

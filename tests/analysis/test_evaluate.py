@@ -7,6 +7,7 @@ import math
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -230,6 +231,31 @@ def test_a_kill_leaves_whole_conditions_and_the_same_command_goes_on(runs):
     (run_dir / "robustness.csv").unlink()
     main(again)
     assert (run_dir / "robustness.csv").read_bytes() == before
+
+
+def test_what_is_played_is_stored_by_the_process_that_plays(runs):
+    """So nothing waits for an earlier condition that still plays in another process."""
+    run_dir = one(runs, "PPO")
+    [finished], _ = evaluate.find_runs([run_dir])
+    evaluate.play(finished, Configuration.read([OBSERVATION], [0.5]), Args((run_dir,), episodes=2))
+    assert [row["noise"] for row in stored(run_dir)] == [OBSERVATION] * 2
+
+
+@pytest.mark.slow
+def test_a_terminated_program_leaves_no_process_behind(runs):
+    options = ["--noises", OBSERVATION, ACTION, "--episodes", 20_000, "--jobs", 2]
+    process = subprocess.Popen(**command(one(runs, "PPO"), *options), start_new_session=True)
+
+    def processes():
+        listed = ["ps", "-o", "args=", "-s", str(process.pid)]
+        return subprocess.run(listed, capture_output=True, text=True).stdout.count("spawn_main")
+
+    while processes() < 2:
+        assert process.poll() is None
+        time.sleep(0.1)
+    process.terminate()
+    assert process.wait(timeout=100) == 128 + signal.SIGTERM
+    assert processes() == 0
 
 
 def wait(*args):
@@ -664,6 +690,35 @@ def test_a_module_of_ones_own_is_imported(runs_dir, trained, tmp_path, monkeypat
 )
 def test_bad_arguments(runs, capsys, options, message):
     refused(Args(**({"runs": (runs,)} | options)), message, runs, capsys)
+
+
+FAILING = """
+class Failing(gym.ActionWrapper):
+    def action(self, action):
+        if abs(action[0]) == 3:
+            raise RuntimeError("too strong")
+        return action
+
+gym.register("Failing-v0", lambda **given: Failing(gym.make("InvertedPendulum-v5", **given)))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_what_fails_under_a_noise_is_told_and_the_rest_is_kept(runs, tmp_path, jobs):
+    register(tmp_path, "failing", FAILING)
+    first, second = sorted(runs.glob("*ppo_continuous_noisy*"))
+    other_environment(first, "failing:Failing-v0")
+    noises = ["RandomNormalNoisyAction(1e9)", OBSERVATION]
+    options = ["--noises", *noises, "--episodes", 2, "--jobs", jobs]
+    result = run(first, second, *options, cwd=tmp_path)
+    assert result.returncode == 1
+    cause = r"RuntimeError: too strong \(.*failing.py, line \d+\)"
+    where = f"{re.escape(str(first))}: p1.0_NormalNoisyAction_1000000000.0"
+    assert re.fullmatch(rf"error: {where}: {cause}\n", result.stderr)
+    assert result.stdout.count("InvertedPendulum-v5") == 2  # in two tables, one for each noise
+    assert "Failing" not in result.stdout
+    assert [len(stored(run_dir)) for run_dir in (first, second)] == [4, 6]
 
 
 def test_another_environment(runs, capsys):

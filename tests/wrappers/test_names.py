@@ -4,6 +4,7 @@ import re
 import sys
 
 import gymnasium as gym
+import numpy as np
 import pytest
 from cases import A, B, C, hypothesis_settings
 from hypothesis import given, settings
@@ -155,6 +156,20 @@ def test_what_a_module_raises_passes_through(source, error, tmp_path, monkeypatc
     with pytest.raises(error):
         canonical_env_id("buggy_module:Env-v0")
     assert sys.path == path
+
+
+def test_what_a_module_draws_is_always_the_same(tmp_path, monkeypatch):
+    (tmp_path / "drawing_module.py").write_text("import numpy as np\nDRAWN = np.random.rand()\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    found = []
+    for seed in (1, 2):
+        np.random.seed(seed)
+        before = np.random.get_state()[1].tolist()
+        with pytest.raises(ValueError):  # it registers nothing
+            canonical_env_id("drawing_module:Env-v0")
+        found.append(sys.modules.pop("drawing_module").DRAWN)
+        assert np.random.get_state()[1].tolist() == before
+    assert found[0] == found[1]
 
 
 def test_a_module_may_add_to_the_path(tmp_path, monkeypatch):

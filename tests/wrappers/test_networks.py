@@ -8,6 +8,7 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from cases import BOX, A, B, layers, numbered_env
 from gymnasium.wrappers import FlattenObservation
 
@@ -207,16 +208,19 @@ def test_an_env_state_has_only_pythons_own_types(make_generator):
 
 
 class Simulator:
-    """Part of an environment, with a generator of its own."""
+    """Part of an environment, with generators of its own."""
+
+    __module__ = "simulator"  # another one of the user's than the environment's
 
     def __init__(self):
         self.rng = np.random.default_rng(0)
+        self.torch = torch.Generator().manual_seed(0)
 
 
 class Drawing(gym.Env):
     """Draws from generators that it holds, in many ways, and one that a helper or space holds."""
 
-    observation_space = gym.spaces.Box(-9, 9, (7,), np.float64)
+    observation_space = gym.spaces.Box(-9, 9, (8,), np.float64)
     action_space = gym.spaces.Box(-1, 1, (1,))
 
     def __init__(self):
@@ -235,6 +239,7 @@ class Drawing(gym.Env):
         drawn = [self.rng.normal(), self.old.normal(), self.python.random()]
         drawn += [self.simulator.rng.normal(), self.goals.sample()[0]]
         drawn.append(self.several["of one kind"][1].normal())
+        drawn.append(torch.rand((), generator=self.simulator.torch).item())
         return np.array([*drawn, self.robot.reset()[0][0]]), {}
 
 
