@@ -43,7 +43,8 @@ Options of choose
                            rates 0.05 and 1.0, 105 runs if all can act (see docs/sweeps.md). Both confirm
                            a true gain of 1.5 standard deviations in 9 of 10 cases
   --exclude "NOISE@RATE"   noises to leave out, for example because they always fail
-  --budget N               about how many runs the search may take (default: 3 for each noise)
+  --budget N               about how many runs the search may take (default: 3 for each noise); it
+                           takes two for each noise at least
   --confirm N              fresh seeds for the final comparison (default: 25)
   --metric success_rate    choose by the rate of success (default: return), where the info of an
                            episode's last step has is_success or success
@@ -77,8 +78,8 @@ Examples
 Run the same command again to resume: finished runs are skipped. Ctrl-C saves a checkpoint of every
 run and exits. `status` without a preset counts all runs in RUNS_DIR. Logs are in logs/ beside the
 runs. The interpreter is $PYTHON, else .venv/bin/python, else python. Exit status: 0 all runs are
-done (slurm without --wait: submitted), 1 some are not, 2 bad arguments, 130 stopped by Ctrl-C. See
-docs/sweeps.md.
+done (slurm without --wait: submitted), 1 some are not, 2 bad arguments, 130 stopped by Ctrl-C, 143
+by SIGTERM; of --dry-run 0, of status 0, or 1 if a run's files are damaged. See docs/sweeps.md.
 END
 }
 
@@ -153,14 +154,17 @@ show() {
 # sets `todo`: the runs to do, but for those that were tried, a line each: folder, command.
 # LC_ALL=C: folders may have names that are not UTF-8
 list_todo() {
-  todo=$(show "${dry_run:-list}") || exit $?
+  local status=0
+  todo=$(show "${dry_run:-list}") || status=$?
+  [ "$status" -lt 131 ] || fail "Python was ended by signal $((status - 128)), as by an environment"
+  [ "$status" -eq 0 ] || exit "$status"
   todo=$(LC_ALL=C grep -vxFf <(printf '%s\n' "$tried") <<<"$todo" || true)
 }
 tried=''
 list_todo
 first=${todo%%$'\t'*}
 [ -z "$remote_dir" ] || [ "${first#/}" = "$first" ] ||
-  fail "--remote-dir needs a --runs-dir in the project's folder, not ${first%/*}"
+  fail "--remote-dir needs a relative --runs-dir in the project's folder, not ${first%/*}"
 # Whatever becomes of the reader of a pipe ("| head"), nothing is started
 if [ -n "$dry_run" ]; then printf %s "$todo" | cut -f2 || true; exit; fi
 [ -n "$todo" ] || { show report; exit; }
@@ -226,7 +230,9 @@ run_todo() {
   [ "$stopped" -eq 0 ] || "stop_$executor" &
   trap '' PIPE # whoever reads what this prints may leave first
   WATCHED=$$ "$PYTHON" -m sweep watch "$caller" "${grid[@]}" & watch=$!
-  while kill -0 -- "-$group" 2>/dev/null; do
+  # After a signal, runs outlive the executor. Otherwise, what does is some environment's.
+  while kill -0 "$group" 2>/dev/null ||
+    { [ "$stopped" -ne 0 ] && kill -0 -- "-$group" 2>/dev/null; }; do
     sleep 1 & wait $! || true # a trap interrupts wait, not sleep
   done
   kill -- "-$guard" || true

@@ -121,20 +121,23 @@ def follow(args, algorithm, env_id, environment):
     for seed in fresh:  # which other choices in this folder may have run: with the same options?
         result(make_run(args, algorithm, env_id, BASELINE, seed, CONFIRMATION))
     state, runs, tests, returns = walk(args, algorithm, env_id, noises, budget)
-    folders = {steps: runs[key].folder for key, (steps, _) in tests.items()}
+    folders = {steps: runs[key].folder for key, (steps, _, _) in tests.items()}
     if len(folders) > 1:  # then their scores do not compare
         one, other, *_ = folders.values()
         fail(
             f"{one} and {other} were not tested at the same steps: choose another --runs-dir, or "
             "move the runs of one kind away"
         )
-    spread = halving.spread({run: values[-1] for run, (_, values) in tests.items()})
+    spread = halving.spread({run: values[-1] for run, (_, values, _) in tests.items()})
     seconds = wall_time(map(runs.get, returns))
     if environment and seconds is None:
         seconds = run_seconds(next(iter(runs.values())), environment)
     kind = algorithm, env_id
-    results, problem = set().union(*(values for _, values in tests.values())), ""
-    if len(results) == 1 and (state.rounds or not state.due):
+    results, problem = set().union(*(values for _, values, _ in tests.values())), ""
+    over = state.rounds or not state.due  # the first batch
+    if over and args.metric == SUCCESS and not any(told for _, _, told in tests.values()):
+        problem = "it tells no `is_success` or `success`, as --metric success_rate needs"
+    elif over and len(results) == 1:
         problem = (
             f"{what_all_runs_do(*results, args.metric)} in {args.total_timesteps:,} steps (runs: "
             f"{len(returns)}), so further runs would say nothing about noise; change "
@@ -147,15 +150,13 @@ def walk(args, algorithm, env_id, noises, budget):
     """Go from batch to batch as long as runs are finished.
 
     Returns the state; the runs that were due; the steps and the results of the tests of those that
-    are finished; and their scores. All but the state are {(configuration, seed): ...}. A run that
-    tells no success, where others do, had none.
+    are finished, and whether they tell the metric; and their scores. All but the state are
+    {(configuration, seed): ...}. A run that tells no success, where others do, had none.
     """
-    runs, tests, returns, tells = {}, {}, {}, set()
+    runs, tests, returns = {}, {}, {}
     while True:
         state = halving.advance(noises, budget, args.confirm, returns)
         if runs.keys() >= set(state.due):  # they have not finished
-            if tells == {False} and (state.rounds or not state.due):
-                fail(f"--metric success_rate: {env_id} tells no `is_success` or `success`")
             return state, runs, tests, returns
         for noise, seed in state.due:
             phase = SEARCH if seed < halving.FIRST_CONFIRMATION_SEED else CONFIRMATION
@@ -163,9 +164,9 @@ def walk(args, algorithm, env_id, noises, budget):
             runs[noise, seed] = run
             if row:
                 values = row["success_rates" if args.metric == SUCCESS else "returns"]
-                tells.add(values is not None)
-                values = np.zeros(len(row["steps"])) if values is None else values
-                tests[noise, seed] = tuple(row["steps"]), values
+                told = values is not None
+                values = values if told else np.zeros(len(row["steps"]))
+                tests[noise, seed] = tuple(row["steps"]), values, told
                 score = halving.score(row["steps"], values) if phase == SEARCH else values[-1]
                 returns[noise, seed] = score
 
@@ -304,15 +305,14 @@ def standing(found, args):
 def report(found, args):
     """Print the verdicts, and write choice.csv; or, where runs are left, what to do about them."""
     if any(choice.state.due for choice in found):
-        lines = [obstacle(choice) if choice.state.due else describe(choice) for choice in found]
-    else:
-        judged, rows = verdicts(found, args), []
-        for choice, (helped, _) in zip(found, judged, strict=True):
-            names = choice.kind[0].upper(), choice.kind[1]
-            rows += halving.records(*names, choice.state, choice.returns, helped)
-        write_choice(Path(args.runs_dir, choice_file(args.metric)), rows)
-        lines = [sentence for _, sentence in judged]
-    print(*lines, sep="\n")
+        print(*(obstacle(choice, len(found)) for choice in found), sep="\n")
+        return
+    judged, rows = verdicts(found, args), []
+    print(*(sentence for _, sentence in judged), sep="\n", flush=True)
+    for choice, (helped, _) in zip(found, judged, strict=True):
+        names = choice.kind[0].upper(), choice.kind[1]
+        rows += halving.records(*names, choice.state, choice.returns, helped)
+    write_choice(Path(args.runs_dir, choice_file(args.metric)), rows)
 
 
 def unit(args):
@@ -336,12 +336,18 @@ def verdicts(found, args):
     return judged
 
 
-def obstacle(choice):
-    """Say that a choice cannot continue, and what to do."""
-    text = f"{describe(choice)}. These did not finish; run the same command again to retry them."
-    for noise in dict.fromkeys(noise for noise, _ in choice.state.due if noise != BASELINE):
+def obstacle(choice, choices):
+    """Say that a choice of so many cannot continue, and what to do."""
+    if not choice.state.due:
+        return f"{describe(choice)}; the verdict comes with the others, for which p is corrected"
+    failed = [run for run in choice.state.due if not choice.runs[run].damage]
+    text = f"{describe(choice)}."
+    if failed:
+        text += " These did not finish; run the same command again to retry them."
+    for noise in dict.fromkeys(noise for noise, _ in failed if noise != BASELINE):
         excluded = "+".join(f"{name}@{rate}" for name, rate in zip(*noise.texts, strict=True))
         text += f'\n  If it fails every time, leave it out: --exclude "{excluded}"'
+        text += " (of all choices of the command, finished ones too)" if choices > 1 else ""
     return text
 
 

@@ -153,7 +153,8 @@ def sentence(name, winner, noises, comparison, p_corrected, comparisons, unit=""
     if noises == 1:
         start = f"{name}: {winner} could not be shown to help"
     if verdicts.significant(p_corrected):
-        return f"{start}, is worse than no noise: {evidence}{end}"
+        start = f"{start}," if noises > 1 else f"{name}: {winner}"
+        return f"{start} is worse than no noise: {evidence}{end}"
     if comparison.detectable > 0:
         seen = rounded(comparison.detectable, verdicts.spread_of(comparison))
         power = "80 % power before the correction" if comparisons > 1 else "80 % power"

@@ -183,12 +183,12 @@ def unknown_option(name, known):
 def from_project(caller, text):
     """Return a path that counts from the caller's folder as one that counts from the project's.
 
-    It is relative where it lies in the project, so that it means the same on other machines.
+    A relative one stays so where it lies in the project: it means the same on other machines.
     """
     if not text:
         fail("--runs-dir must name a folder")
     path = os.path.normpath(os.path.join(caller, os.path.expanduser(text)))
-    if Path(path).is_relative_to(os.getcwd()):
+    if not os.path.isabs(text) and Path(path).is_relative_to(os.getcwd()):
         path = os.path.relpath(path)
     if not re.fullmatch(r"[^-\t\n][^\t\n]*", path):
         fail("--runs-dir must be a path without tabs and newlines that begins with no dash")
@@ -244,8 +244,8 @@ def entry(text):
     """
     pairs = []
     for part in split_noises(text):
-        noise, at, own = part.partition("@")
-        pairs.append((noise, rate(own) if at else None))
+        found = re.fullmatch(r"(.*\))\s*@(.*)", part)  # there may be an @ in the brackets, too
+        pairs.append((found[1], rate(found[2])) if found else (part, None))
     if len({own is None for _, own in pairs}) > 1:
         reason = f"{text!r}: give each of these noises a rate with @, or none of them"
         raise argparse.ArgumentTypeError(reason)

@@ -4,7 +4,7 @@
 
 It makes 100,000 steps a second, and a checkpoint after each tenth of them and when SIGTERM or
 SIGINT stops it; started again, it goes on from there. STUB_FAILS is a pattern of folders whose runs
-fail.
+fail, STUB_LEAVES what a process runs that a run leaves behind.
 """
 
 import argparse
@@ -14,6 +14,7 @@ import json
 import os
 import random
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -93,6 +94,8 @@ def train(argv):
     (folder / "config.json").write_text(json.dumps(config))
     if fnmatch.fnmatch(folder.name, os.environ.get("STUB_FAILS", "")):
         sys.exit("error: this one fails")
+    if code := os.environ.get("STUB_LEAVES"):
+        subprocess.Popen([sys.executable, "-c", code])
     pretend_to_train(args.total_timesteps, folder / "checkpoint.pt")
 
     tests = episodes_of(exp_name[:3], args.env_id, args.noise, args.noise_rate, args.seed)

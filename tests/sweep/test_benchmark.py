@@ -490,7 +490,10 @@ def test_a_failing_run_stops_its_choice_and_no_other(tmp_path, stub):
     assert result.code == 1 and "exit 1" in result.out and "error: this one fails" in result.out
     assert "PPO on Pendulum-v1, round 1 of 1: 2 of 2 noises, seed 1; runs to do: 1" in result.out
     assert '--exclude "RandomDropoutObservation(0.9)@1.0"' in result.out
-    assert verdicts(result.out)[-1] == "SAC on Pendulum-v1: all runs are done"
+    assert verdicts(result.out)[-1] == (
+        "SAC on Pendulum-v1: all runs are done; the verdict comes with the others, for which p is "
+        "corrected"
+    )
     assert not (tmp_path / "choice.csv").exists()
     status = view("status", *command)
     assert status.code == 0 and "1 failed" in status.out
@@ -685,6 +688,26 @@ def test_runs_may_be_in_the_projects_own_folder(tmp_path, stub):
 
 
 @pytest.mark.slow
+def test_a_process_that_a_run_leaves_behind_holds_up_no_sweep(tmp_path, stub):
+    env = stub | {"STUB_LEAVES": "import time; time.sleep(61.25)"}
+    result = run(*GRID, "--total-timesteps", "400", "--runs-dir", tmp_path, env=env)
+    left = processes("time.sleep(61.25)")
+    for pid in left:
+        os.kill(pid, signal.SIGKILL)
+    assert result.code == 0 and "3 done" in result.out and len(left) == 3
+
+
+@pytest.mark.slow
+def test_a_crash_of_an_environment_is_told(tmp_path):
+    text = "import os\nimport gymnasium\ngymnasium.register('Abort-v0', lambda **_: os.abort())\n"
+    (tmp_path / "aborting.py").write_text(text)
+    words = ["choose", "--algos", "ppo", "--envs", "aborting:Abort-v0", "--dry-run"]
+    result = run(*words, cwd=tmp_path, script=ROOT / "benchmark.sh")
+    assert result.code == 2 and not result.out
+    assert result.err.endswith("error: Python was ended by signal 6, as by an environment\n")
+
+
+@pytest.mark.slow
 def test_openmps_threads_do_not_limit_the_number_of_runs(tmp_path, stub):
     grid = ["baseline", *GRID[1:5], "--seeds", "1-99", *FOREVER, "--runs-dir", tmp_path]
     start(*grid, env=stub | {"OMP_NUM_THREADS": "1"})
@@ -756,7 +779,7 @@ def test_a_second_sweep_waits_for_the_runs_of_the_first(tmp_path, stub):
         ("demo --jobs 0", "--jobs must be a number greater than 0, not '0'"),
         ("demo --jobs", "--jobs needs a value"),
         ("demo --sshlogin host", "--sshlogin and --remote-dir belong to --executor parallel"),
-        ("demo --remote-dir x --executor parallel", "--remote-dir needs a --runs-dir in the"),
+        ("demo --remote-dir x --executor parallel", "--remote-dir needs a relative --runs-dir"),
     ],
 )
 def test_bad_input(args, message, tmp_path):

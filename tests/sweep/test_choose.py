@@ -278,6 +278,15 @@ def test_a_comparison_by_hand(baseline, expected):
     assert expected in sentence("PPO on X", noise, 2, found, found.p, 1)
 
 
+def test_a_single_noise_that_harms():
+    noise = Configuration.parse("A", 0.1)
+    returns = {(noise, 1001 + i): float(i) for i in range(4)}
+    returns |= {(BASELINE, 1001 + i): 10.0 + i for i in range(4)}
+    found = compare(noise, range(1001, 1005), returns)
+    said = sentence("PPO on X", noise, 1, found, found.p, 1)
+    assert said.startswith("PPO on X: A at 0.1 is worse than no noise: 4 fresh seeds, -10")
+
+
 def test_records_of_choice_csv():
     table = np.arange(4.0)[:, None] + np.zeros(SEARCH_SEEDS + CONFIRM)
     state, returns = play(named(3), 3, table)
@@ -403,9 +412,14 @@ def test_choose_by_success_needs_an_environment_that_tells_it(tmp_path, capsys):
     text = f"--algos | ppo | --envs | Pendulum-v1 | --metric | success_rate | {THREE}"
     with pytest.raises(SystemExit) as exit_:
         batches(arguments(text, tmp_path))
-    assert exit_.value.code == 2
-    told = "error: --metric success_rate: Pendulum-v1 tells no `is_success` or `success`\n"
-    assert capsys.readouterr().err == told
+    assert exit_.value.code == 1
+    told = "PPO on Pendulum-v1: it tells no `is_success` or `success`, as --metric success_rate"
+    assert capsys.readouterr().err == f"error: {told} needs\n"
+    both = arguments(text.replace("Pendulum-v1", "Pendulum-v1 | toy_envs:Success-v0"), tmp_path)
+    batches(both)  # the other goes on
+    [choice] = choose.choices(both)
+    assert choice.kind[1] == "toy_envs:Success-v0" and not choice.state.due
+    assert f"warning: {told}" in capsys.readouterr().err
 
 
 def test_a_run_that_tells_no_success_had_none(tmp_path):
@@ -481,6 +495,19 @@ def test_the_default_noises_and_those_of_the_paper(tmp_path):
     paper = tried("--noises paper")
     assert len(paper) == 90 and len({noise.noise for noise in paper}) == 15
     assert len(tried("--noises paper --noise-rates 0.2")) == 15
+
+
+def test_a_damaged_run_is_not_to_be_retried_or_excluded(tmp_path, capsys):
+    args = arguments(f"--algos | ppo | --envs | Pendulum-v1 | {THREE}", tmp_path)
+    [choice] = choose.choices(args)
+    for run in choice.state.due:
+        stub_run.train(choice.runs[run].command)
+    path = choice.runs[choice.state.due[0]].folder / "eval.csv"
+    path.write_text(path.read_text()[:-1])
+    capsys.readouterr()
+    choose.report(choose.choices(args), args)
+    [line] = capsys.readouterr().out.splitlines()
+    assert line.endswith("runs to do: 1.")
 
 
 def test_an_excluded_noise_is_no_other_choice(tmp_path):

@@ -233,6 +233,12 @@ def test_status_arithmetic(tmp_path):
     assert re.search(rf"exit 1 +{log_of(failed)} +ValueError: broken\n", result.out)
 
 
+def test_an_at_in_a_noises_argument_is_no_rate():
+    keyed = "my_noises:Keyed(1, keys='a@b')"
+    assert options.entry(keyed) == [(keyed, None)]
+    assert options.entry(f"{keyed}@0.5+{A}@1:0") == [(keyed, 0.5), (A, "1:0")]
+
+
 def test_a_report_of_runs_without_logs_does_not_blame_the_disk(tmp_path):
     grid = ["baseline", *GRID, "--total-timesteps", "1000", "--runs-dir", tmp_path]
     [folder] = folders(*grid)
