@@ -2188,11 +2188,16 @@ def compiler_failure(error: Exception) -> str:
     return text.partition("\n")[0] or type(error).__name__
 
 
-def start_again() -> None:
-    """Start the program again with a new cache for the compiler, the next time without it."""
-    cache = f"torchinductor_{os.getpid()}_"  # os.execv keeps the process number
-    options = ["--no-compile"] if cache in os.environ.get("TORCHINDUCTOR_CACHE_DIR", "") else []
-    os.environ["TORCHINDUCTOR_CACHE_DIR"] = tempfile.mkdtemp(prefix=cache)
+def start_again(reason: str) -> None:
+    """Start the program again: with a new cache for the compiler, or without a compiler at all.
+
+    ``reason`` is that of :func:`compiler_failure`. A new cache is tried once.
+    """
+    cache, options = f"torchinductor_{os.getpid()}_", []  # os.execv keeps the process number
+    if "No working" in reason or cache in os.environ.get("TORCHINDUCTOR_CACHE_DIR", ""):
+        options = ["--no-compile"]
+    else:
+        os.environ["TORCHINDUCTOR_CACHE_DIR"] = tempfile.mkdtemp(prefix=cache)
     os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:], *options])
 
 

@@ -66,7 +66,7 @@ class Args:
 
     cuda: bool = False  # SPEED: train on a GPU (not tested on one yet); these networks are small
     torch_threads: int = 1  # CPU threads; runs in parallel gain more than extra threads
-    compile: bool = True  # compile the updates; needs a C++ compiler
+    compile: bool = True  # compile the updates, if there is a C++ compiler
     # precision of float32 products, raised to highest where another would cost accuracy; with bf16
     # the updates are computed in bfloat16, even if this costs accuracy
     matmul_precision: Literal["highest", "medium", "bf16"] = "medium"
@@ -746,7 +746,7 @@ if __name__ == "__main__":
         if not signals:  # the environment's processes may have got the signal, too
             if reason := noisy.compiler_failure(error):
                 say(f"not compiled, starting again: {reason}")
-                noisy.start_again()
+                noisy.start_again(reason)
             raise
     if not finished:
         say("stopped; run the same command again to resume")

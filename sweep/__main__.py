@@ -156,7 +156,9 @@ def show_status(args, runs, choices):
     """Print how far a sweep is; the exit status is 1 where a run's files are damaged."""
     progresses = show_progress(args, runs, over=False)
     silent = [p for p in progresses if p.state == RUNNING and p.reason]
-    rows = [(f"{p.state}, {p.reason}", str(p.log.path), p.log.last_line) for p in silent]
+    rows = [
+        (f"{p.state}, {p.reason}", from_caller(args, p.log.path), p.log.last_line) for p in silent
+    ]
     table("running, but silent:", rows)
     if choices:
         from sweep import choose
@@ -181,9 +183,10 @@ def show_report(args, runs, choices):
 
         choose.report(choices, args)
     if any(p.state == "done" for p in progresses):
-        place = shlex.quote(args.runs_dir)
+        place = shlex.quote(from_caller(args, args.runs_dir))
+        program = shlex.quote(from_caller(args, "analyze.py"))
         print(f"See the curves with: tensorboard --logdir {place}")
-        print(f"Make tables and figures with: python analyze.py --runs-dir {place}")
+        print(f"Make tables and figures with: python {program} --runs-dir {place}")
     return int(unfinished)
 
 
@@ -193,11 +196,16 @@ def show_progress(args, runs, over, everything=False):
     everything: also print what else is known to have ended, or not to.
     """
     progresses = [progress_of(run, over) for run in runs]
-    print(f"{args.runs_dir}: {summary(progresses)}")
+    print(f"{from_caller(args, args.runs_dir)}: {summary(progresses)}")
     named = [p for p in progresses if p.state == "failed" or (everything and p.reason)]
-    rows = [(p.reason, str(p.log.path), p.log.last_line) for p in named]
+    rows = [(p.reason, from_caller(args, p.log.path), p.log.last_line) for p in named]
     table("not finished:" if everything else "failed:", rows)
     return progresses
+
+
+def from_caller(args, path):
+    """Return a path that counts from the project's folder as the caller can paste it."""
+    return str(path) if args.caller == os.getcwd() else os.path.abspath(path)
 
 
 def check_disk(folder):

@@ -61,7 +61,7 @@ def parse_args(view, caller, argv):
     args = parser.parse_args(words)
     if args.preset != preset:
         fail(f"the preset comes first: {args.preset} --...")
-    args.view, args.given, args.extra = view, given, extra
+    args.view, args.caller, args.given, args.extra = view, caller, given, extra
     args.jobs, args.elsewhere = machines()
     args.runs_dir = from_project(caller, args.runs_dir)
     args.metric = args.metric.replace("_", " ")

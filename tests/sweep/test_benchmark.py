@@ -882,6 +882,7 @@ def test_an_environment_and_runs_in_the_callers_folder(tmp_path, stub):
     del grid[1]
     swept = run(*grid, cwd=tmp_path, script=ROOT / "benchmark.sh", env=stub)
     assert swept.code == 0, swept.out + swept.err
+    assert f"python {ROOT}/analyze.py --runs-dir '{tmp_path}/my runs'" in swept.out
     _, result = sorted((tmp_path / "my runs").glob("*/result.json"))
     shutil.rmtree(tmp_path / "my runs")
     pasted = f"{line} --no-compile --eval-episodes 1"
