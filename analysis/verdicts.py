@@ -71,7 +71,7 @@ def difference(row, unit=""):
     unit: of the difference, such as POINTS.
     """
     if pd.isna(row.difference):
-        text = f"{row.effect_size:+z.2f} standard deviations (median of the environments)"
+        text = f"{row.effect_size:+z.2f} standard deviations in the median environment"
         if pd.isna(row.effect_size):
             text = "effects that have no median"
     else:
@@ -83,7 +83,8 @@ def difference(row, unit=""):
             text += f" [{', '.join(rounded(end, spread) for end in ends)}]"
         text += unit
     if pd.notna(row.difference_percent):
-        text += f" ({percent(row.difference_percent)})"
+        average = " on average" if pd.isna(row.difference) else ""
+        text += f" ({percent(row.difference_percent)}{average})"
     return text
 
 
