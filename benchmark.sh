@@ -174,11 +174,16 @@ case $executor in
     parallel --version 2>/dev/null | grep -q "GNU parallel" ||
       fail "--executor parallel needs GNU parallel (Debian: apt-get install parallel)"
     export PARALLEL_SSH=${PARALLEL_SSH:-ssh -o BatchMode=yes}
+    quoted="'${PYTHON//\'/\'\\\'\'}'" # for the shell of each machine
     parallel_options=(--will-cite --workdir "${remote_dir:-$PWD}" --sshlogin "${sshlogin:-:}")
     [ -z "$sshlogin" ] || parallel "${parallel_options[@]}" --nonall --tag \
-      "$PYTHON" -c "'import mujoco, torch, tyro, noisy_wrappers'" "&&" test -x benchmark.sh >&2 ||
+      "$quoted" -c "'import mujoco, torch, tyro, noisy_wrappers'" "&&" test -x benchmark.sh >&2 ||
       fail "a machine of --sshlogin cannot run the project in ${remote_dir:-$PWD} with $PYTHON" ;;
-  slurm) command -v sbatch >/dev/null || fail "--executor slurm needs sbatch, on a Slurm cluster" ;;
+  slurm)
+    command -v sbatch >/dev/null || fail "--executor slurm needs sbatch, on a Slurm cluster"
+    words=$(xargs -rn1 printf '%s\n' <<<"$slurm_args" 2>/dev/null) ||
+      fail "--slurm-args has a quote that does not end: $slurm_args"
+    [ -z "$words" ] || mapfile -t slurm_options <<<"$words" ;;
 esac
 command -v flock >/dev/null || fail "benchmark.sh needs flock (Debian: apt-get install util-linux)"
 command -v ps >/dev/null || fail "benchmark.sh needs ps (Debian: apt-get install procps)"

@@ -16,6 +16,7 @@ import fcntl
 import json
 import math
 import os
+import shlex
 import signal
 import sys
 import time
@@ -679,7 +680,7 @@ class Run:
         text = f"{self.folder} is finished: mean test return {noisy.rounded(mean, std)}"
         rate = self.result.get("final_success_rate")
         say(text if rate is None else f"{text}, success rate {rate:.2f}")
-        say(f"See its curves with: tensorboard --logdir {self.args.runs_dir}")
+        say(f"See its curves with: tensorboard --logdir {shlex.quote(self.args.runs_dir)}")
 
     def _reading(self, path):
         return fail_on(Exception, f"cannot read {path} (if damaged, --overwrite starts afresh)")

@@ -102,17 +102,17 @@ submit() { # the array's indices are line numbers, counted from the offset of it
   count=$(wc -l <"$list")
   size=$(scontrol show config | awk '$1 == "MaxArraySize" {print $3}') || true
   [ "${size:-0}" -gt 0 ] || [ "$stopped" -ne 0 ] || fail "scontrol show config does not show MaxArraySize"
-  read -ra slurm_options <<<"$slurm_args"
   quoted=${list//\'/\'\\\'\'} # for sh, which does not know all that printf %q writes
   for ((offset = 0; offset < count && stopped == 0; offset += size)); do
     n=$((count - offset < size ? count - offset : size))
     id=$(sbatch --parsable --array="0-$((n - 1))${jobs:+%$jobs}" --requeue --signal=B:USR1@180 \
       --ntasks=1 --cpus-per-task=1 --job-name=noisy-sweep \
-      --open-mode=append --output="$logs/slurm-%A.out" \
+      --open-mode=append --output="${logs//%/%%}/slurm-%A.out" \
       ${slurm_options[@]+"${slurm_options[@]}"} \
       --wrap "exec ./benchmark.sh slurm-task '$quoted' $offset") || {
       [ "$stopped" -eq 0 ] || break # Ctrl-C ends sbatch, too
-      fail "sbatch refused runs $((offset + 1)) to $((offset + n)); submitted before: ${ids[*]}"
+      fail "sbatch refused runs $((offset + 1)) to $((offset + n)); submitted before: ${ids[*]:-none};" \
+        "run the same command again when they are over"
     }
     trap - EXIT # of benchmark.sh, which removes the list: the tasks read it later
     ids+=("${id%%;*}")

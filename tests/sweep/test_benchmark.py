@@ -318,7 +318,7 @@ def copy_project(folder):
 def test_machines_without_a_shared_folder(sshd, tmp_path):
     """The run folders travel: an interrupted run can go on elsewhere."""
     here, there = copy_project(tmp_path / "here"), copy_project(tmp_path / "there")
-    grid = ["baseline", *GRID[1:7], "--total-timesteps", "600000"]
+    grid = ["baseline", *GRID[1:7], "--total-timesteps", "1200000"]
     machine = ["--executor", "parallel", "--sshlogin", "second", "--remote-dir", there]
     folder = here / folders(*grid)[0]
     sweep = start(*grid, *machine, env=sshd, cwd=here)
@@ -332,7 +332,7 @@ def test_machines_without_a_shared_folder(sshd, tmp_path):
     again = run(*grid, *machine, env=sshd, cwd=here)
     assert again.code == 0, again.out + again.err
     assert attempts(folder)[1][0].startswith("resumed at step "), "not resumed"
-    assert json.loads((folder / "result.json").read_text())["total_timesteps"] == 600_000
+    assert json.loads((folder / "result.json").read_text())["total_timesteps"] == 1_200_000
 
 
 @pytest.mark.slow
@@ -361,13 +361,16 @@ def test_a_machine_without_the_project(sshd, tmp_path):
 
 @pytest.mark.slow
 def test_slurm_requeues_before_the_time_limit(slurm, tmp_path):
-    grid = ["baseline", *GRID[1:7], "--total-timesteps", "500000", "--runs-dir", tmp_path]
+    grid = ["baseline", *GRID[1:7], "--total-timesteps", "500000", "--runs-dir", tmp_path / "50%A"]
     (folder,) = folders(*grid)
-    submitted = run(*grid, "--executor", "slurm", "--slurm-args=--comment=hello", env=slurm)
+    grid += ["--executor", "slurm"]
+    refused = run(*grid, "--slurm-args=--comment='hello", env=slurm)
+    assert refused.code == 2 and "--slurm-args has a quote that does not end" in refused.err
+    submitted = run(*grid, '--slurm-args=--nice=7\n--comment="hello world"', env=slurm)
     assert submitted.code == 0, submitted.err
     (job,) = re.findall(r"scancel (\d+)$", submitted.err.strip())
     shown = output(["scontrol", "show", "job", job], slurm)
-    assert "Comment=hello" in shown and "Requeue=1" in shown
+    assert "Comment=hello world" in shown and "Nice=7" in shown and "Requeue=1" in shown
     wait_for(lambda: is_training(folder), what="the first evaluation")
     # What --signal=B:USR1@180 has Slurm do three minutes before the limit.
     subprocess.run(["scancel", "--batch", "--signal=USR1", job], env=slurm, check=True)
