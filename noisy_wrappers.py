@@ -60,6 +60,7 @@ from gymnasium.envs.registration import (
     parse_env_id,
 )
 from gymnasium.utils import RecordConstructorArgs
+from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
 __version__ = "0.3.0"
@@ -1266,7 +1267,7 @@ class Configuration:
             return gym.wrappers.FlattenObservation(noisy)
         pairs = [(parse_noise(noise), rate) for noise, rate in zip(*self.texts, strict=True)]
         if record_statistics and any(env.has_wrapper_attr(name) for name in _OF_RECORDERS):
-            raise ValueError(_RECORDED)
+            raise SpaceError(_RECORDED)
         for noise, rate in pairs:
             if noise.wrapper.kind in _BEFORE_STATISTICS:
                 env = noise(env, rate)
@@ -1851,7 +1852,11 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and check the first observation."""
-        self._steps = 0
+        self._steps, base = 0, self.unwrapped
+        if seed is not None and isinstance(
+            getattr(base, "_np_random", 0), np.random.Generator | None
+        ):
+            base._np_random, _ = np_random(seed)  # some, as Meta-World's, ignore the seed
         try:
             observation, info = self.env.reset(seed=seed, options=options)
         except (SystemExit, TypeError, ValueError) as error:
@@ -1950,8 +1955,9 @@ def make_flat(env: Env, step_limit: int | None = None) -> Env:
     env = FiniteNumbers(env)
     space = env.observation_space
     is_vector = isinstance(space, gym.spaces.Box) and len(space.shape) == 1
-    if space.is_np_flattenable and not is_vector:
-        env = gym.wrappers.FlattenObservation(env)
+    with contextlib.suppress(NotImplementedError):  # a space of the user's own does not say it
+        if space.is_np_flattenable and not is_vector:
+            env = gym.wrappers.FlattenObservation(env)
     observations, actions = env.observation_space, env.action_space
     if not isinstance(observations, gym.spaces.Box) or observations.dtype.kind not in "fiu":
         env.close()
@@ -2102,8 +2108,9 @@ def outcome(info: Mapping[str, Any]) -> float:
     (1.0, 0.0, nan)
     """
     for name in ("is_success", "success"):
-        if np.size(info.get(name)) == 1 and np.asarray(info.get(name)).dtype.kind in "biuf":
-            return float(np.asarray(info[name]).item() > 0)
+        value = np.asarray(info.get(name))  # PyTorch's tensors have a size() of their own
+        if value.size == 1 and value.dtype.kind in "biuf":
+            return float(value.item() > 0)
     return math.nan
 
 
@@ -2314,17 +2321,21 @@ def _held_generators(env: Env) -> dict[str, Any]:
 _LIBRARIES = {*sys.stdlib_module_names, "numpy", "torch", "mujoco", "gymnasium", "dm_control"}
 
 
+def _package_of(value: Any) -> str:
+    module = getattr(type(value), "__module__", "")  # which types of SWIG do not have
+    return str(module).partition(".")[0]
+
+
 def _members(holder: Any, depth: int = 3) -> Iterator[tuple[str, Any]]:
     """Yield what an object holds, also in its containers, its spaces and objects of no library."""
-    package = type(holder).__module__.partition(".")[0]
+    package = _package_of(holder)
     parts = vars(holder) if hasattr(holder, "__dict__") else holder
     for name, value in [*(parts.items() if isinstance(parts, dict) else enumerate(parts))]:
         if isinstance(holder, NoiseWrapper) and name in ("_gate", "noise"):
             continue  # which state_dict has
         yield str(name), value
         few = isinstance(value, list | tuple | dict) and len(value) <= 1000
-        its_package = type(value).__module__.partition(".")[0]
-        own = its_package == package or its_package not in _LIBRARIES
+        own = _package_of(value) == package or _package_of(value) not in _LIBRARIES
         goes_on = few or (own and hasattr(value, "__dict__")) or isinstance(value, gym.Space)
         if depth and goes_on and not isinstance(value, gym.Env):
             for inner, part in _members(value, depth - 1):

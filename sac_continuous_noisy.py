@@ -438,7 +438,8 @@ def make_envs(args):
     noisy.seed_globals(args.seed)
     with make_env(env_id, **limit) as test_env, make_env(env_id, **limit) as env:
         caught = warnings.catch_warnings(record=True)
-        with fail_on(ValueError, f"--noise in {env_id}"), caught as notes:
+        where = f"--noise in {env_id}" if noise else f"--env-id {env_id}"
+        with fail_on(ValueError, where), caught as notes:
             env = noisy.make_noisy(env, noise, noise_rate)
         for text in [note.message for note in notes] + noisy.remarks(env_id, test_env, STEP_LIMIT):
             say(text)

@@ -1,6 +1,7 @@
 """The figure of the effects: every noise in every environment."""
 
 import re
+from textwrap import wrap
 
 import numpy as np
 import pandas as pd
@@ -8,9 +9,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from analysis import style
+from analysis.runs import SUCCESS
 from analysis.verdicts import seeds_of
 from noisy_wrappers import rate_order
 
+WHOLE_WORDS = {"break_long_words": False, "break_on_hyphens": False}
 MOST_IN_FOREST = 25  # configurations of a forest plot; more of them are a heatmap
 
 
@@ -30,11 +33,11 @@ def effects_caption(study, rows):
     text = f"{study.name}: difference from no noise in mean final {study.metric}"
     if len(configurations(rows)) > MOST_IN_FOREST:
         _, unit, limit = heatmap_scale(rows)
-        dots = "A dot marks a clear verdict." if clear else "No verdict is clear."
+        dots = "A dot marks a clear verdict." if clear else "No single verdict is clear."
         return f"{text} ({unit}). {dots} The colours end at \u00b1 {limit:.3g} {unit}."
     text += ", with its 95 % interval from five seeds on, by noise and rate; every environment has "
     text += "its own scale. "
-    text += "Filled marks are clear verdicts" if clear else "No verdict is clear"
+    text += "Filled marks are clear verdicts" if clear else "No single verdict is clear"
     return f"{text}. n: seeds (with / without noise)."
 
 
@@ -68,9 +71,10 @@ def effects_figure(rows, metric):
         else:
             image = heat_panel(ax, panel, scale)
         ax.set_yticks(range(len(names)), names, fontsize=8)
-        ax.set_title(environment, fontsize=9)
+        style.set_title(ax, environment, width / across)
     write_below = fig.supxlabel if across > 1 else axes[-1].set_xlabel
-    quantity = f"difference from no noise in mean {metric}"
+    unit_of = " (percentage points)" if metric == SUCCESS else ""
+    quantity = f"difference from no noise in mean {metric}{unit_of}"
     write_below(quantity if is_forest else "noise rate", fontsize=9)
     if not is_forest:
         beyond = "both" if rows[column].abs().max() > limit else "neither"
@@ -85,7 +89,9 @@ def labels_of(rows, is_forest):
         labels = [f"{noise}, {rate}" for noise, rate in configurations(rows)]
     else:
         labels = sorted(set(rows["noise"]))
-    return [re.sub(r"(?<=\w)\((?=.{10})", "\n(", style.broken(label)) for label in labels]
+    labels = [re.sub(r"(?<=\w)\((?=.{10})", "\n(", style.broken(label)) for label in labels]
+    return ["\n".join(line for part in label.split("\n") for line in wrap(part, 44, **WHOLE_WORDS))
+            for label in labels]  # fmt: skip
 
 
 def forest_panel(ax, rows, inches):
@@ -141,9 +147,11 @@ def heatmap(ax, grid, limit, number, dots, size):
 
     The colours end at \u00b1 limit. dots: as grid, of bool; size: of the numbers, in points.
     """
-    image = ax.imshow(grid, cmap=style.DIVERGING, vmin=-limit, vmax=limit, aspect="auto")
+    image = ax.imshow(
+        grid.clip(-limit, limit), cmap=style.DIVERGING, vmin=-limit, vmax=limit, aspect="auto"
+    )
     for (i, j), value in np.ndenumerate(grid.to_numpy()):
-        if np.isfinite(value):
+        if not np.isnan(value):
             ink = "white" if value > 0.7 * limit else "black"  # only the blue is dark
             ax.text(j, i, number(value), fontsize=size, ha="center", va="center", color=ink)
         if dots.iat[i, j]:

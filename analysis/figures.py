@@ -97,7 +97,8 @@ def panels(environments, labels, metric, below):
     fig.subplots_adjust(0.9 / width, bottom, 1 - 0.3 / width, top, wspace=0.25, hspace=0.45)
     axes = [fig.add_subplot(down, across, i + 1) for i in range(len(environments))]
     for ax, env in zip(axes, environments, strict=True):
-        ax.set(title=env, xlabel=below)
+        style.set_title(ax, env, width / across)
+        ax.set(xlabel=below)
         ax.yaxis.get_major_locator().set_params(nbins=5)
         if ax.get_subplotspec().is_first_col():
             ax.set_ylabel(RETURN_LABELS[metric])
@@ -129,7 +130,7 @@ def best_curves_figure(study, best):
             curve(ax, steps, *mean_and_std(curves), 0.12, color=color, linewidth=1.6)
         noise = row.noise if len(row.noise) < 50 else f"{row.noise[:47]}..."
         lines = f"{noise}, {row.noise_rate}\n{row.verdict} (n = {seeds_of(row.n, row.n_baseline)})"
-        ax.set_title(f"{row.environment}\n{lines}", fontsize=7.5)
+        style.set_title(ax, row.environment, style.WIDTH / 3, f"\n{lines}")
     handles = [axes[0].lines[0], Rectangle((0, 0), 1, 1, color=style.UNCLEAR)]
     fig.legend(handles, labels, loc="lower center", ncols=2, frameon=False)
     return fig

@@ -181,4 +181,5 @@ def write_table(out, table, latex=False):
     lines = lines.replace("\n", f"\n\\caption{{{caption}}}\\\\\n", 1)
     for sign, command in (("\u00b1", r"$\pm$"), ("\u2013", "--"), (" < ", " $<$ ")):
         lines = lines.replace(sign, command)
-    (out / f"{table.name}.tex").write_text(lines + "\n", "utf-8")
+    note = re.sub(r"([%&_#$])", r"\\\1", note)
+    (out / f"{table.name}.tex").write_text(f"{lines}\n{note}", "utf-8")

@@ -8,7 +8,7 @@ returns. Keeping the baseline fixed would not do: a baseline that was unlucky is
 import numpy as np
 
 from analysis.runs import STUDY
-from analysis.statistics import pooled_std
+from analysis.statistics import contrast, pooled_std
 
 DRAWS = 10_000
 SEEDS_TO_RESAMPLE = 20  # with fewer seeds of the baseline, returns are taken as normal
@@ -45,6 +45,9 @@ def draw_differences(std, df, n_baseline, n_noisy, rng, seeds=()):
 def luck_of_studies(studies):
     """Draw the sweep of each Study again, with its numbers of seeds, as if no noise did anything.
 
+    The spread is that of the baseline, of the best noise, and of all that are not clearly worse:
+    one that ends training, or makes it diverge, does something, and has a spread of its own.
+
     Return {(*study.key, environment): the highest difference of each sweep (draws,)}, NaN where
     nothing could be drawn.
     """
@@ -53,13 +56,21 @@ def luck_of_studies(studies):
         rng = np.random.default_rng(0)
         for e, environment in enumerate(study.environments):
             samples = [study.sample(config, e) for config in study.returns]
-            std, df = pooled_std(samples)
+            best = max(filter(len, samples[1:]), key=np.mean, default=None)
+            std, df = pooled_std(
+                [s for s in samples if s is best or not clearly_worse(s, samples[0])]
+            )
             n_baseline, *n_noisy = map(len, samples)
             draws = np.full((1, DRAWS), np.nan)
             if n_baseline and df > 0:
                 draws = draw_differences(std, df, n_baseline, n_noisy, rng, samples[0])
             lucks[*study.key, environment] = highest(draws)
     return lucks
+
+
+def clearly_worse(sample, baseline):
+    """Tell whether the 95 % interval of the difference of two samples is below zero."""
+    return len(sample) > 1 and len(baseline) > 1 and contrast([sample, baseline], [1, -1])[3] < 0
 
 
 def luck_of_paper(best, seeds, configurations):

@@ -254,7 +254,7 @@ def few(texts):
     different = list(texts.dropna().unique())
     if len(different) > 2:
         return f"{different[0]} and {len(different) - 1} more"
-    return ", ".join(different)
+    return "; ".join(different)
 
 
 def ranges(numbers):

@@ -31,6 +31,16 @@ def line_style(i, number):
     return {"color": color, "linestyle": line, "marker": marker}
 
 
+def set_title(ax, environment, inches, more=""):
+    """Set a title that begins with an environment's id, as small as a panel so wide needs it.
+
+    Of module:Environment-v0 only the environment is shown; tables have the whole.
+    """
+    name = environment.rpartition(":")[2]
+    size = min(7.5 if more else 9, 100 * inches / len(name))
+    ax.set_title(f"{name}{more}", fontsize=size)
+
+
 def broken(label):
     """Put each noise or rate of a combination on a line of its own."""
     return str(label).replace(" + ", " +\n")

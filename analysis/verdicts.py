@@ -5,7 +5,7 @@ from math import nan
 import pandas as pd
 
 from analysis.runs import STUDY, SUCCESS, rows_of, study_name
-from analysis.statistics import LEVEL, SEEDS_FOR_INTERVAL
+from analysis.statistics import LEVEL, SEEDS_FOR_INTERVAL, holm
 from noisy_wrappers import rounded
 
 UNCLEAR = "no clear difference"
@@ -190,6 +190,7 @@ def luck_sentence(best):
     rivals = f"the best of {number} useless noises would"
     if tried == {1}:
         rivals = "one useless noise might"
+    best = best.assign(p_luck=holm(best["p_luck"].to_numpy(float)))  # over environments
     beyond = best[best["p_luck"] <= LEVEL]
     if beyond.empty:
         where = " in each environment" if len(best) > 1 else ""

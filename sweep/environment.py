@@ -57,8 +57,9 @@ def ask(env_id, configurations=(), max_episode_steps=None):
         made = gym.make(env_id, disable_env_checker=True, max_episode_steps=max_episode_steps)
         declared = made.spec.max_episode_steps
         with noisy.make_flat(made, constant("sac_continuous_noisy.py", "STEP_LIMIT")) as env:
+            noisy.make_noisy(env, [], [])  # refuses one that records its episodes
             limit = env.spec.max_episode_steps
-            seconds, steps, length = time_steps(env, limit, deadline)
+            seconds, steps, length = time_steps(env, limit, deadline, declared is None)
             env.reset()  # a failure after this one is the noise's
             tried = {}
             for n in configurations:  # at every rate: it may fail at one of them
@@ -73,11 +74,12 @@ def ask(env_id, configurations=(), max_episode_steps=None):
             )
 
 
-def time_steps(env, time_limit, deadline):
+def time_steps(env, time_limit, deadline, whole=False):
     """Return an environment's seconds a step, the steps timed, and the length of an episode.
 
     Each step bears its share of a reset: an episode is as long as those that ended while it was
-    timed, or as the time limit if none did.
+    timed, or as the time limit if none did. whole: an episode is played to its end, if that takes
+    no more than half of the time until the deadline.
     """
     env.action_space.seed(1)
     env.reset(seed=1)
@@ -86,7 +88,11 @@ def time_steps(env, time_limit, deadline):
     steps = resets = episodes = in_episodes = 0
     stepping = resetting = 0.0
     ended = True
-    while not steps or now < deadline and (steps < STEPS or now < begin + SECONDS):
+    half = (begin + deadline) / 2
+    while not steps or (
+        now < deadline
+        and (steps < STEPS or now < begin + SECONDS or (whole and not episodes and now < half))
+    ):
         if ended:
             start = time.perf_counter()
             env.reset()

@@ -811,6 +811,23 @@ def test_effects_have_in_every_environment_the_rows_that_were_tried_there(tmp_pa
     assert [text.get_text() for text in figure.axes[0].texts] == ["5", "5", "n"]
 
 
+def test_an_infinite_effect_has_the_strongest_colour():
+    ax, grid = analysis.effects.Figure().subplots(), pd.DataFrame([[np.inf, 1.0], [NAN, -2.0]])
+    dots = grid.isna() & False
+    image = analysis.effects.heatmap(ax, grid, 2.0, "{:+.1f}".format, dots, 6)
+    shown = image.get_array()
+    assert shown.tolist() == [[2.0, 1.0], [None, -2.0]]
+    assert [text.get_text() for text in ax.texts] == ["+inf", "+1.0", "-2.0"]
+
+
+def test_the_id_of_an_environment_fits_above_its_panel():
+    ax = analysis.effects.Figure(figsize=(3, 3)).subplots()
+    analysis.style.set_title(ax, "my_company_robotics.envs:WarehousePickAndPlaceDense-v12", 3)
+    assert ax.get_title() == "WarehousePickAndPlaceDense-v12" and ax.title.get_fontsize() == 9
+    analysis.style.set_title(ax, "A" * 60, 3)
+    assert ax.title.get_fontsize() < 9
+
+
 def test_effects_of_many_configurations_are_a_heatmap(tmp_path):
     rates = [0.01 * i for i in range(1, analysis.effects.MOST_IN_FOREST + 2)]
     for seed in range(1, 8):

@@ -64,6 +64,16 @@ def test_a_single_configuration_is_students_test():
         )
 
 
+def test_noise_that_ends_training_says_nothing_of_luck():
+    rng = np.random.default_rng(0)
+    baseline, useless = rng.normal(100, 1, 5), rng.normal(100, 1, (20, 5))
+    dead, exploding = rng.normal(50, 0.01, (15, 5)), rng.normal(-1e6, 1e4, (15, 5))
+    study = make_study(baseline[:, None], np.concatenate([useless, dead, exploding])[..., None])
+    spread = analysis.statistics.pooled_std([baseline, *useless])
+    drawn = analysis.luck.draw_differences(*spread, 5, [5] * 50, np.random.default_rng(0), baseline)
+    np.testing.assert_array_equal(luck_of_study(study)["Env0-v0"], drawn.max(axis=0))
+
+
 def test_the_best_of_many_against_a_baseline_that_is_known():
     """P(best <= x) is the product over configurations of Phi(x sqrt(n) / std)."""
     rng, n = np.random.default_rng(0), np.array([4] * 20 + [25] * 10)

@@ -219,8 +219,15 @@ def test_of_many_versions_is_said_at_the_end(tmp_path):
             [5, 9],
             [0.3, 0.01],
             [3, 4],
-            "On Hopper-v5 (p = 0.01) the best noise looks better than "
+            "On Hopper-v5 (p = 0.02) the best noise looks better than "  # Holm's, of two
             "the best of as many useless noises would; elsewhere it does not.",
+        ),
+        (
+            [5, 9],
+            [0.3, 0.04],
+            [3, 3],
+            "The best noise in each environment looks no better than "
+            "the best of 3 useless noises would.",
         ),
         (
             [5, 9],

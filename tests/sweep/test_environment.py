@@ -7,14 +7,16 @@ import re
 import shlex
 import subprocess
 import textwrap
+import time
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
 import stub_run
 import toy_envs
 from views import finish, view
 
-from noisy_wrappers import BASELINE, Configuration
+from noisy_wrappers import BASELINE, Configuration, SpaceError
 from sweep import environment
 from sweep.environment import Environment, ask, remember, remembered, run_seconds, time_left
 from sweep.grid import make_run
@@ -106,6 +108,21 @@ def test_resets_count_in_proportion(monkeypatch):
 def test_without_a_time_limit_a_test_is_as_long_as_an_episode():
     assert ask("toy_envs:NoLimit-v0").episode_steps == 20
     assert ask("toy_envs:Endless-v0").episode_steps == 10_000
+
+
+def test_an_episode_without_a_declared_limit_is_played_to_its_end(monkeypatch):
+    monkeypatch.setattr(environment, "SECONDS", 0)
+    env = gym.wrappers.TimeLimit(gym.make("Pendulum-v1").unwrapped, 300)
+    deadline = time.perf_counter() + 100
+    assert environment.time_steps(env, 10_000, deadline, whole=True)[1:] == (300, 300)
+    assert environment.time_steps(env, 10_000, deadline)[1:] == (environment.STEPS, 10_000)
+
+
+def test_an_environment_that_records_its_episodes_is_refused():
+    recorder = gym.wrappers.RecordEpisodeStatistics
+    gym.register("Recorded-v0", lambda **given: recorder(gym.make("Pendulum-v1", **given)))
+    with pytest.raises(SpaceError, match="records its episodes already"):
+        ask("Recorded-v0")
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from noisy_wrappers import (
     make_flat,
     make_noisy,
     noise_wrappers,
+    outcome,
 )
 
 
@@ -207,6 +208,14 @@ def test_an_env_state_has_only_pythons_own_types(make_generator):
     assert env.unwrapped.np_random.normal(size=5).tolist() == expected
 
 
+class Nameless(type):
+    """The class of classes that have no module, as SWIG makes them for Box2D."""
+
+    @property
+    def __module__(cls):
+        raise AttributeError("__module__")
+
+
 class Simulator:
     """Part of an environment, with generators of its own."""
 
@@ -228,6 +237,7 @@ class Drawing(gym.Env):
         self.simulator, self.goals = Simulator(), gym.spaces.Box(-1, 1, (1,))
         self.several = {"of one kind": [np.random.default_rng(i) for i in range(2)]}
         self.goals.seed(0)
+        self.world = Nameless("World", (), {})()
         self.dice = random.SystemRandom()  # nothing can restore it, and nothing fails
 
     def reset(self, *, seed=None, options=None):
@@ -258,6 +268,44 @@ def test_an_env_state_has_the_generators_among_the_attributes():
     np.testing.assert_array_equal(other.reset()[0], third)
     del saved["attributes"]  # of a checkpoint that an earlier version wrote
     EnvState(other).load_state_dict(saved)
+
+
+def test_success_may_be_a_tensor():
+    for value in (True, [True], 1.0):
+        assert outcome({"success": torch.tensor(value)}) == 1.0
+    assert outcome({"is_success": torch.tensor(False)}) == 0.0
+    assert np.isnan(outcome({"success": torch.tensor([True, False])}))
+
+
+class Heedless(gym.Env):
+    """Ignores the seed of a reset, as Meta-World's environments do."""
+
+    observation_space = gym.spaces.Box(-9, 9, (1,), np.float64)
+    action_space = gym.spaces.Box(-1, 1, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset()
+        return self.np_random.normal(size=1), {}
+
+
+def test_an_environment_that_ignores_its_seed_is_seeded_all_the_same():
+    first, second = (make_flat(Heedless()).reset(seed=3)[0] for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+    pendulum, bare = make_flat(gym.make("Pendulum-v1")), gym.make("Pendulum-v1")
+    for seed in (3, None, 4):
+        np.testing.assert_array_equal(pendulum.reset(seed=seed)[0], bare.reset(seed=seed)[0])
+
+
+class Mission(gym.spaces.Space):
+    """A space that does not say whether it can be flattened, as MiniGrid's."""
+
+
+def test_a_space_of_another_kind_is_refused():
+    env = gym.wrappers.TransformObservation(
+        gym.make("Pendulum-v1"), lambda o: {"o": o}, gym.spaces.Dict({"o": Mission()})
+    )
+    with pytest.raises(SpaceError, match="needs Box observations of numbers"):
+        make_flat(env)
 
 
 def test_an_environment_that_exits_when_it_is_closed(monkeypatch):
