@@ -2085,7 +2085,7 @@ def kept_generators(env: Env | None = None) -> Iterator[None]:
     torch: Any = sys.modules.get("torch")
     python, numpy = random.getstate(), np.random.get_state()
     pytorch = torch.get_rng_state() if torch else None
-    held = _held_generators(env) if env else {}
+    held = _held_generators(env) if env is not None else {}
     streams = {place: _stream(generator) for place, generator in held.items()}
     try:
         yield
@@ -2318,6 +2318,7 @@ def _held_generators(env: Env) -> dict[str, Any]:
     return found
 
 
+# Their objects are large, and hold no generator of an environment's own
 _LIBRARIES = {*sys.stdlib_module_names, "numpy", "torch", "mujoco", "gymnasium", "dm_control"}
 
 

@@ -89,9 +89,14 @@ def labels_of(rows, is_forest):
         labels = [f"{noise}, {rate}" for noise, rate in configurations(rows)]
     else:
         labels = sorted(set(rows["noise"]))
-    labels = [re.sub(r"(?<=\w)\((?=.{10})", "\n(", style.broken(label)) for label in labels]
-    return ["\n".join(line for part in label.split("\n") for line in wrap(part, 44, **WHOLE_WORDS))
-            for label in labels]  # fmt: skip
+    return list(map(folded, labels))
+
+
+def folded(label):
+    """Break a label between noises, before a long bracket, and where a line is still too long."""
+    label = re.sub(r"(?<=\w)\((?=.{10})", "\n(", style.broken(label))
+    lines = [wrap(line, 44, **WHOLE_WORDS) for line in label.split("\n")]
+    return "\n".join(sum(lines, []))
 
 
 def forest_panel(ax, rows, inches):
