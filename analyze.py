@@ -26,7 +26,7 @@ import tyro
 from analysis.errors import fail, take_over_terminal
 from analysis.figures import figures, write_figure
 from analysis.folders import is_run
-from analysis.formatting import text_table, write_table
+from analysis.formatting import WHOLE_WORDS, text_table, write_table
 from analysis.paper import read_paper
 from analysis.report import Results, write_report
 from analysis.robustness import analyse_robustness, read_robustness
@@ -121,8 +121,7 @@ def print_results(out, results):
     width, tables = terminal_width(), results.tables
 
     def say(text):
-        style = {"break_long_words": False, "break_on_hyphens": False, "subsequent_indent": "  "}
-        print(textwrap.fill(text, width, **style))
+        print(textwrap.fill(text, width, subsequent_indent="  ", **WHOLE_WORDS))
 
     for line in verdicts_in_short(results):
         say(line)

@@ -174,10 +174,9 @@ case $executor in
     parallel --version 2>/dev/null | grep -q "GNU parallel" ||
       fail "--executor parallel needs GNU parallel (Debian: apt-get install parallel)"
     export PARALLEL_SSH=${PARALLEL_SSH:-ssh -o BatchMode=yes}
-    quoted="'${PYTHON//\'/\'\\\'\'}'" # for the shell of each machine
     parallel_options=(--will-cite --workdir "${remote_dir:-$PWD}" --sshlogin "${sshlogin:-:}")
     [ -z "$sshlogin" ] || parallel "${parallel_options[@]}" --nonall --tag \
-      "$quoted" -c "'import mujoco, torch, tyro, noisy_wrappers'" "&&" test -x benchmark.sh >&2 ||
+      "$(quoted "$PYTHON")" -c "'import mujoco, torch, tyro, noisy_wrappers'" "&&" test -x benchmark.sh >&2 ||
       fail "a machine of --sshlogin cannot run the project in ${remote_dir:-$PWD} with $PYTHON" ;;
   slurm)
     command -v sbatch >/dev/null || fail "--executor slurm needs sbatch, on a Slurm cluster"

@@ -105,6 +105,11 @@ class Args:
     video: Path | None = None
     """write a video of one episode of each condition into this folder and store nothing else"""
 
+    @property
+    def storing(self):
+        """Whether episodes are stored: robustness.csv has no column for the seed."""
+        return self.seed == Args.seed
+
 
 @dataclass(frozen=True, eq=False)
 class FinishedRun:
@@ -292,7 +297,7 @@ def play(run, condition, args):
     """Play episodes; return what play_episodes does."""
     with load(run) as (env, policy):
         results = play_episodes(add_noise(env, condition), policy, args.episodes, args.seed)
-    if args.seed == Args.seed:
+    if args.storing:
         store(run, run.key(condition), results)
     return results
 
@@ -532,7 +537,6 @@ def main(args):
     here = Path.cwd()  # for what the module of my_envs:MyEnv-v0 imports
     if not any(here.is_relative_to(run.runs_dir) for run in runs):
         sys.path.append(str(here))
-    storing = args.seed == Args.seed
     if args.video:
         args.video = args.video.expanduser()
         if len({run.folder.name for run in runs}) < len(runs):
@@ -544,7 +548,7 @@ def main(args):
         except ValueError as error:
             fail(f"--env-id: {error}")
         runs = [replace(run, elsewhere=env_id * (env_id != run.environment)) for run in runs]
-    stored = check_runs(runs, conditions, bad, storing)
+    stored = check_runs(runs, conditions, bad, args.storing)
     runs = list(stored)
     tell(bad)
     if not runs and bad:
@@ -559,7 +563,7 @@ def main(args):
             fail(f"--video: cannot write to {args.video}: {error}")
     if args.video or args.render:
         return show(runs, conditions, args) or bool(bad)
-    if not storing:
+    if not args.storing:
         print(f"--seed {args.seed} is not the default: everything is played, nothing is stored")
     tasks = [
         (run, condition)

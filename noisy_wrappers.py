@@ -907,12 +907,12 @@ class RandomDynamics(NoiseWrapper):
             scaled = {field: getattr(model, field).copy() for field in self.fields}
         observation, info = self.env.reset(seed=seed, options=options)
         if self._chosen:
-            if self._model() is not model:  # the environment has built or taken another one
+            now = self._model()
+            if now is not model:  # the environment has built or taken another one
                 self._restore()
-                rows = {field: len(getattr(self._model(), field)) for field in self.fields}
-                if rows != {field: len(values) for field, values in factors.items()}:
-                    factors = self._draw(self._model())
-                self._scale(self._model(), factors)
+                if any(len(factors[name]) != len(getattr(now, name)) for name in self.fields):
+                    factors = self._draw(now)
+                self._scale(now, factors)
             elif own := [name for name in scaled if (getattr(model, name) != scaled[name]).any()]:
                 raise ValueError(
                     f"fields: this environment's reset() sets {own[0]} itself, so that no factor "
@@ -1852,10 +1852,9 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and check the first observation."""
-        self._steps, base = 0, self.unwrapped
-        if seed is not None and isinstance(
-            getattr(base, "_np_random", 0), np.random.Generator | None
-        ):
+        self._steps = 0
+        base, kinds = self.unwrapped, np.random.Generator | None
+        if seed is not None and isinstance(getattr(base, "_np_random", 0), kinds):
             base._np_random, _ = np_random(seed)  # some, as Meta-World's, ignore the seed
         try:
             observation, info = self.env.reset(seed=seed, options=options)

@@ -13,6 +13,7 @@ from analysis.verdicts import percent
 from noisy_wrappers import rate_order, rounded
 
 # Formats of numbers that have no spread. z: no "-0"
+WHOLE_WORDS = {"break_long_words": False, "break_on_hyphens": False}  # of textwrap
 DASH = "\u2013"  # of what does not exist
 TENTH, WHOLE, PLAIN, SHARE, P_VALUE = "z,.1f", "z,.0f", "g", "z.2f", ".2g"
 
@@ -176,10 +177,10 @@ def write_table(out, table, latex=False):
     note = f"\n{table.note}\n" if table.note else ""
     (out / f"{table.name}.md").write_text(f"{table.caption}\n\n{markdown}\n{note}", "utf-8")
     lines = tabulate(text.values, text.columns, tablefmt="latex_longtable", disable_numparse=True)
-    caption = table.caption.replace("%", r"\%")
+    caption, note = (re.sub(r"([%&_#$])", r"\\\1", text) for text in (table.caption, note))
     lines = lines.replace("{}", f"{{{len(text.columns) * 'l'}}}", 1)  # if it has no rows
     lines = lines.replace("\n", f"\n\\caption{{{caption}}}\\\\\n", 1)
+    lines = f"{lines}\n{note}"
     for sign, command in (("\u00b1", r"$\pm$"), ("\u2013", "--"), (" < ", " $<$ ")):
         lines = lines.replace(sign, command)
-    note = re.sub(r"([%&_#$])", r"\\\1", note)
-    (out / f"{table.name}.tex").write_text(f"{lines}\n{note}", "utf-8")
+    (out / f"{table.name}.tex").write_text(lines, "utf-8")

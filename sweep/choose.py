@@ -25,6 +25,8 @@ from sweep import halving
 from sweep.environment import ask_all, remember, remembered, run_seconds, time_left, wall_time
 from sweep.grid import PlannedRun, configuration_of, configurations, make_run, result
 
+NO_SUCCESS = "it tells no `is_success` or `success`, as --metric success_rate needs"
+
 
 class Choice(NamedTuple):
     """The choice of a noise for one algorithm and environment, as far as it has come."""
@@ -72,7 +74,8 @@ def choices(args):
         remember(args.runs_dir, env_id, known[env_id])
     problems = [f"{choice.name}: {choice.problem}" for choice in found if choice.problem]
     if len(problems) == len(found):
-        fail("\nerror: ".join(problems), code=1)
+        is_argument = all(choice.problem == NO_SUCCESS for choice in found)
+        fail("\nerror: ".join(problems), code=2 if is_argument else 1)
     for problem in problems:  # the others go on
         print(f"warning: {problem}", file=sys.stderr)
     return [choice for choice in found if not choice.problem]
@@ -136,7 +139,7 @@ def follow(args, algorithm, env_id, environment):
     results, problem = set().union(*(values for _, values, _ in tests.values())), ""
     over = state.rounds or not state.due  # the first batch
     if over and args.metric == SUCCESS and not any(told for _, _, told in tests.values()):
-        problem = "it tells no `is_success` or `success`, as --metric success_rate needs"
+        problem = NO_SUCCESS
     elif over and len(results) == 1:
         problem = (
             f"{what_all_runs_do(*results, args.metric)} in {args.total_timesteps:,} steps (runs: "

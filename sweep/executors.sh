@@ -8,6 +8,10 @@
 
 log_of() { echo "${1%/*}/logs/${1##*/}.log"; }
 
+quoted() { # TEXT: as one word of any sh, which does not know all that printf %q writes
+  printf "'%s'" "${1//\'/\'\\\'\'}"
+}
+
 locks_work() { # FILE: flock's status is 1 for a lock that another process holds, more for no locks
   flock --nonblock "$1" true 2>/dev/null || [ $? -eq 1 ]
 }
@@ -98,18 +102,17 @@ stop_parallel() { # HUP: parallel starts no more runs, and waits for those that 
 # -------------------------------------------------------------------------------------------- slurm
 
 submit() { # the array's indices are line numbers, counted from the offset of its part
-  local count size offset n id quoted
+  local count size offset n id
   count=$(wc -l <"$list")
   size=$(scontrol show config | awk '$1 == "MaxArraySize" {print $3}') || true
   [ "${size:-0}" -gt 0 ] || [ "$stopped" -ne 0 ] || fail "scontrol show config does not show MaxArraySize"
-  quoted=${list//\'/\'\\\'\'} # for sh, which does not know all that printf %q writes
   for ((offset = 0; offset < count && stopped == 0; offset += size)); do
     n=$((count - offset < size ? count - offset : size))
     id=$(sbatch --parsable --array="0-$((n - 1))${jobs:+%$jobs}" --requeue --signal=B:USR1@180 \
       --ntasks=1 --cpus-per-task=1 --job-name=noisy-sweep \
       --open-mode=append --output="${logs//%/%%}/slurm-%A.out" \
       ${slurm_options[@]+"${slurm_options[@]}"} \
-      --wrap "exec ./benchmark.sh slurm-task '$quoted' $offset") || {
+      --wrap "exec ./benchmark.sh slurm-task $(quoted "$list") $offset") || {
       [ "$stopped" -eq 0 ] || break # Ctrl-C ends sbatch, too
       fail "sbatch refused runs $((offset + 1)) to $((offset + n)); submitted before: ${ids[*]:-none};" \
         "run the same command again when they are over"

@@ -412,7 +412,7 @@ def test_choose_by_success_needs_an_environment_that_tells_it(tmp_path, capsys):
     text = f"--algos | ppo | --envs | Pendulum-v1 | --metric | success_rate | {THREE}"
     with pytest.raises(SystemExit) as exit_:
         batches(arguments(text, tmp_path))
-    assert exit_.value.code == 1
+    assert exit_.value.code == 2
     told = "PPO on Pendulum-v1: it tells no `is_success` or `success`, as --metric success_rate"
     assert capsys.readouterr().err == f"error: {told} needs\n"
     both = arguments(text.replace("Pendulum-v1", "Pendulum-v1 | toy_envs:Success-v0"), tmp_path)
