@@ -247,7 +247,7 @@ def test_a_terminated_program_leaves_no_process_behind(runs):
     process = subprocess.Popen(**command(one(runs, "PPO"), *options), start_new_session=True)
 
     def processes():
-        listed = ["ps", "-o", "args=", "-s", str(process.pid)]
+        listed = ["ps", "-ww", "-o", "args=", "-s", str(process.pid)]
         return subprocess.run(listed, capture_output=True, text=True).stdout.count("spawn_main")
 
     while processes() < 2:
