@@ -10,6 +10,7 @@ in ten far below ("failing").
 
 import argparse
 import sys
+from functools import partial
 from math import ceil
 from pathlib import Path
 
@@ -25,23 +26,15 @@ GAINS = (1.0, 1.5, 2.0)
 PARTITIONS = 999  # of a test; the real one has a hundred times as many
 
 
-def normal(rng, shape):
-    """Draw returns with mean 0 and standard deviation 1."""
-    return rng.standard_normal(shape)
+def two_peaks(rng, shape, height, share):
+    """Draw returns, a share of them `height` widths above the others: mean 0, deviation 1."""
+    returns = rng.standard_normal(shape) + height * (rng.random(shape) < share)
+    return (returns - height * share) / np.sqrt(1 + height**2 * share * (1 - share))
 
 
-def high_peak(rng, shape):
-    """Draw returns, a fifth of them around a peak 4 widths above the other: mean 0, deviation 1."""
-    returns = rng.standard_normal(shape) + 4 * (rng.random(shape) < 0.2)
-    return (returns - 4 * 0.2) / np.sqrt(1 + 4**2 * 0.2 * 0.8)
-
-
-def failing(rng, shape):
-    """Draw returns, 30 % of them around a peak 4 widths below the other: mean 0, deviation 1."""
-    returns = rng.standard_normal(shape) - 4 * (rng.random(shape) < 0.3)
-    return (returns + 4 * 0.3) / np.sqrt(1 + 4**2 * 0.3 * 0.7)
-
-
+normal = np.random.Generator.standard_normal  # of a generator and a shape, as the others
+high_peak = partial(two_peaks, height=4, share=0.2)
+failing = partial(two_peaks, height=-4, share=0.3)
 DRAWS = {"normal": normal, "high peak": high_peak, "failing": failing}
 
 
