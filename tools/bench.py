@@ -44,12 +44,6 @@ ROLLOUT = 2048  # the steps of PPO's rollout, the default of all programs here
 TOTAL_TIMESTEPS = 10**9  # more than any program takes before it is ended
 
 
-def fail(message):
-    """Exit with one line that says which argument is wrong."""
-    print("error:", message, file=sys.stderr)
-    raise SystemExit(2)
-
-
 # CHILDREN: what runs on the measured core, in the interpreter of the measured program. They rely on
 # nothing but its command line and the tags of its TensorBoard curves.
 
@@ -176,10 +170,16 @@ def advance(*programs):
         program.read_mark()
 
 
-def warm_up(program):
-    """Run until the speed is steady: what is compiled is compiled."""
-    for _ in range(3):
-        advance(program)
+@contextlib.contextmanager
+def started(programs):
+    """Start programs one after another, run each until its speed is steady, and end all."""
+    with contextlib.ExitStack() as stack:
+        begun = []
+        for program in map(stack.enter_context, programs):
+            begun.append(program)
+            for _ in range(3):  # then what is compiled is compiled
+                advance(program)
+        yield begun
 
 
 def measure(options, *programs):
@@ -220,19 +220,15 @@ def ours_and_others(algo, env_id, options):
         python = options.cleanrl_python
         yield Program("CleanRL", core, "_script", *arguments, "--no-cuda", python=python)
     if options.against_sbx:
-        python = options.against_sbx
-        yield Program("SBX", core, "_sbx", algo, env_id, python=python)
+        yield Program("SBX", core, "_sbx", algo, env_id, python=options.against_sbx)
 
 
 def compare(algo, env_id, options):
     """Run ours and the others, if there are any, alternately."""
     from scipy.stats import quantile_test  # here, since the children's interpreters may not have it
 
-    programs, rows = [], []
-    with contextlib.ExitStack() as stack:
-        for program in ours_and_others(algo, env_id, options):
-            programs.append(stack.enter_context(program))
-            warm_up(program)
+    rows = []
+    with started(ours_and_others(algo, env_id, options)) as programs:
         for pair in range(options.pairs):
             in_turn = programs if pair % 2 == 0 else programs[::-1]  # each is first as often
             for program in in_turn:
@@ -254,11 +250,8 @@ def compare(algo, env_id, options):
 
 def side_by_side(algo, env_id, options):
     """Run one alone and several at once, alternately."""
-    programs, alone, at_once = [], [], []
-    with contextlib.ExitStack() as stack:
-        for job in range(options.jobs):
-            programs.append(stack.enter_context(ours(algo, env_id, options, job=job)))
-            warm_up(programs[job])
+    alone, at_once = [], []
+    with started(ours(algo, env_id, options, job=job) for job in range(options.jobs)) as programs:
         for _ in range(options.pairs):
             measure(options, programs[0])
             alone.append(programs[0].speeds[-1])
@@ -274,7 +267,7 @@ def parse(argv):
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.error = fail
+    parser.error = lambda message: parser.exit(2, f"error: {message}\n")
     add = parser.add_argument
     add("--algos", nargs="+", choices=ALGOS, default=ALGOS)
     add("--envs", nargs="+", default=["HalfCheetah-v5", "Humanoid-v5"], metavar="ENV_ID")
@@ -293,20 +286,20 @@ def parse(argv):
     for name, low in (("pairs", 1), ("seconds", 0.1), ("jobs", 2)):
         value = getattr(options, name)
         if value is not None and not value >= low:
-            fail(f"--{name} must be at least {low}, not {value}")
+            parser.error(f"--{name} must be at least {low}, not {value}")
     others = (options.against_cleanrl, options.against_sbx, options.against_checkout)
     if options.jobs and any(others):
-        fail("--jobs compares runs of this version only: leave out --against-...")
+        parser.error("--jobs compares runs of this version only: leave out --against-...")
     if bool(options.against_cleanrl) != bool(options.cleanrl_python):
-        fail("--against-cleanrl and --cleanrl-python need each other")
+        parser.error("--against-cleanrl and --cleanrl-python need each other")
     files = {"cleanrl": "cleanrl/sac_continuous_action.py", "checkout": "sac_continuous_noisy.py"}
     for name, file in files.items():
         folder = getattr(options, f"against_{name}")
         if folder and not (folder / file).is_file():
-            fail(f"--against-{name}: there is no {folder / file}")
+            parser.error(f"--against-{name}: there is no {folder / file}")
     for program in filter(None, (options.cleanrl_python, options.against_sbx)):
         if not shutil.which(program):
-            fail(f"{program} is not a program")
+            parser.error(f"{program} is not a program")
     return options
 
 
