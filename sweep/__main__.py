@@ -51,8 +51,9 @@ def progress_of(run, over):
     if damage:
         return Progress(run, log._replace(last_line=damage), "failed", "damaged")
     if is_locked(run.folder):
-        silent = f"silent for {log.age / 60:.0f} min" if YOUNG <= log.age < float("inf") else ""
-        return Progress(run, log, RUNNING, "still running" if over else silent)
+        is_silent = YOUNG <= log.age < float("inf")
+        reason = f"running, silent for {log.age / 60:.0f} min" if is_silent else ""
+        return Progress(run, log, RUNNING, "still running" if over else reason)
     status = log.exit_status
     if status in STOPPED:
         return Progress(run, log, "to do", "stopped")
@@ -64,12 +65,6 @@ def progress_of(run, over):
     if log.age < YOUNG and not over:
         return Progress(run, log, PROBABLY)
     return Progress(run, log, "to do", "lost" if log.age < float("inf") else "")
-
-
-def steps_left(progress):
-    """Return the environment steps that a run has left."""
-    done = progress.state == "done"
-    return 0 if done else max(0, progress.run.total_timesteps - progress.log.step)
 
 
 def summary(progresses):
@@ -85,7 +80,10 @@ def summary(progresses):
     speed = {key: harmonic_mean(values) for key, values in speeds.items()}
     on_their_way = [p for p in progresses if p.state in (RUNNING, PROBABLY)]
     if on_their_way and speed:
-        seconds = sum(steps_left(p) / speed.get(p.run.kind, speed[None]) for p in progresses)
+        seconds = 0
+        for run, log, state, _ in progresses:
+            steps = 0 if state == "done" else max(0, run.total_timesteps - log.step)
+            seconds += steps / speed.get(run.kind, speed[None])
         left = timedelta(seconds=round(seconds / len(on_their_way)))
         now = sum(progress.log.steps_per_second for progress in on_their_way)
         text += f"; about {left} left"
@@ -93,8 +91,9 @@ def summary(progresses):
     return text
 
 
-def table(title, rows):
-    """Print rows as columns, if there are any."""
+def table(title, progresses, args):
+    """Print the runs under a title, if there are any: the reason, the log, its last line."""
+    rows = [(p.reason, from_caller(args, p.log.path), p.log.last_line) for p in progresses]
     if rows:
         print(title)
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -156,10 +155,7 @@ def show_status(args, runs, choices):
     """Print how far a sweep is; the exit status is 1 where a run's files are damaged."""
     progresses = show_progress(args, runs, over=False)
     silent = [p for p in progresses if p.state == RUNNING and p.reason]
-    rows = [
-        (f"{p.state}, {p.reason}", from_caller(args, p.log.path), p.log.last_line) for p in silent
-    ]
-    table("running, but silent:", rows)
+    table("running, but silent:", silent, args)
     if choices:
         from sweep import choose
 
@@ -198,8 +194,7 @@ def show_progress(args, runs, over, everything=False):
     progresses = [progress_of(run, over) for run in runs]
     print(f"{from_caller(args, args.runs_dir)}: {summary(progresses)}")
     named = [p for p in progresses if p.state == "failed" or (everything and p.reason)]
-    rows = [(p.reason, from_caller(args, p.log.path), p.log.last_line) for p in named]
-    table("not finished:" if everything else "failed:", rows)
+    table("not finished:" if everything else "failed:", named, args)
     return progresses
 
 
