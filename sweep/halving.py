@@ -146,35 +146,29 @@ def sentence(name, winner, noises, comparison, p_corrected, comparisons, unit=""
     evidence = f"{comparison.n} fresh seeds, {verdicts.difference(comparison, unit)}"
     evidence += f", p {verdicts.p_value(comparison.p)}{verdicts.smallest(comparison)}"
     evidence += verdicts.corrected(p_corrected, comparisons, "verdict")
-    end = f".{verdicts.borderline(comparison)}"
+    none = f"none of {noises} noises could be shown to help; the best of them, {winner}"
+    said = none if noises > 1 else f"{winner} could not be shown to help"
     if helps(comparison, p_corrected):
-        return f"{name}: {winner} beats no noise: {evidence}{end}"
-    start = f"{name}: none of {noises} noises could be shown to help; the best of them, {winner}"
-    if noises == 1:
-        start = f"{name}: {winner} could not be shown to help"
-    if verdicts.significant(p_corrected):
-        start = f"{start}," if noises > 1 else f"{name}: {winner}"
-        return f"{start} is worse than no noise: {evidence}{end}"
-    if comparison.detectable > 0:
+        said = f"{winner} beats no noise"
+    elif verdicts.significant(p_corrected):
+        said = f"{none}," if noises > 1 else f"{winner}"
+        said += " is worse than no noise"
+    elif comparison.detectable > 0:
         seen = rounded(comparison.detectable, verdicts.spread_of(comparison))
         power = "80 % power before the correction" if comparisons > 1 else "80 % power"
         evidence += f"; with {comparison.n} seeds a difference of {seen}{unit} would have been seen"
         evidence += f" ({power})"
-    return f"{start}: {evidence}{end}"
+    return f"{name}: {said}: {evidence}.{verdicts.borderline(comparison)}"
 
 
 def records(algorithm, environment, state, returns, helped):
-    """Return the rows of choice.csv for one finished choice; their columns are CHOICE_COLUMNS."""
-    rows = []
-
-    def add(phase, number, noise, seeds, score, survives):
-        rows.append((algorithm, environment, phase, number, *noise.columns, seeds, score, survives))
-
+    """Yield the rows of choice.csv for one finished choice; their columns are CHOICE_COLUMNS."""
+    kind = algorithm, environment
     for number, done in enumerate(state.rounds, start=1):
         for noise in done.noises:
             survives = "yes" if noise in done.survivors else "no"
-            add("search", number, noise, done.seeds, done.scores[noise], survives)
+            score = done.scores[noise]
+            yield *kind, "search", number, *noise.columns, done.seeds, score, survives
     for noise, survives in ((BASELINE, ""), (*state.noises, "yes" if helped else "no")):
         score = fmean(returns[noise, seed] for seed in state.seeds)
-        add("confirmation", "", noise, len(state.seeds), score, survives)
-    return rows
+        yield *kind, "confirmation", "", *noise.columns, len(state.seeds), score, survives
