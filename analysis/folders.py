@@ -185,18 +185,14 @@ def is_locked(folder):
 
     F_GETLK only asks. To take the lock, even for a moment, would end a run that starts just then.
     """
-    layout, place = ("hhqqi", 0) if os.uname().sysname == "Linux" else ("qqihh", 3)
-    question = [0] * 5
-    question[place] = fcntl.F_RDLCK
+    layout = "hhqqi"  # of Linux; the type comes first
+    question = struct.pack(layout, fcntl.F_RDLCK, 0, 0, 0, 0)
     try:
-        descriptor = os.open(folder / ".lock", os.O_RDONLY | os.O_NONBLOCK)
-        try:
-            answer = fcntl.fcntl(descriptor, fcntl.F_GETLK, struct.pack(layout, *question))
-        finally:
-            os.close(descriptor)
+        with open(os.open(folder / ".lock", os.O_RDONLY | os.O_NONBLOCK), "rb") as lock:
+            answer = fcntl.fcntl(lock, fcntl.F_GETLK, question)
     except OSError:  # there is none, or the file system has no locks
         return False
-    return struct.unpack(layout, answer)[place] != fcntl.F_UNLCK
+    return struct.unpack(layout, answer)[0] != fcntl.F_UNLCK
 
 
 class Log(NamedTuple):
