@@ -55,14 +55,9 @@ ABLATION = [(f"RandomUniformScaleReward({2 - b:.1f}, {b})", 0.05) for b in (1.1,
 ABLATION += [
     (f"RandomUniformNoisyObservation(-{b}, {b})", 1.0) for b in (0.0001, 0.001, 0.01, 0.1, 1.0)
 ]
-PAIRS = {  # presets, and their noises with rates
-    "demo": [("RandomNormalNoisyObservation(1.0)", 1.0)],  # harms with any five seeds
-    "paper": list(itertools.product(NOISES, RATES)),
-    "choose": list(itertools.product(CHOOSE_NOISES, CHOOSE_RATES)),
-    "ablation": ABLATION,
-}
-PRESETS = {  # the grid options that a preset sets
+PRESETS = {  # what a preset sets: its noises with their rates, and grid options
     "demo": {
+        "pairs": [("RandomNormalNoisyObservation(1.0)", 1.0)],  # harms with any five seeds
         "algos": ["ppo"],
         "envs": ["InvertedPendulum-v5"],
         "seeds": [range(1, 6)],
@@ -70,11 +65,14 @@ PRESETS = {  # the grid options that a preset sets
         "runs_dir": "runs/demo",  # never into a sweep's folders: these runs are shorter
     },
     "baseline": {},
-    "best": {},
-    "paper": {},
-    "ablation": {"algos": ["ppo"]},
+    "best": {"pairs": None},  # the paper's, another one for each algorithm and environment
+    "paper": {"pairs": list(itertools.product(NOISES, RATES))},
+    "ablation": {"pairs": ABLATION, "algos": ["ppo"]},
     "custom": {},
-    "choose": {"runs_dir": "runs/choose"},  # apart: analyze.py judges its runs otherwise
+    "choose": {
+        "pairs": list(itertools.product(CHOOSE_NOISES, CHOOSE_RATES)),
+        "runs_dir": "runs/choose",  # apart: analyze.py judges its runs otherwise
+    },
 }
 
 
@@ -95,21 +93,19 @@ def script_of(algorithm):
     return f"{algorithm}_continuous_noisy.py"
 
 
-def preset_pairs(preset, algorithm, env_id):
-    """Return a preset's (noise, rate) pairs for one algorithm and environment."""
-    if preset != "best":
-        return PAIRS.get(preset, [])
+def best_of_the_paper(algorithm, env_id):
+    """Return the paper's best noise for an algorithm in an environment, and its rate."""
     with open(PROJECT / "results/paper/best.csv", newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
             case = row["algorithm"].lower(), row["environment"].rpartition("-v")[0]
             if case == (algorithm, env_id.rpartition("-v")[0]):
-                return [(row["noise_as_run"], float(row["noise_rate"]))]
+                return row["noise_as_run"], float(row["noise_rate"])
     return fail(f"the paper has no best noise for {algorithm} on {env_id}")
 
 
 def configurations(args, algorithm, env_id):
     """Return the configurations with noise of a grid, in the order given."""
-    pairs = preset_pairs(args.noises_of, algorithm, env_id)
+    pairs = [best_of_the_paper(algorithm, env_id)] if args.pairs is None else args.pairs
     entries, rates = [[pair] for pair in pairs], []
     if args.noises or args.noise_rates:
         entries = args.noises or [[(noise, None)] for noise in dict(pairs)]
@@ -195,31 +191,22 @@ def result(run):
         read_result(run.folder, config)
     except DamageError as error:
         return False, f"{run.folder}/{error}; move its folder away to run it again"
-    steps, differences = config["total"], other_options(run, config["args"])
+    steps, made = config["total"], config["args"]
     if steps != run.total_timesteps:
         fail(f"{run.folder} holds a finished run of {steps} steps; choose another --runs-dir")
+    differences = [
+        f"--{name.replace('_', '-')} {made[name]}, not {wanted}"
+        for name, wanted in run.options.items()
+        if name not in MAY_DIFFER_IN_A_RUN
+        and (name != "eval_frequency" or wanted is not None)  # without one, a run keeps its own
+        and made.get(name, wanted) != wanted  # an older version did not have all options
+    ]
     if differences:
         fail(
             f"{run.folder} holds a finished run with {' and '.join(differences)}; choose another "
             "--runs-dir, or the same options after the --"
         )
     return True, ""
-
-
-def other_options(run, made_with):
-    """Say in which options that change its result a run differs from the one that made its folder.
-
-    made_with: the arguments in the folder's config.json. One that an older version did not have is
-    no difference.
-    """
-    differences = []
-    for name, wanted in run.options.items():
-        if name in MAY_DIFFER_IN_A_RUN or (name == "eval_frequency" and wanted is None):
-            continue  # where no frequency of tests is asked for, a run keeps its own
-        made = made_with.get(name, wanted)
-        if made != wanted:
-            differences.append(f"--{name.replace('_', '-')} {made}, not {wanted}")
-    return differences
 
 
 def command_line(run):

@@ -53,11 +53,11 @@ def parse_args(view, caller, argv):
     if preset not in PRESETS and not (preset is None and view == "status"):
         named = words[0] if words else ""
         fail(f"unknown preset {named!r}; choose one of {', '.join(PRESETS)}")
-    known = [f"--{name.replace('_', '-')}" for name in vars(parser.parse_args([]))]
+    known = flags(parser)
     given = {word.partition("=")[0] for word in words if word.startswith("--")}
     for name in sorted(given.difference(known)):
         fail(unknown_option(name, known))
-    parser.set_defaults(**PRESETS.get(preset, {}))
+    parser.set_defaults(**{"pairs": []} | PRESETS.get(preset, {}))
     args = parser.parse_args(words)
     if args.preset != preset:
         fail(f"the preset comes first: {args.preset} --...")
@@ -65,9 +65,8 @@ def parse_args(view, caller, argv):
     args.jobs, args.elsewhere = machines()
     args.runs_dir = from_project(caller, args.runs_dir)
     args.metric = args.metric.replace("_", " ")
-    args.noises_of = preset
     if args.noises == [[("paper", None)]]:
-        args.noises_of, args.noises = "paper", []
+        args.pairs, args.noises = PRESETS["paper"]["pairs"], []
     # a status that names no grid is one of whatever the folder holds
     whole_folder = preset in (None, "custom") and given <= {"--runs-dir"}
     args.names_grid = view != "status" or not whole_folder
@@ -153,7 +152,7 @@ def script_options(algorithm, words):
             fail(f"{flag} is part of the grid: use {GIVEN_BY_THE_GRID[flag]}, before the --")
     options, unknown = parser_of(algorithm).parse_known_args(words)
     if unknown:
-        near = difflib.get_close_matches(unknown[0], flags_of(algorithm), n=1)
+        near = difflib.get_close_matches(unknown[0], flags(parser_of(algorithm)), n=1)
         hint = f"; did you mean {near[0]}?" if near else ""
         fail(f"{script_of(algorithm)} has no option {unknown[0]}{hint}")
     if options.overwrite:
@@ -161,14 +160,14 @@ def script_options(algorithm, words):
     return vars(options)
 
 
-def flags_of(algorithm):
-    """Return the options of a script that are not the grid's."""
-    return [f"--{name.replace('_', '-')}" for name in vars(parser_of(algorithm).parse_args([]))]
+def flags(parser):
+    """Return the options of a parser."""
+    return [f"--{name.replace('_', '-')}" for name in vars(parser.parse_args([]))]
 
 
 def unknown_option(name, known):
     """Say what to write instead of an option that the grid does not have."""
-    of_scripts = {flag for algorithm in SEEDS for flag in flags_of(algorithm)}
+    of_scripts = {flag for algorithm in SEEDS for flag in flags(parser_of(algorithm))}
     if name in of_scripts:
         return f"{name} is an option of the scripts: put it at the end, after --"
     if name in EXECUTOR_OPTIONS:  # benchmark.sh reads it, unless it is written with a value
