@@ -31,7 +31,7 @@ NO_SUCCESS = "it tells no `is_success` or `success`, as --metric success_rate ne
 class Choice(NamedTuple):
     """The choice of a noise for one algorithm and environment, as far as it has come."""
 
-    kind: tuple[str, str]  # algorithm, environment
+    kind: tuple[str, str]  # algorithm, in capitals, and environment
     noises: int  # that it began with
     schedule: list[tuple[int, int]]  # of its search
     state: halving.State
@@ -44,7 +44,7 @@ class Choice(NamedTuple):
     @property
     def name(self):
         """The choice in a sentence."""
-        return f"{self.kind[0].upper()} on {self.kind[1]}"
+        return " on ".join(self.kind)
 
 
 def choices(args):
@@ -89,8 +89,7 @@ def untried(args, env_id, environment):
     """
     tried = environment.tried if environment else {}
     noises = candidates(args, args.algos[0], env_id)
-    fit = None if args.noises else environment
-    kept = candidates(args, args.algos[0], env_id, fit.tried if fit else {})
+    kept = candidates(args, args.algos[0], env_id, None if args.noises else environment)
     walks = (walk(args, algorithm, env_id, kept, len(kept)) for algorithm in args.algos)
     if not any(returns for _, _, _, returns in walks):
         return noises
@@ -112,7 +111,7 @@ def follow(args, algorithm, env_id, environment):
 
     environment: what is known of it, or None.
     """
-    noises = candidates(args, algorithm, env_id, environment.tried if environment else {})
+    noises = candidates(args, algorithm, env_id, environment)
     budget = 3 * len(noises) if args.budget is None else args.budget
     if budget < len(noises):
         fail(f"--budget must be at least {len(noises)}, a run for each noise, not {budget}")
@@ -135,7 +134,7 @@ def follow(args, algorithm, env_id, environment):
     seconds = wall_time(map(runs.get, returns))
     if environment and seconds is None:
         seconds = run_seconds(next(iter(runs.values())), environment)
-    kind = algorithm, env_id
+    kind = algorithm.upper(), env_id
     results, problem = set().union(*(values for _, values, _ in tests.values())), ""
     over = state.rounds or not state.due  # the first batch
     if over and args.metric == SUCCESS and not any(told for _, _, told in tests.values()):
@@ -188,11 +187,12 @@ def read(run):
     return run._replace(damage=damage), None
 
 
-def candidates(args, algorithm, env_id, tried=()):
+def candidates(args, algorithm, env_id, environment=None):
     """Return the noises to choose from, each once, but for those that cannot act there.
 
-    tried: see Environment. Exits if the user has named one that cannot act.
+    environment: what is known of it, or None. Exits if the user has named one that cannot act.
     """
+    tried = environment.tried if environment else {}
     noises = dict.fromkeys(configurations(args, algorithm, env_id))
     noises.pop(BASELINE, None)  # at rate 0 a noise is none
     if any(rate is None for pairs in args.exclude for _, rate in pairs):
@@ -313,8 +313,7 @@ def report(found, args):
     judged, rows = verdicts(found, args), []
     print(*(sentence for _, sentence in judged), sep="\n", flush=True)
     for choice, (helped, _) in zip(found, judged, strict=True):
-        names = choice.kind[0].upper(), choice.kind[1]
-        rows += halving.records(*names, choice.state, choice.returns, helped)
+        rows += halving.records(*choice.kind, choice.state, choice.returns, helped)
     write_choice(Path(args.runs_dir, choice_file(args.metric)), rows)
 
 
