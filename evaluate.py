@@ -68,6 +68,7 @@ from noisy_wrappers import (
     NotFiniteError,
     SpaceError,
     canonical_env_id,
+    check_numbers,
     kept_generators,
     make_flat,
     module_path,
@@ -304,29 +305,27 @@ def play(run, condition, args):
 
 def draw(run, condition, args):
     """Play an episode in a window or into a video; return its result."""
-    place = f"__{slug(run.elsewhere)}" if run.elsewhere else ""
-    name = f"{run.folder.name}__{condition.slug or 'clean'}{place}.mp4"
     with load(run, "human" if args.render else "rgb_array") as (env, policy):
         noisy_env = add_noise(env, condition)
-        if args.video:
-            [result] = record(noisy_env, policy, args.seed, args.video / name)
-        else:
-            [result] = play_episodes(noisy_env, policy, 1, args.seed)
-        return result
+        if args.render:
+            return play_episodes(noisy_env, policy, 1, args.seed)[0]
+        place = f"__{slug(run.elsewhere)}" if run.elsewhere else ""
+        name = f"{run.folder.name}__{condition.slug or 'clean'}{place}.mp4"
+        return record(noisy_env, policy, args.seed, args.video / name)
 
 
 def record(env, policy, seed, path):
-    """Play one episode into a video; return what play_episodes does."""
+    """Play an episode into a video; return its result."""
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".") as temporary:
         folder = Path(temporary, "video")  # a new one: RecordVideo warns of one that exists
         video = RecordVideo(env, str(folder))  # of the first episode
         try:
-            results = play_episodes(video, policy, 1, seed)
+            [result] = play_episodes(video, policy, 1, seed)
         finally:
             if video.recording:
                 video.stop_recording()
         (folder / "rl-video-episode-0.mp4").replace(path)
-    return results
+    return result
 
 
 def play_episodes(env, policy, number, seed):
@@ -518,17 +517,15 @@ def show(runs, conditions, args):
 
 def main(args):
     """Check everything, play what is not stored, print the table; return the exit status."""
-    for name, least in (("episodes", 1), ("jobs", 1), ("seed", 0)):
-        if getattr(args, name) < least:
-            fail(f"--{name} must be at least {least}, not {getattr(args, name)}")
     if args.render and args.video:
         fail("--render and --video exclude each other")
     if args.render and not works(DISPLAY):
         fail("--render needs a display; --video FOLDER makes videos without one")
     os.environ["OMP_NUM_THREADS"] = "1"  # before the scripts import PyTorch; processes inherit it
-    runs, bad = find_runs(args.runs)
-    named = [name for text in args.noises for name in split_noises(text)]
     try:
+        check_numbers(vars(args))
+        runs, bad = find_runs(args.runs)
+        named = [name for text in args.noises for name in split_noises(text)]
         for run, name in itertools.product(runs, [*named, args.env_id or ""]):
             refuse_foreign_module(run, name)
         conditions = read_conditions(args)
@@ -551,10 +548,8 @@ def main(args):
     stored = check_runs(runs, conditions, bad, args.storing)
     runs = list(stored)
     tell(bad)
-    if not runs and bad:
-        return 2
     if not runs:
-        fail(f"there is no finished run in {', '.join(map(str, args.runs))}")
+        return 2 if bad else fail(f"there is no finished run in {', '.join(map(str, args.runs))}")
     if args.video:
         try:
             args.video.mkdir(parents=True, exist_ok=True)
