@@ -42,43 +42,13 @@ from gymnasium.wrappers import RecordVideo
 from tabulate import tabulate
 from tqdm import tqdm
 
+import noisy_wrappers as noisy
+from analysis import folders
 from analysis.errors import fail, in_words, take_over_terminal, with_place
-from analysis.folders import (
-    PHASES,
-    DamageError,
-    difference,
-    has_begun,
-    is_run,
-    read_config,
-    read_result,
-    runs_of,
-)
+from analysis.folders import PHASES, DamageError
 from analysis.formatting import slug
-from analysis.runs import (
-    ROBUSTNESS_COLUMNS,
-    script_name,
-    study_name,
-    usual_settings,
-    where_tested,
-)
+from analysis.runs import ROBUSTNESS_COLUMNS, script_name, study_name, usual_settings, where_tested
 from analysis.statistics import mean_std
-from noisy_wrappers import (
-    BASELINE,
-    Configuration,
-    NotFiniteError,
-    SpaceError,
-    canonical_env_id,
-    check_numbers,
-    kept_generators,
-    make_flat,
-    module_path,
-    outcome,
-    reason,
-    refusals,
-    rounded,
-    seed_globals,
-    split_noises,
-)
 
 DISPLAY = "import glfw; assert glfw.init() and glfw.get_primary_monitor()"
 
@@ -120,7 +90,7 @@ class FinishedRun:
     algorithm: str
     exp_name: str
     environment: str
-    configuration: Configuration
+    configuration: noisy.Configuration
     settings: dict  # the other arguments
     elsewhere: str = ""  # another environment to be tested in
 
@@ -153,23 +123,23 @@ def find_runs(paths):
     """
     if not paths:
         fail("name the runs to test, for example: python evaluate.py runs/*Hopper-v5*")
-    folders = {}
+    named = {}
     for path in map(Path.expanduser, paths):
-        found = [path] if is_run(path) else runs_of(path)
+        found = [path] if folders.is_run(path) else folders.runs_of(path)
         if not os.path.lexists(path) or (len(paths) == 1 and not found):
             fail(f"{path} is neither a run nor a folder of runs")
         for folder in found:
-            folders.setdefault(folder.resolve(), folder.absolute())
+            named.setdefault(folder.resolve(), folder.absolute())
     runs, damaged = [], {}
-    for folder in folders.values():
+    for folder in named.values():
         try:
-            config = read_config(folder) if has_begun(folder) else None
-            if config and read_result(folder, config):
+            config = folders.read_config(folder) if folders.has_begun(folder) else None
+            if config and folders.read_result(folder, config):
                 names = "algorithm", "exp_name", "environment", "configuration", "settings"
                 runs.append(FinishedRun(folder, *(config[name] for name in names)))
         except DamageError as error:
             damaged[folder] = str(error)
-    unfinished = len(folders) - len(runs) - len(damaged)
+    unfinished = len(named) - len(runs) - len(damaged)
     if unfinished:
         print(f"unfinished runs are left out: {unfinished}")
     return runs, damaged
@@ -180,13 +150,13 @@ def read_conditions(args):
 
     Raises ValueError.
     """
-    conditions = {BASELINE: None}  # a dictionary keeps each once, in order; a rate of 0 is clean
+    conditions = [noisy.BASELINE]
     for noise, rate in itertools.product(args.noises, args.noise_rates):
-        configuration = Configuration.read(split_noises(noise), [rate])
+        configuration = noisy.Configuration.read(noisy.split_noises(noise), [rate])
         if any(start != end for start, end in configuration.rates):
             raise ValueError(f"--noise-rates {rate}: policies are tested at constant rates")
-        conditions[configuration] = None
-    return list(conditions)
+        conditions.append(configuration)
+    return list(dict.fromkeys(conditions))  # each once, in order; a rate of 0 is clean
 
 
 @contextmanager
@@ -201,15 +171,15 @@ def load(run, render_mode=None):
         """Make a clean environment as the script does."""
         try:
             env = gym.make(env_id, disable_env_checker=True, max_episode_steps=steps, **kwargs)
-            return make_flat(env, script.STEP_LIMIT)
-        except refusals(env_id) as error:
-            raise ValueError(reason(error)) from error
+            return noisy.make_flat(env, script.STEP_LIMIT)
+        except noisy.refusals(env_id) as error:
+            raise ValueError(noisy.reason(error)) from error
 
     for environment in (run.environment, run.tested_in):
-        canonical_env_id(environment)  # imports its module
+        noisy.canonical_env_id(environment)  # imports its module
     steps = run.settings.get("max_episode_steps")
     drawn = {"render_mode": render_mode} if render_mode else {}  # not every class takes it
-    seed_globals(Args.seed)  # as every episode does: the constructor may draw, too
+    noisy.seed_globals(Args.seed)  # as every episode does: the constructor may draw, too
     with make_env(run.tested_in, **drawn) as env:
         if run.elsewhere:
             with make_env(run.environment) as trained_in:
@@ -240,7 +210,7 @@ def refuse_foreign_module(run, name):
     """
     module, colon, _ = name.partition("(")[0].rpartition(":")
     first, *rest = module.strip().split(".")
-    spec = PathFinder.find_spec(first, module_path()) if colon else None  # executes nothing
+    spec = PathFinder.find_spec(first, noisy.module_path()) if colon else None  # executes nothing
     here, project, folder = Path.cwd(), Path(__file__).resolve().parent, run.folder.resolve()
     for found in (spec.submodule_search_locations or [spec.origin]) if spec else ():
         entry, top = Path(found).parent.resolve(), Path(found).resolve()
@@ -286,10 +256,10 @@ def add_noise(env, condition):
 
 def tell(bad):
     """Print each reason why runs cannot be tested, with the first of them; bad: see check_runs."""
-    folders = {}
+    folders_of = {}
     for folder, text in bad.items():
-        folders.setdefault(text, []).append(folder)
-    for text, (first, *others) in folders.items():
+        folders_of.setdefault(text, []).append(folder)
+    for text, (first, *others) in folders_of.items():
         more = f" and {len(others)} more" if others else ""
         print(f"error: {first}{more}: {text}", file=sys.stderr)
 
@@ -334,15 +304,15 @@ def play_episodes(env, policy, number, seed):
     Success is 1 or 0, or NaN where the environment does not tell it.
     """
     results = []
-    with kept_generators(env):
+    with noisy.kept_generators(env):
         for episode in range(number):
-            seed_globals(seed + episode)
+            noisy.seed_globals(seed + episode)
             observation, _ = env.reset(seed=seed + episode)
             terminated = truncated = False
             while not (terminated or truncated):
                 observation, _, terminated, truncated, info = env.step(policy(observation))
             record = info["episode"]  # the return is a sum of numbers or of arrays
-            results.append((np.asarray(record["r"]).item(), int(record["l"]), outcome(info)))
+            results.append((np.asarray(record["r"]).item(), int(record["l"]), noisy.outcome(info)))
     return results
 
 
@@ -351,7 +321,7 @@ def attempt(play, run, condition, args):
     try:
         return play(run, condition, args)
     except Exception as error:  # of the environment, or of any library that draws
-        return with_place(error, (NotFiniteError, SpaceError))
+        return with_place(error, (noisy.NotFiniteError, noisy.SpaceError))
 
 
 def play_all(play, tasks, args):
@@ -440,7 +410,8 @@ def names_of(runs):
     usual = {key: usual_settings(settings) for key, settings in studies.items()}
     for run in runs:
         key = run.study
-        own = [f"{name}={run.settings[name]}" for name in difference(run.settings, usual[key])]
+        differing = folders.difference(run.settings, usual[key])
+        own = [f"{name}={run.settings[name]}" for name in differing]
         yield ", ".join([study_name(*key), *own])
 
 
@@ -473,9 +444,9 @@ def mean_return(played, episodes):
     """
     results = np.array([results[:episodes] for results in played])
     mean, spread, n = mean_std(results[..., 0].mean(axis=1))
-    text = rounded(mean, spread)
+    text = noisy.rounded(mean, spread)
     if n > 1:
-        text += f" ± {rounded(spread, spread)}"
+        text += f" ± {noisy.rounded(spread, spread)}"
     success = results[..., 2]
     return text if np.isnan(success).all() else f"{text}, {100 * (success > 0).mean():.0f} % solved"
 
@@ -511,7 +482,7 @@ def show(runs, conditions, args):
             print(f"error: cannot draw {name}: {result}", file=sys.stderr)
             failed = True
         else:
-            print(f"{name}: return {rounded(result[0])}, {result[1]} steps")
+            print(f"{name}: return {noisy.rounded(result[0])}, {result[1]} steps")
     return failed
 
 
@@ -523,9 +494,9 @@ def main(args):
         fail("--render needs a display; --video FOLDER makes videos without one")
     os.environ["OMP_NUM_THREADS"] = "1"  # before the scripts import PyTorch; processes inherit it
     try:
-        check_numbers(vars(args))
+        noisy.check_numbers(vars(args))
         runs, bad = find_runs(args.runs)
-        named = [name for text in args.noises for name in split_noises(text)]
+        named = [name for text in args.noises for name in noisy.split_noises(text)]
         for run, name in itertools.product(runs, [*named, args.env_id or ""]):
             refuse_foreign_module(run, name)
         conditions = read_conditions(args)
@@ -541,7 +512,7 @@ def main(args):
         draw_without_display()
     if args.env_id:
         try:
-            env_id = canonical_env_id(args.env_id)
+            env_id = noisy.canonical_env_id(args.env_id)
         except ValueError as error:
             fail(f"--env-id: {error}")
         runs = [replace(run, elsewhere=env_id * (env_id != run.environment)) for run in runs]
