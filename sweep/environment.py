@@ -117,10 +117,9 @@ def why_unfit(env, configuration, time_limit, deadline):
     except ValueError as error:
         return noisy.reason(error)
     for wrapper in noisy.noise_wrappers(noisy_env).values():
-        if isinstance(wrapper, noisy.RandomEarlyTermination) and not wrapper.each_step:
-            last = time_limit - 1 if wrapper.truncate else time_limit  # truncated there anyway
-            if wrapper.low > last:
-                return f"an episode has at most {time_limit} steps"
+        ends = isinstance(wrapper, noisy.RandomEarlyTermination) and not wrapper.each_step
+        if ends and wrapper.low + wrapper.truncate > time_limit:  # which truncates there anyway
+            return f"an episode has at most {time_limit} steps"
     try:
         if time.perf_counter() < deadline:
             noisy_env.reset()
