@@ -173,8 +173,8 @@ def shortened(value):
 
 def difference(settings, reference):
     """Return the names of the settings that both have, with different values, in order."""
-    return [name for name in sorted(settings.keys() & reference.keys())
-            if settings[name] != reference[name]]  # fmt: skip
+    shared = sorted(settings.keys() & reference.keys())
+    return [name for name in shared if settings[name] != reference[name]]
 
 
 # -------------------------------------------------------------------------------- the lock, the log
