@@ -64,8 +64,7 @@ slurm_task() { # LINES OFFSET: one task of a job array, requeued if it was stopp
 
 run_local() { # nproc obeys OMP_NUM_THREADS, which is about the threads of one process
   local cores folder command
-  cores=$(env -u OMP_NUM_THREADS -u OMP_THREAD_LIMIT nproc 2>/dev/null) ||
-    cores=$(getconf _NPROCESSORS_ONLN)
+  cores=$(env -u OMP_NUM_THREADS -u OMP_THREAD_LIMIT nproc)
   while IFS=$'\t' read -r folder command; do
     while [ "$(jobs -pr | wc -l)" -ge "${jobs:-$cores}" ]; do wait -n || true; done
     : 2>/dev/null >>"$(log_of "$folder")" || continue # the report says why
@@ -80,8 +79,7 @@ stop_local() { kill -TERM -- "-$group"; } # run_local ends at once, the runs aft
 run_parallel() { # --termseq: where a connection is lost, the runs get TERM and are left in peace
   trap '' HUP
   local chatter='^parallel: (SIGHUP|Waiting for|\./benchmark)|will not be transferred'
-  local options=(--jobs "${jobs:-100%}" --joblog "+$logs/joblog.tsv")
-  options+=(--termseq "TERM,600000")
+  local options=(--jobs "${jobs:-100%}" --joblog "+$logs/joblog.tsv" --termseq "TERM,600000")
   [ -z "$remote_dir" ] || options+=(--transferfile '{1}' --return '{1}')
   parallel "${parallel_options[@]}" "${options[@]}" --line-buffer --tagstring '{1}' --colsep '\t' \
     ./benchmark.sh run-one "$sweep" '{1}' '{2}' :::: "$list" 2> >(grep -Ev "$chatter" >&2) |
