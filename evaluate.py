@@ -18,7 +18,6 @@ never from a folder of runs. Runs that cannot be tested are listed; the exit sta
 """
 
 import csv
-import fcntl
 import importlib
 import itertools
 import multiprocessing
@@ -371,35 +370,21 @@ def read_stored(run):
 
 def store(run, key, results):
     """Add a condition to robustness.csv, beside what other processes have stored meanwhile."""
+    path = run.folder / "robustness.csv"
     try:
-        with open(run.folder / ".robustness.lock", "a", encoding="utf-8") as lock:
-            fcntl.lockf(lock, fcntl.LOCK_EX)  # until it is closed
+        with folders.rewritten(path) as file:
             stored = read_stored(run)
-            if len(stored.get(key, [])) < len(results):
-                write_stored(run, stored | {key: results})
-    except (OSError, DamageError) as error:
-        fail(f"cannot write {run.folder / 'robustness.csv'}: {error}", code=1)
-
-
-def write_stored(run, stored):
-    """Write robustness.csv, whole or not at all."""
-    rows = [
-        (*condition, i, *result, environment or None)
-        for (*condition, environment), results in stored.items()
-        for i, result in enumerate(results)
-    ]
-    table = pd.DataFrame(rows, columns=[*ROBUSTNESS_COLUMNS, "success", "environment"])
-    table = table.astype({"success": "Int64"}).dropna(axis="columns", how="all")
-    # not *.tmp, which the training command deletes when it is called again
-    temporary = run.folder / f".robustness.{os.getpid()}"
-    try:
-        with open(temporary, "w", encoding="utf-8") as file:
+            stored[key] = max(stored.get(key, []), results, key=len)
+            rows = [
+                (*condition, i, *result, environment or None)
+                for (*condition, environment), played in stored.items()
+                for i, result in enumerate(played)
+            ]
+            table = pd.DataFrame(rows, columns=[*ROBUSTNESS_COLUMNS, "success", "environment"])
+            table = table.astype({"success": "Int64"}).dropna(axis="columns", how="all")
             table.to_csv(file, index=False)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(run.folder / "robustness.csv")
-    finally:
-        temporary.unlink(missing_ok=True)
+    except (OSError, DamageError) as error:
+        fail(f"cannot write {path}: {error}", code=1)
 
 
 def names_of(runs):

@@ -177,6 +177,22 @@ def difference(settings, reference):
     return [name for name in shared if settings[name] != reference[name]]
 
 
+@contextmanager
+def rewritten(path):
+    """Yield a file that replaces `path` in the end, whole or not at all; one process at a time."""
+    new = path.with_name(f".{path.stem}.{os.getpid()}")  # not *.tmp, which training again deletes
+    with open(path.with_name(f".{path.stem}.lock"), "a", encoding="utf-8") as lock:
+        fcntl.lockf(lock, fcntl.LOCK_EX)  # until it is closed
+        try:
+            with open(new, "w", newline="", encoding="utf-8") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(new, path)
+        finally:
+            new.unlink(missing_ok=True)
+
+
 # -------------------------------------------------------------------------------- the lock, the log
 
 

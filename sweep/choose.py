@@ -5,7 +5,6 @@ command computes from the finished runs where each choice stands.
 """
 
 import csv
-import fcntl
 import itertools
 import math
 import os
@@ -16,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from analysis.errors import fail, in_words
-from analysis.folders import CONFIRMATION, SEARCH, flat_choice
+from analysis.folders import CONFIRMATION, SEARCH, flat_choice, rewritten
 from analysis.runs import CHOICE_COLUMNS, SUCCESS, choice_file, read_run
 from analysis.statistics import detectable_shift, holm
 from analysis.verdicts import POINTS, what_all_runs_do
@@ -354,22 +353,18 @@ def obstacle(choice, choices):
 
 
 def write_choice(path, new):
-    """Write choice.csv whole or not at all; it keeps what other commands have chosen.
+    """Write choice.csv; it keeps what other commands have chosen.
 
     new: rows of halving.records.
     """
     rows, chosen_now = [CHOICE_COLUMNS], {row[:2] for row in new}
-    temporary = path.with_suffix(".tmp")
     try:
-        with open(path.with_name(".choice.lock"), "w", encoding="utf-8") as lock:
-            fcntl.lockf(lock, fcntl.LOCK_EX)  # until it is closed: commands may end side by side
+        with rewritten(path) as file:  # other commands may end at the same time
             if path.exists():
-                with open(path, newline="", encoding="utf-8") as file:
-                    rows = [row for row in csv.reader(file) if tuple(row[:2]) not in chosen_now]
+                with open(path, newline="", encoding="utf-8") as old:
+                    rows = [row for row in csv.reader(old) if tuple(row[:2]) not in chosen_now]
             if rows[:1] != [CHOICE_COLUMNS]:
                 raise ValueError(f"its columns are not {','.join(CHOICE_COLUMNS)}")
-            with open(temporary, "w", newline="", encoding="utf-8") as file:
-                csv.writer(file, lineterminator="\n").writerows(rows + new)
-            os.replace(temporary, path)
+            csv.writer(file, lineterminator="\n").writerows(rows + new)
     except (OSError, ValueError) as error:
         fail(f"cannot write {path} ({in_words(error)})")
