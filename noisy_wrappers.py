@@ -49,7 +49,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import gymnasium as gym
 import numpy as np
@@ -68,7 +68,8 @@ __version__ = "0.3.0"
 Env = gym.Env[Any, Any]
 Info = dict[str, Any]
 Step = tuple[Any, Any, bool, bool, Info]  # observation, reward, terminated, truncated, info
-Keys = tuple[str | int, ...]  # of a Dict observation; of a Tuple, indices
+Rate = float | str  # a number, or "start:end"
+Keys = tuple[str | int, ...] | None  # of a Dict observation; of a Tuple, indices
 EntryPath = tuple[Any, ...]  # the keys that lead to an entry of nested observations
 
 
@@ -120,7 +121,7 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     kind: ClassVar[str]  # what it perturbs: "observation", "reward", "action" or "dynamics"
 
-    def __init__(self, env: Env, noise_rate: float | str, **parameters: Any):
+    def __init__(self, env: Env, noise_rate: Rate, **parameters: Any):
         """Raise ValueError unless noise_rate is in [0, 1] or "start:end" of two such rates.
 
         Nor may ``env`` reset itself, by ``gymnasium.wrappers.Autoreset``.
@@ -257,9 +258,7 @@ class ObservationNoise(NoiseWrapper):
 
     kind = "observation"
 
-    def __init__(
-        self, env: Env, noise_rate: float | str, *, keys: Keys | None = None, **parameters: Any
-    ):
+    def __init__(self, env: Env, noise_rate: Rate, *, keys: Keys = None, **parameters: Any):
         """Raise ValueError unless observations contain numbers, and keys are those of the space."""
         self.keys = _keys(keys)
         super().__init__(env, noise_rate, **parameters, keys=self.keys)
@@ -375,11 +374,11 @@ class RandomNormalNoisyObservation(ObservationNoise):
     def __init__(
         self,
         env: Env,
-        noise_rate: float | str,
+        noise_rate: Rate,
         scale: float | tuple[float, ...],
         *,
         loc: float = 0.0,
-        keys: Keys | None = None,
+        keys: Keys = None,
     ):
         """Raise ValueError unless scale >= 0, both are finite and a tuple fits the observation."""
         self.scale = _scale_or_scales(scale)
@@ -411,15 +410,7 @@ class RandomUniformNoisyObservation(ObservationNoise):
     array([ 0.01826801, -0.01052575, -0.1353507 , -0.00589376], dtype=float32)
     """
 
-    def __init__(
-        self,
-        env: Env,
-        noise_rate: float | str,
-        low: float,
-        high: float,
-        *,
-        keys: Keys | None = None,
-    ):
+    def __init__(self, env: Env, noise_rate: Rate, low: float, high: float, *, keys: Keys = None):
         """Raise ValueError unless low <= high and both are finite."""
         self.low, self.high = _interval(low, high)
         super().__init__(env, noise_rate, low=self.low, high=self.high, keys=keys)
@@ -444,23 +435,18 @@ class RandomUniformScaleObservation(ObservationNoise):
     def __init__(
         self,
         env: Env,
-        noise_rate: float | str,
+        noise_rate: Rate,
         low: float,
         high: float,
         *,
         per_dimension: bool = False,
-        keys: Keys | None = None,
+        keys: Keys = None,
     ):
         """Raise ValueError unless low <= high, both are finite and per_dimension is a bool."""
         self.low, self.high = _interval(low, high)
         self.per_dimension = _flag("per_dimension", per_dimension)
         super().__init__(
-            env,
-            noise_rate,
-            low=self.low,
-            high=self.high,
-            per_dimension=self.per_dimension,
-            keys=keys,
+            env, noise_rate, low=self.low, high=self.high, per_dimension=per_dimension, keys=keys
         )
         self._widen(lambda bound: (bound * self.low, bound * self.high))
 
@@ -491,11 +477,11 @@ class RandomMixupObservation(ObservationNoise):
     def __init__(
         self,
         env: Env,
-        noise_rate: float | str,
+        noise_rate: Rate,
         factor: float,
         *,
         recursive: bool = False,
-        keys: Keys | None = None,
+        keys: Keys = None,
     ):
         """Raise ValueError unless factor is in [0, 1] and recursive is a bool."""
         self.factor = _number("factor", factor, low=0, high=1)
@@ -537,9 +523,7 @@ class RandomDropoutObservation(ObservationNoise):
     array([0.01369617, 0.        , 0.        , 0.        ], dtype=float32)
     """
 
-    def __init__(
-        self, env: Env, noise_rate: float | str, keep_prob: float, *, keys: Keys | None = None
-    ):
+    def __init__(self, env: Env, noise_rate: Rate, keep_prob: float, *, keys: Keys = None):
         """Raise ValueError unless keep_prob is in [0, 1]."""
         self.keep_prob = _number("keep_prob", keep_prob, low=0, high=1)
         super().__init__(env, noise_rate, keep_prob=self.keep_prob, keys=keys)
@@ -587,7 +571,7 @@ class RandomNormalNoisyReward(RewardNoise):
     1.1210431182607201
     """
 
-    def __init__(self, env: Env, noise_rate: float | str, scale: float, *, loc: float = 0.0):
+    def __init__(self, env: Env, noise_rate: Rate, scale: float, *, loc: float = 0.0):
         """Raise ValueError unless scale >= 0 and both are finite."""
         self.scale = _number("scale", scale, low=0)
         self.loc = _number("loc", loc)
@@ -609,7 +593,7 @@ class RandomUniformNoisyReward(RewardNoise):
     0.9380732431402061
     """
 
-    def __init__(self, env: Env, noise_rate: float | str, low: float, high: float):
+    def __init__(self, env: Env, noise_rate: Rate, low: float, high: float):
         """Raise ValueError unless low <= high and both are finite."""
         self.low, self.high = _interval(low, high)
         super().__init__(env, noise_rate, low=self.low, high=self.high)
@@ -630,7 +614,7 @@ class RandomUniformScaleReward(RewardNoise):
     0.778865122592071
     """
 
-    def __init__(self, env: Env, noise_rate: float | str, low: float, high: float):
+    def __init__(self, env: Env, noise_rate: Rate, low: float, high: float):
         """Raise ValueError unless low <= high and both are finite."""
         self.low, self.high = _interval(low, high)
         super().__init__(env, noise_rate, low=self.low, high=self.high)
@@ -660,7 +644,7 @@ class RandomNormalNoisyAction(NoiseWrapper):
 
     kind = "action"
 
-    def __init__(self, env: Env, noise_rate: float | str, scale: float, *, loc: float = 0.0):
+    def __init__(self, env: Env, noise_rate: Rate, scale: float, *, loc: float = 0.0):
         """Raise ValueError unless scale >= 0, both are finite and actions are a Box of floats."""
         self.scale = _number("scale", scale, low=0)
         self.loc = _number("loc", loc)
@@ -712,7 +696,7 @@ class RandomActionDelay(NoiseWrapper):
 
     kind = "action"
 
-    def __init__(self, env: Env, noise_rate: float | str, low: int, high: int | None = None):
+    def __init__(self, env: Env, noise_rate: Rate, low: int, high: int | None = None):
         """Raise ValueError unless 0 <= low <= high are integers."""
         self.low, self.high = _whole_interval(low, high, least=0)
         unlike = None if self.high == self.low else self.high
@@ -766,7 +750,7 @@ class RandomEarlyTermination(NoiseWrapper):
     def __init__(
         self,
         env: Env,
-        noise_rate: float | str,
+        noise_rate: Rate,
         low: int | None = None,
         high: int | None = None,
         *,
@@ -869,7 +853,7 @@ class RandomDynamics(NoiseWrapper):
     def __init__(
         self,
         env: Env,
-        noise_rate: float | str,
+        noise_rate: Rate,
         low: float,
         high: float,
         *,
@@ -1011,7 +995,7 @@ class Noise:
     kwargs: tuple[tuple[str, Any], ...] = ()
     module: str = ""  # of a wrapper that is not ours
 
-    def __call__(self, env: Env, noise_rate: float | str) -> NoiseWrapper:
+    def __call__(self, env: Env, noise_rate: Rate) -> NoiseWrapper:
         """Wrap an environment."""
         return self.wrapper(env, noise_rate, *self.args, **dict(self.kwargs))
 
@@ -1157,9 +1141,7 @@ class Configuration:
     rates: tuple[tuple[float, float], ...] = ()  # of each, at the start and the end of training
 
     @classmethod
-    def read(
-        cls, noises: Sequence[str], rates: Sequence[float | str], *, stored: bool = False
-    ) -> "Configuration":
+    def read(cls, noises: Sequence[str], rates: Sequence[Rate], *, stored: bool = False) -> Self:
         """Check noises and rates and make them canonical.
 
         One rate serves all noises; it is a number in [0, 1], or "start:end" of two such numbers,
@@ -1192,7 +1174,7 @@ class Configuration:
         return cls(tuple(str(noise) for noise, _ in pairs), tuple(rate for _, rate in pairs))
 
     @classmethod
-    def parse(cls, noise: str, noise_rate: float | str) -> "Configuration":
+    def parse(cls, noise: str, noise_rate: Rate) -> Self:
         """Read two cells of a csv file, :attr:`columns` or :attr:`noise` and :attr:`noise_rate`.
 
         Nothing is checked.
@@ -1203,7 +1185,7 @@ class Configuration:
         return cls(tuple(split_noises(noise)), tuple((float(r[0]), float(r[-1])) for r in rates))
 
     @property
-    def texts(self) -> tuple[list[str], list[float | str]]:
+    def texts(self) -> tuple[list[str], list[Rate]]:
         """The noises and the rates as config.json holds them and the scripts read them."""
         return list(self.noises), [_as_written(rate) for rate in self.rates]
 
@@ -1317,11 +1299,7 @@ def _place(wrapper: type[NoiseWrapper]) -> int:
 
 
 def make_noisy(
-    env: Env,
-    noises: Sequence[str],
-    rates: Sequence[float | str],
-    *,
-    record_statistics: bool = True,
+    env: Env, noises: Sequence[str], rates: Sequence[Rate], *, record_statistics: bool = True
 ) -> Env:
     """Stack noises on an environment, around a record of the true returns.
 
@@ -1467,7 +1445,7 @@ def _call_each(env: Any, method: str, *args: Any, **kwargs: Any) -> Sequence[Any
 
 
 def run_name(
-    env_id: str, exp_name: str, noises: Sequence[str], rates: Sequence[float | str], seed: int
+    env_id: str, exp_name: str, noises: Sequence[str], rates: Sequence[Rate], seed: int
 ) -> str:
     """Return the name of a run's folder, the same for all spellings of one configuration.
 
@@ -1679,7 +1657,7 @@ def _flag(name: str, value: bool) -> bool:
     return value
 
 
-def _keys(keys: Any) -> Keys | None:
+def _keys(keys: Any) -> Keys:
     """Check names or indices of observations; their order does not matter."""
     if keys is None:
         return None
@@ -1722,7 +1700,7 @@ def _is_field(name: Any) -> bool:
     return isinstance(array, np.ndarray) and array.dtype == np.float64
 
 
-def _schedule(noise_rate: float | str) -> tuple[float, float]:
+def _schedule(noise_rate: Rate) -> tuple[float, float]:
     """Return the rates at the beginning and at the end of training."""
     try:
         if isinstance(noise_rate, str):
@@ -1740,7 +1718,7 @@ def _schedule(noise_rate: float | str) -> tuple[float, float]:
         ) from None
 
 
-def _as_written(schedule: tuple[float, float]) -> float | str:
+def _as_written(schedule: tuple[float, float]) -> Rate:
     """Return a schedule as it is written: one number, or "start:end" where they differ."""
     start, end = schedule
     return start if start == end else f"{start}:{end}"
