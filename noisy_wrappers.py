@@ -1230,13 +1230,11 @@ class Configuration:
     @property
     def slug(self) -> str:
         """Part of a file's name: "p0.05_NormalNoisyReward_1.0", or "" for the baseline."""
-        return "_".join(self._rates_and_names())
-
-    def _rates_and_names(self) -> list[str]:
         if self.is_baseline:
-            return []
+            return ""
+        rates = "+".join(map(str, self.texts[1])).replace(":", "to")
         names = [_words(noise).removeprefix("Random") for noise in self.noises]
-        return ["p" + "+".join(map(_rate_word, self.rates)), "+".join(names)]
+        return f"p{rates}_{'+'.join(names)}"
 
     def wrap(self, env: Env, *, record_statistics: bool = True) -> Env:
         """Stack the noises on an environment, as :func:`make_noisy` says."""
@@ -1459,8 +1457,7 @@ def run_name(
     >>> run_name("ALE/Pong-v5", "ppo", [], [], seed=1)
     'baseline_s1__ALE-Pong-v5__ppo'
     """
-    configuration = Configuration.read(noises, rates)
-    rate, *names = configuration._rates_and_names() or ["baseline"]
+    rate, *names = (Configuration.read(noises, rates).slug or "baseline").split("_", 1)
     first = "_".join([rate, f"s{seed}", *names])
     end = f"__{safe_name(env_id)}__{safe_name(exp_name)}"
     if len(first + end) > 240:  # a file's name has at most 255 bytes
@@ -1477,10 +1474,6 @@ def _words(noise: str) -> str:
     if odd or (":" in name and re.search(r"""[(\[{'"]""", arguments)):  # own, not numbers only
         words += "_" + hashlib.sha256(noise.encode()).hexdigest()[:8]
     return words
-
-
-def _rate_word(rate: tuple[float, float]) -> str:
-    return str(_as_written(rate)).replace(":", "to")
 
 
 def safe_name(text: str) -> str:
