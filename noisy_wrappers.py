@@ -53,12 +53,7 @@ from typing import Any, ClassVar, Self
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import (
-    find_highest_version,
-    get_env_id,
-    load_env_creator,
-    parse_env_id,
-)
+from gymnasium.envs import registration
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
@@ -212,9 +207,8 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def _seed(self, seed: int | None) -> None:
         name = zlib.crc32(type(self).__name__.encode())
         entropy = None if seed is None else [seed, name, self._position]
-        gate, noise = np.random.SeedSequence(entropy).spawn(2)
-        self._gate = np.random.default_rng(gate)
-        self.noise = np.random.default_rng(noise)
+        seeds = np.random.SeedSequence(entropy).spawn(2)
+        self._gate, self.noise = map(np.random.default_rng, seeds)
 
     def acts(self) -> bool:
         """Decide with probability p whether the noise acts now: on this step, or in this episode.
@@ -235,9 +229,9 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._counted = True
         name = type(self).__name__
         below = info.get("noise")
-        if isinstance(below, tuple):  # of noise wrappers; anything else is the environment's own
-            return {**info, "noise": (*below, name)}
-        return {**info, "noise": (name,)}
+        if not isinstance(below, tuple):  # nothing, or the environment's own
+            below = ()
+        return {**info, "noise": (*below, name)}
 
 
 # ---------------------------------------------------------------------------- noise on observations
@@ -1591,9 +1585,8 @@ class _ProbeEnv(gym.Env[Any, Any]):
     So a wrapper leaves alone what only the environment can tell: its keys, its simulator.
     """
 
-    def __init__(self) -> None:
-        self.observation_space = gym.spaces.Box(-1.0, 1.0, (1,))
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+    observation_space = gym.spaces.Box(-1.0, 1.0, (1,))
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,))
 
 
 def _parameters(wrapper: type[NoiseWrapper]) -> list[inspect.Parameter]:
@@ -1984,15 +1977,15 @@ def canonical_env_id(env_id: str) -> str:
     if module:
         _import_module(module, f"there is no environment {env_id!r}")
     try:
-        namespace, base_name, version = parse_env_id(name)
+        namespace, base_name, version = registration.parse_env_id(name)
         if version is None:
-            version = find_highest_version(namespace, base_name)
-        spec = gym.spec(get_env_id(namespace, base_name, version))
+            version = registration.find_highest_version(namespace, base_name)
+        spec = gym.spec(registration.get_env_id(namespace, base_name, version))
     except gym.error.Error as error:
         raise ValueError(f"there is no environment {env_id!r}: {error}") from error
     if os.environ.get("MUJOCO_GL") and isinstance(spec.entry_point, str):
         try:
-            load_env_creator(spec.entry_point)
+            registration.load_env_creator(spec.entry_point)
         except Exception as error:  # gymnasium.make() will raise it again
             _raise_if_of_mujoco(error, env_id)
     return f"{module}{colon}{spec.id}"
