@@ -179,14 +179,13 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment; a seed also reseeds the noise. The rate follows its schedule."""
-        self._follow_schedule()
-        result = self.env.reset(seed=seed, options=options)
+        self._begin(seed)
+        return self.env.reset(seed=seed, options=options)
+
+    def _begin(self, seed: int | None) -> None:
+        self._noise_rate = float(np.interp(self._training_progress, (0.0, 1.0), self.schedule))
         if seed is not None:
             self._seed(seed)
-        return result
-
-    def _follow_schedule(self) -> None:
-        self._noise_rate = float(np.interp(self._training_progress, (0.0, 1.0), self.schedule))
 
     def state_dict(self) -> dict[str, Any]:
         """Return the random streams and the counters, to be taken between two episodes."""
@@ -658,10 +657,9 @@ class RandomNormalNoisyAction(NoiseWrapper):
         noise = self.noise.normal(self.loc, self.scale, space.shape)
         unclipped = np.asarray(action, np.float64) + noise
         noisy = np.asarray(np.clip(unclipped, space.low, space.high), space.dtype)
-        observation, reward, terminated, truncated, info = self.env.step(noisy)
-        if (noisy != np.asarray(action, space.dtype)).any():
-            info = self.mark(info)
-        return observation, reward, terminated, truncated, info
+        *result, info = self.env.step(noisy)
+        changed = (noisy != np.asarray(action, space.dtype)).any()
+        return *result, self.mark(info) if changed else info
 
 
 class RandomActionDelay(NoiseWrapper):
@@ -713,11 +711,9 @@ class RandomActionDelay(NoiseWrapper):
         self._actions.append(copy.deepcopy(action))  # the caller may reuse an array
         if len(self._actions) > self._delay + 1:
             self._actions.popleft()
-        delayed = copy.deepcopy(self._actions[0])
-        observation, reward, terminated, truncated, info = self.env.step(delayed)
-        if len(self._actions) > 1:  # so this step's action waits
-            info = self.mark(info)
-        return observation, reward, terminated, truncated, info
+        *result, info = self.env.step(copy.deepcopy(self._actions[0]))
+        waits = len(self._actions) > 1  # this step's action
+        return *result, self.mark(info) if waits else info
 
 
 class RandomEarlyTermination(NoiseWrapper):
@@ -874,37 +870,32 @@ class RandomDynamics(NoiseWrapper):
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Restore the model, perhaps change it anew, and reset the environment."""
         self._restore()
-        self._follow_schedule()
-        if seed is not None:
-            self._seed(seed)  # before the environment's own reset, which needs the new model
+        self._begin(seed)
         model = self._model()
         factors = self._draw(model)
         self._chosen = self.acts() and any((values != 1).any() for values in factors.values())
-        if self._chosen:
-            self._scale(model, factors)
-            scaled = {field: getattr(model, field).copy() for field in self.fields}
+        if not self._chosen:
+            return self.env.reset(seed=seed, options=options)
+        self._scale(model, factors)  # before the environment's own reset, which needs it
+        scaled = {field: getattr(model, field).copy() for field in self.fields}
         observation, info = self.env.reset(seed=seed, options=options)
-        if self._chosen:
-            now = self._model()
-            if now is not model:  # the environment has built or taken another one
-                self._restore()
-                if any(len(factors[name]) != len(getattr(now, name)) for name in self.fields):
-                    factors = self._draw(now)
-                self._scale(now, factors)
-            elif own := [name for name in scaled if (getattr(model, name) != scaled[name]).any()]:
-                raise ValueError(
-                    f"fields: this environment's reset() sets {own[0]} itself, so that no factor "
-                    "of RandomDynamics is left"
-                )
-            info = {**self.mark(info), "dynamics": factors}
-        return observation, info
+        now = self._model()
+        if now is not model:  # the environment has built or taken another one
+            self._restore()
+            if any(len(factors[name]) != len(getattr(now, name)) for name in self.fields):
+                factors = self._draw(now)
+            self._scale(now, factors)
+        elif own := [name for name in scaled if (getattr(model, name) != scaled[name]).any()]:
+            raise ValueError(
+                f"fields: this environment's reset() sets {own[0]} itself, so that no factor of "
+                "RandomDynamics is left"
+            )
+        return observation, {**self.mark(info), "dynamics": factors}
 
     def step(self, action: Any) -> Step:
         """Step the environment; every step of a chosen episode is a perturbed one."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        if self._chosen:
-            info = self.mark(info)
-        return observation, reward, terminated, truncated, info
+        *result, info = self.env.step(action)
+        return *result, self.mark(info) if self._chosen else info
 
     def _draw(self, model: Any) -> dict[str, NDArray[Any]]:
         """Return factors for all rows of the fields."""
