@@ -759,35 +759,26 @@ class RandomEarlyTermination(NoiseWrapper):
             low, high = _whole_interval(low, high, least=1)
         elif low is not None or high is not None:
             raise ValueError(f"each_step=True excludes low and high, got low={low}, high={high}")
-        self.low = low
-        self.high = high
+        self.low, self.high = low, high
+        unlike = None if high == low else high  # (50, 50) and (50) are one configuration
         super().__init__(
-            env,
-            noise_rate,
-            low=low,
-            high=None if high == low else high,  # (50, 50) and (50) are one configuration
-            each_step=each_step,
-            truncate=truncate,
+            env, noise_rate, low=low, high=unlike, each_step=each_step, truncate=truncate
         )
         self._steps = 0
         self._last_step: int | None = None
-        self._warn_if_late()
-
-    def _warn_if_late(self) -> None:
-        """Say if no episode lasts long enough to be ended."""
-        timers = [layer for layer in _layers(self.env) if isinstance(layer, gym.wrappers.TimeLimit)]
+        timers = [layer for layer in _layers(env) if isinstance(layer, gym.wrappers.TimeLimit)]
         limit = min((timer._max_episode_steps for timer in timers), default=math.inf)
-        if self.low is not None and self.low >= limit:
-            only = self.low == limit and not self.truncate
+        if low is not None and low >= limit:  # no episode lasts long enough to be ended
+            only = low == limit and not truncate
             effect = "only turns truncated into terminated there" if only else "never acts"
             most = f"episodes have at most {limit} steps"
-            warnings.warn(f"RandomEarlyTermination({self.low}) {effect}: {most}", stacklevel=3)
+            warnings.warn(f"RandomEarlyTermination({low}) {effect}: {most}", stacklevel=2)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and decide when the episode ends."""
         result = super().reset(seed=seed, options=options)
         self._steps = 0
-        if self.low is not None and self.high is not None:  # that is, without each_step
+        if not self.each_step:
             last_step = int(self.noise.integers(self.low, self.high, endpoint=True))
             self._last_step = last_step if self.acts() else None
         return result
@@ -796,8 +787,7 @@ class RandomEarlyTermination(NoiseWrapper):
         """Step the environment and end the episode if its time has come."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._steps += 1
-        at_last_step = self._steps == self._last_step
-        ends = self.acts() if self.each_step else at_last_step
+        ends = self.acts() if self.each_step else self._steps == self._last_step
         if ends and not (truncated if self.truncate else terminated):
             info = self.mark(info)
             truncated, terminated = truncated or self.truncate, terminated or not self.truncate
