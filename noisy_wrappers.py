@@ -32,7 +32,6 @@ import importlib.machinery
 import importlib.metadata
 import inspect
 import math
-import numbers
 import operator
 import os
 import random
@@ -1577,18 +1576,18 @@ def _parameters(wrapper: type[NoiseWrapper]) -> list[inspect.Parameter]:
 
 
 def _number(name: str, value: float, low: float = -math.inf, high: float = math.inf) -> float:
-    number = math.nan
-    plain = _without_arrays(value)
-    if isinstance(plain, numbers.Real) and not isinstance(plain, bool):
-        with contextlib.suppress(OverflowError):  # an integer beyond the range of floats
-            number = float(plain)
-    if not (math.isfinite(number) and low <= number <= high):
+    number = _without_arrays(value)
+    finite = type(number) in (int, float) and abs(number) <= sys.float_info.max
+    if not (finite and low <= number <= high):
         raise ValueError(f"{name} must be a finite number in [{low}, {high}], got {value!r}")
-    return number + 0.0  # -0.0 becomes 0.0
+    return float(number) + 0.0  # -0.0 becomes 0.0
 
 
 def _interval(low: float, high: float, least: float = -math.inf) -> tuple[float, float]:
-    low, high = _number("low", low, least), _number("high", high, least)
+    return _ordered(_number("low", low, least), _number("high", high, least))
+
+
+def _ordered(low: Any, high: Any) -> tuple[Any, Any]:
     if low > high:
         raise ValueError(f"low must not exceed high, got low={low}, high={high}")
     return low, high
@@ -1596,16 +1595,13 @@ def _interval(low: float, high: float, least: float = -math.inf) -> tuple[float,
 
 def _whole_interval(low: int | None, high: int | None, least: int) -> tuple[int, int]:
     """Check two numbers of steps; the second is the first by default."""
-    given = (low, low if high is None else high)
-    ends = list(map(_without_arrays, given))
-    for name, end, value in zip(("low", "high"), ends, given, strict=True):
-        whole = isinstance(end, numbers.Integral) and not isinstance(end, bool)
-        if not (whole and least <= end < 2**63):  # Generator.integers draws 64-bit integers
+    ends = []
+    for name, value in (("low", low), ("high", low if high is None else high)):
+        end = _without_arrays(value)
+        if type(end) is not int or not least <= end < 2**63:  # numpy draws 64-bit integers
             raise ValueError(f"{name} must be an integer in [{least}, 2**63), got {value!r}")
-    low, high = map(int, ends)
-    if low > high:
-        raise ValueError(f"low must not exceed high, got low={low}, high={high}")
-    return low, high
+        ends.append(end)
+    return _ordered(*ends)
 
 
 def _scale_or_scales(value: float | tuple[float, ...] | list[float]) -> float | tuple[float, ...]:
@@ -1669,15 +1665,11 @@ def _is_field(name: Any) -> bool:
 
 def _schedule(noise_rate: Rate) -> tuple[float, float]:
     """Return the rates at the beginning and at the end of training."""
+    start = end = noise_rate
     try:
         if isinstance(noise_rate, str):
-            start, end = (float(number) for number in noise_rate.split(":"))
-        else:
-            start = end = noise_rate
-        return (
-            _number("noise_rate", start, low=0, high=1),
-            _number("noise_rate", end, low=0, high=1),
-        )
+            start, end = map(float, noise_rate.split(":"))
+        return _number("start", start, low=0, high=1), _number("end", end, low=0, high=1)
     except ValueError:
         raise ValueError(
             'a noise_rate must be a number in [0, 1], or "start:end" of two such numbers, as '
