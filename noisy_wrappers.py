@@ -271,11 +271,7 @@ class ObservationNoise(NoiseWrapper):
             if not set(self.keys) <= set(known):
                 raise ValueError(f"keys={self.keys!r}: these observations have the keys {known}")
             entries = {path: part for path, part in entries.items() if path[0] in self.keys}
-        boxes = {
-            path: part
-            for path, part in entries.items()
-            if isinstance(part, gym.spaces.Box) and part.dtype.kind in "fiu"
-        }
+        boxes = {path: part for path, part in entries.items() if _is_box(part, "fiu")}
         if not boxes and _has_categories(env):
             raise ValueError(
                 f"{name} cannot perturb categories (Discrete, MultiDiscrete, MultiBinary), and "
@@ -641,12 +637,11 @@ class RandomNormalNoisyAction(NoiseWrapper):
         self.scale = _number("scale", scale, low=0)
         self.loc = _number("loc", loc)
         super().__init__(env, noise_rate, scale=self.scale, loc=self.loc)
-        space = env.action_space
-        if not isinstance(space, gym.spaces.Box) or space.dtype.kind != "f":
+        self._space = env.action_space
+        if not _is_box(self._space, "f"):
             raise ValueError(
-                f"RandomNormalNoisyAction needs a Box action space of floats, got {space}"
+                f"RandomNormalNoisyAction needs a Box action space of floats, got {self._space}"
             )
-        self._space = space
 
     def step(self, action: Any) -> Step:
         """Perturb the action with probability p and step the environment."""
@@ -1508,16 +1503,16 @@ def _entries(space: gym.Space[Any], path: EntryPath = ()) -> Iterator[tuple[Entr
 
     Each is (the keys that lead to it, its space); a space of another kind is one entry.
     """
-    parts: Any = None
-    if isinstance(space, gym.spaces.Dict):
-        parts = space.items()
-    elif isinstance(space, gym.spaces.Tuple):
-        parts = enumerate(space)
-    if parts is None:
+    if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
+        for key, part in _items(space):
+            yield from _entries(part, (*path, key))
+    else:
         yield path, space
-        return
-    for key, part in parts:
-        yield from _entries(part, (*path, key))
+
+
+def _items(nested: Any) -> Iterable[tuple[Any, Any]]:
+    """Return what a mapping or a sequence holds, as (key or index, value)."""
+    return nested.items() if isinstance(nested, Mapping) else enumerate(nested)
 
 
 def _subscript(path: EntryPath) -> str:
@@ -1531,13 +1526,18 @@ def _replaced(nested: Any, entries: dict[EntryPath, Any]) -> Any:
     of_key: dict[Any, dict[EntryPath, Any]] = {}
     for (key, *path), entry in entries.items():
         of_key.setdefault(key, {})[tuple(path)] = entry
-    pairs = nested.items() if isinstance(nested, Mapping) else enumerate(nested)
-    parts = {key: _replaced(part, of_key[key]) if key in of_key else part for key, part in pairs}
+    parts = dict(_items(nested))
+    parts |= {key: _replaced(parts[key], inner) for key, inner in of_key.items()}
     if isinstance(nested, gym.spaces.Dict):
         return gym.spaces.Dict(list(parts.items()))
     if isinstance(nested, gym.spaces.Tuple):
         return gym.spaces.Tuple(list(parts.values()))
     return parts if isinstance(nested, Mapping) else tuple(parts.values())
+
+
+def _is_box(space: gym.Space[Any], kinds: str) -> bool:
+    """Return whether a space is a Box of floats ("f"), or of floats and integers ("fiu")."""
+    return isinstance(space, gym.spaces.Box) and space.dtype.kind in kinds
 
 
 def _has_categories(env: Env) -> bool:
@@ -1895,17 +1895,14 @@ def make_flat(env: Env, step_limit: int | None = None) -> Env:
         if space.is_np_flattenable and not is_vector:
             env = gym.wrappers.FlattenObservation(env)
     observations, actions = env.observation_space, env.action_space
-    if not isinstance(observations, gym.spaces.Box) or observations.dtype.kind not in "fiu":
-        env.close()
-        raise SpaceError(f"needs Box observations of numbers; {name} has {observations}")
-    if (
-        not isinstance(actions, gym.spaces.Box)
-        or actions.dtype.kind != "f"
-        or len(actions.shape) != 1
-    ):
-        env.close()
-        raise SpaceError(f"needs Box actions of floats in one dimension; {name} has {actions}")
-    return env
+    if not _is_box(observations, "fiu"):
+        problem = f"needs Box observations of numbers; {name} has {observations}"
+    elif not _is_box(actions, "f") or len(actions.shape) != 1:
+        problem = f"needs Box actions of floats in one dimension; {name} has {actions}"
+    else:
+        return env
+    env.close()
+    raise SpaceError(problem)
 
 
 def into_space(action: NDArray[Any], space: gym.spaces.Box) -> NDArray[Any]:
@@ -2267,7 +2264,7 @@ def _members(holder: Any, depth: int = 3) -> Iterator[tuple[str, Any]]:
     """Yield what an object holds, also in its containers, its spaces and objects of no library."""
     package = _package_of(holder)
     parts = vars(holder) if hasattr(holder, "__dict__") else holder
-    for name, value in [*(parts.items() if isinstance(parts, dict) else enumerate(parts))]:
+    for name, value in [*_items(parts)]:
         if isinstance(holder, NoiseWrapper) and name in ("_gate", "noise"):
             continue  # which state_dict has
         yield str(name), value
