@@ -1780,11 +1780,8 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         gym.Wrapper.__init__(self, env)
         RecordConstructorArgs.__init__(self)
         self.action_space, self.observation_space = env.action_space, env.observation_space
-        self._boxes = {
-            path: part
-            for path, part in _entries(self.observation_space)
-            if isinstance(part, gym.spaces.Box)
-        }
+        entries = _entries(self.observation_space)
+        self._boxes = {path: part for path, part in entries if isinstance(part, gym.spaces.Box)}
         self._steps = 0
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
@@ -1832,9 +1829,8 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             part = np.array(functools.reduce(operator.getitem, path, observation))
             if part.shape != box.shape:
                 raise SpaceError(
-                    f"step {self._steps} of an episode: the environment returned an "
-                    f"observation{_subscript(path)} of shape {part.shape}, and its "
-                    f"observation_space has shape {box.shape}"
+                    f"{self._where()} returned an observation{_subscript(path)} of shape "
+                    f"{part.shape}, and its observation_space has shape {box.shape}"
                 )
             if not np.isfinite(part).all():
                 self._blame(f"returned the observation{_subscript(path)}", part, action)
@@ -1846,24 +1842,23 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
         An exit becomes a RuntimeError, because a run would seem to have ended well.
         """
-        at = f"step {self._steps} of an episode: the environment"
         if isinstance(error, SystemExit):
-            text = f"{at} called sys.exit({error.code!r})"
+            text = f"{self._where()} called sys.exit({error.code!r})"
             raise RuntimeError(text).with_traceback(error.__traceback__) from None
         *_, (frame, _) = traceback.walk_tb(error.__traceback__)
         place = frame.f_globals.get("__name__", "")
         is_old = re.search("unpack|unexpected keyword", str(error))
         if is_old and place.startswith(("gymnasium.core", "gymnasium.wrappers.", __name__)):
-            raise SpaceError(f"{at}'s {wanted}: {error}") from error
+            raise SpaceError(f"{self._where()}'s {wanted}: {error}") from error
 
     def _blame(self, what: str, value: Any, action: Any) -> None:
         """Stop at a value that is not finite, or rather at an action that was not, either."""
         if isinstance(action, np.ndarray) and not np.isfinite(action).all():
-            self._stop("was given the action", action.tolist())
-        self._stop(what, np.asarray(value).tolist())
+            what, value = "was given the action", action
+        raise NotFiniteError(f"{self._where()} {what} {np.asarray(value).tolist()!r}")
 
-    def _stop(self, what: str, value: Any) -> None:
-        raise NotFiniteError(f"step {self._steps} of an episode: the environment {what} {value!r}")
+    def _where(self) -> str:
+        return f"step {self._steps} of an episode: the environment"
 
 
 def make_flat(env: Env, step_limit: int | None = None) -> Env:
