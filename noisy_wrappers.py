@@ -2010,20 +2010,17 @@ def kept_generators(env: Env | None = None) -> Iterator[None]:
     >>> random.getstate() == first
     True
     """
-    torch: Any = sys.modules.get("torch")
-    python, numpy = random.getstate(), np.random.get_state()
-    pytorch = torch.get_rng_state() if torch else None
-    held = _held_generators(env) if env is not None else {}
-    streams = {place: _stream(generator) for place, generator in held.items()}
+    generators: list[Any] = [random, np.random]
+    if torch := sys.modules.get("torch"):
+        generators.append(torch.default_generator)
+    if env is not None:
+        generators += _held_generators(env).values()
+    streams = [_stream(generator) for generator in generators]
     try:
         yield
     finally:
-        random.setstate(python)
-        np.random.set_state(numpy)
-        if torch:
-            torch.set_rng_state(pytorch)
-        for place, generator in held.items():
-            _set_stream(generator, streams[place])
+        for generator, stream in zip(generators, streams, strict=True):
+            _set_stream(generator, stream)
 
 
 def outcome(info: Mapping[str, Any]) -> float:
@@ -2199,8 +2196,8 @@ class EnvState:
     def state_dict(self) -> dict[str, Any]:
         """Return the state in Python's own types, to be taken between two episodes."""
         return {
-            "python": random.getstate(),
-            "numpy": _without_arrays(np.random.get_state(legacy=False)),
+            "python": _stream(random),
+            "numpy": _stream(np.random),
             "generators": [_stream(generator) for generator in self._generators()],
             "attributes": {place: _stream(held) for place, held in self._attributes().items()},
             "noise": [_without_arrays(w.state_dict()) for w in noise_wrappers(self.env).values()],
@@ -2214,7 +2211,7 @@ class EnvState:
             ValueError: a state of another number of generators or noise wrappers.
         """
         _set_stream(random, state["python"])
-        np.random.set_state(state["numpy"])
+        _set_stream(np.random, state["numpy"])
         for generator, stream in zip(self._generators(), state["generators"], strict=True):
             _set_stream(generator, stream)
         attributes, streams = self._attributes(), state.get("attributes", {})
@@ -2272,23 +2269,22 @@ def _members(holder: Any, depth: int = 3) -> Iterator[tuple[str, Any]]:
 
 
 def _stream(generator: Any) -> Any:
-    """Return the state of a random generator; dm_control's environments have a RandomState."""
+    """Return the state of a generator, or of random or np.random, in Python's own types."""
     if isinstance(generator, np.random.Generator):
         return _without_arrays(generator.bit_generator.state)
-    if isinstance(generator, np.random.RandomState):
+    if generator is np.random or isinstance(generator, np.random.RandomState):  # dm_control's
         return _without_arrays(generator.get_state(legacy=False))
-    if isinstance(generator, random.Random):
+    if generator is random or isinstance(generator, random.Random):
         return generator.getstate()
     return generator.get_state().tolist()  # PyTorch's
 
 
 def _set_stream(generator: Any, stream: Any) -> None:
-    """Set the state of a random generator, or of the module random."""
     if isinstance(generator, np.random.Generator):
         generator.bit_generator.state = stream
-    elif isinstance(generator, np.random.RandomState):
+    elif generator is np.random or isinstance(generator, np.random.RandomState):
         generator.set_state(stream)
-    elif isinstance(generator, random.Random) or generator is random:
+    elif generator is random or isinstance(generator, random.Random):
         version, words, normal = stream
         generator.setstate((version, tuple(words), normal))
     else:
