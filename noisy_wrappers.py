@@ -960,20 +960,15 @@ class Noise:
     """
 
     wrapper: type[NoiseWrapper]
-    args: tuple[Any, ...] = ()
-    kwargs: tuple[tuple[str, Any], ...] = ()
-    module: str = ""  # of a wrapper that is not ours
+    text: str  # canonical, e.g. "RandomMixupObservation(0.0, recursive=True)"
 
     def __call__(self, env: Env, noise_rate: Rate) -> NoiseWrapper:
         """Wrap an environment."""
-        return self.wrapper(env, noise_rate, *self.args, **dict(self.kwargs))
+        _, _, args, kwargs = _read_call(self.text)
+        return self.wrapper(env, noise_rate, *args, **kwargs)
 
     def __str__(self) -> str:
-        """Return the canonical notation, e.g. "RandomMixupObservation(0.0, recursive=True)"."""
-        arguments = [repr(value) for value in self.args]
-        arguments += [f"{name}={value!r}" for name, value in self.kwargs]
-        module = f"{self.module}:" if self.module else ""
-        return f"{module}{self.wrapper.__name__}({', '.join(arguments)})"
+        return self.text
 
 
 def signatures() -> list[str]:
@@ -1033,15 +1028,12 @@ def _read_noise(text: str) -> Noise:
     while positional and recorded[positional[-1].name] == positional[-1].default:
         positional.pop()  # but not a default before another value, which would take its place
     keywords = [p for p in parameters if p.kind is p.KEYWORD_ONLY and recorded[p.name] != p.default]
-    noise = Noise(
-        wrapper,
-        tuple(recorded[p.name] for p in positional),
-        tuple((p.name, recorded[p.name]) for p in keywords),
-        "" if wrapper is WRAPPERS.get(name) else module,
-    )
+    written = [repr(recorded[p.name]) for p in positional]
+    written += [f"{p.name}={recorded[p.name]!r}" for p in keywords]
+    owner = "" if wrapper is WRAPPERS.get(name) else f"{module}:"
+    noise = Noise(wrapper, f"{owner}{wrapper.__name__}({', '.join(written)})")
     try:  # what is written must make the same noise again
-        _, _, args, kwargs = _read_call(str(noise))
-        same = wrapper(_ProbeEnv(), 1.0, *args, **kwargs).parameters == recorded
+        same = noise(_ProbeEnv(), 1.0).parameters == recorded
     except (TypeError, ValueError):
         same = False
     if not same:
