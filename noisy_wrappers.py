@@ -104,8 +104,6 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     Attributes:
         schedule: the rates at the beginning and at the end of training, both in [0, 1].
-        training_progress: the fraction of training done; see :func:`set_progress`. Assigning it
-            assigns that of the noise wrappers inside, too.
         parameters: the wrapper's own arguments by name, as its spec records them.
         noise: the generator to draw noise from.
         opportunities: how often the noise might have acted: steps, or episodes where it is decided
@@ -131,7 +129,7 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.opportunities = 0
         self.times_applied = 0
         self._counted = True  # since the last opportunity, in times_applied
-        self._position = sum(1 for _ in _noise_layers(env))
+        self._position = len(_noise_layers(env))
         self._seed(None)
 
     @property
@@ -154,7 +152,7 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     @property
     def training_progress(self) -> float:
-        """The fraction of training done, for rates that change."""
+        """The fraction of training done; assigning it assigns that of the wrappers inside, too."""
         return self._training_progress
 
     @training_progress.setter
@@ -164,12 +162,7 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def noise_statistics(self) -> dict[str, float]:
         """Return :func:`noise_statistics` of this wrapper and of those inside."""
-        statistics, wrappers = {}, noise_wrappers(self)
-        for name, wrapper in wrappers.items():
-            prefix = f"{name}/" if len(wrappers) > 1 else ""
-            statistics[f"{prefix}rate"] = wrapper.noise_rate
-            statistics[f"{prefix}applied_fraction"] = wrapper.applied_fraction
-        return statistics
+        return noise_statistics(self)
 
     @property
     def applied_fraction(self) -> float:
@@ -321,11 +314,9 @@ class ObservationNoise(NoiseWrapper):
         """Return a new observation with these numbers in place of :meth:`_numbers`."""
         if () in self._boxes:
             return _cast(numbers, self._boxes[()].dtype)
-        ends = np.cumsum([math.prod(box.shape) for box in self._boxes.values()])
         parts = {}
-        for (path, box), part in zip(
-            self._boxes.items(), np.split(numbers, ends[:-1]), strict=True
-        ):
+        for path, box in self._boxes.items():
+            part, numbers = np.split(numbers, [math.prod(box.shape)])
             parts[path] = _cast(part.reshape(box.shape), box.dtype)
         return _replaced(observation, parts)
 
@@ -1336,9 +1327,8 @@ def set_progress(env: Any, fraction: float) -> None:
     """
     progress = _number("fraction", fraction, low=0, high=1)
     if isinstance(env, gym.Env):
-        outermost = next(_noise_layers(env), None)
-        if outermost:
-            outermost.training_progress = progress
+        for layer in _noise_layers(env):
+            layer.training_progress = progress
     else:
         _call_each(env, "set_wrapper_attr", "training_progress", progress, force=False)
 
@@ -1355,7 +1345,7 @@ def noise_wrappers(env: Env) -> dict[str, NoiseWrapper]:
         raise TypeError(f"noise_wrappers takes a gymnasium.Env, not a {type(env).__name__}")
     found: dict[str, NoiseWrapper] = {}
     count: Counter[str] = Counter()
-    for layer in reversed(list(_noise_layers(env))):
+    for layer in reversed(_noise_layers(env)):
         name = type(layer).__name__
         count[name] += 1
         found[name if count[name] == 1 else f"{name}_{count[name]}"] = layer
@@ -1378,8 +1368,12 @@ def noise_statistics(env: Any) -> dict[str, float]:
         TypeError: not an environment.
     """
     if isinstance(env, gym.Env):
-        outermost = next(_noise_layers(env), None)
-        return outermost.noise_statistics() if outermost else {}
+        statistics, wrappers = {}, noise_wrappers(env)
+        for name, wrapper in wrappers.items():
+            prefix = f"{name}/" if len(wrappers) > 1 else ""
+            statistics[f"{prefix}rate"] = wrapper.noise_rate
+            statistics[f"{prefix}applied_fraction"] = wrapper.applied_fraction
+        return statistics
     noisy = _call_each(env, "has_wrapper_attr", "noise_statistics")
     if not any(noisy):
         return {}
@@ -1483,11 +1477,9 @@ def _layers(env: Env) -> Iterator[gym.Wrapper[Any, Any, Any, Any]]:
         env = env.env
 
 
-def _noise_layers(env: Env) -> Iterator[NoiseWrapper]:
-    """Yield an environment's noise wrappers, outermost first."""
-    for layer in _layers(env):
-        if isinstance(layer, NoiseWrapper):
-            yield layer
+def _noise_layers(env: Env) -> list[NoiseWrapper]:
+    """Return an environment's noise wrappers, outermost first."""
+    return [layer for layer in _layers(env) if isinstance(layer, NoiseWrapper)]
 
 
 def _entries(space: gym.Space[Any], path: EntryPath = ()) -> Iterator[tuple[EntryPath, Any]]:
@@ -2128,8 +2120,7 @@ def start_again(reason: str) -> None:
 def handle_signals(handler: Callable[[int, Any], None]) -> None:
     """Let a handler have SIGTERM, SIGINT and SIGHUP, but a SIGHUP that is ignored, as by nohup."""
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        ignored = number == signal.SIGHUP and signal.getsignal(number) == signal.SIG_IGN
-        if not ignored:
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, handler)
 
 
