@@ -119,7 +119,7 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         Nor may ``env`` reset itself, by ``gymnasium.wrappers.Autoreset``.
         """
         gym.Wrapper.__init__(self, env)
-        if any(isinstance(layer, gym.wrappers.Autoreset) for layer in _layers(env)):
+        if _layers(env, gym.wrappers.Autoreset):
             raise ValueError("noise must see every reset: apply gymnasium.wrappers.Autoreset last")
         self.schedule = _schedule(noise_rate)
         self._training_progress = 0.0
@@ -129,7 +129,7 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.opportunities = 0
         self.times_applied = 0
         self._counted = True  # since the last opportunity, in times_applied
-        self._position = len(_noise_layers(env))
+        self._position = len(_layers(env, NoiseWrapper))
         self._seed(None)
 
     @property
@@ -157,7 +157,7 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     @training_progress.setter
     def training_progress(self, fraction: float) -> None:
-        for layer in _noise_layers(self):
+        for layer in _layers(self, NoiseWrapper):
             layer._training_progress = fraction
 
     def noise_statistics(self) -> dict[str, float]:
@@ -252,12 +252,11 @@ class ObservationNoise(NoiseWrapper):
     def _find_boxes(self, env: Env) -> dict[EntryPath, gym.spaces.Box]:
         """Return the entries to perturb: {path in the observation: their space}."""
         name, space = type(self).__name__, env.observation_space
-        for layer in _layers(env):
-            if isinstance(layer, gym.wrappers.FlattenObservation) and _has_categories(layer.env):
-                raise ValueError(
-                    f"{name} cannot perturb categories, and these observations were flattened with "
-                    "some in them: apply it before gymnasium.wrappers.FlattenObservation"
-                )
+        if any(_has_categories(f.env) for f in _layers(env, gym.wrappers.FlattenObservation)):
+            raise ValueError(
+                f"{name} cannot perturb categories, and these observations were flattened with "
+                "some in them: apply it before gymnasium.wrappers.FlattenObservation"
+            )
         entries = dict(_entries(space))
         if self.keys is not None:
             known = [*dict.fromkeys(path[0] for path in entries if path)]
@@ -751,7 +750,7 @@ class RandomEarlyTermination(NoiseWrapper):
         )
         self._steps = 0
         self._last_step: int | None = None
-        timers = [layer for layer in _layers(env) if isinstance(layer, gym.wrappers.TimeLimit)]
+        timers = _layers(env, gym.wrappers.TimeLimit)
         limit = min((timer._max_episode_steps for timer in timers), default=math.inf)
         if low is not None and low >= limit:  # no episode lasts long enough to be ended
             only = low == limit and not truncate
@@ -828,7 +827,7 @@ class RandomDynamics(NoiseWrapper):
         self.low, self.high = _interval(low, high, least=0)
         self.fields = _fields(fields)
         super().__init__(env, noise_rate, low=self.low, high=self.high, fields=self.fields)
-        if any(isinstance(layer, RandomDynamics) for layer in _noise_layers(env)):
+        if _layers(env, RandomDynamics):
             raise ValueError("this environment has RandomDynamics already: name all fields in one")
         self._chosen = False  # the episode
         self._scratch: Any = None  # a model, and data to compute with
@@ -1243,9 +1242,8 @@ def _listed(name: str, values: Any, example: str) -> list[Any]:
 
 def _place(wrapper: type[NoiseWrapper]) -> int:
     """Return where make_noisy puts a noise, counted from the environment."""
-    if wrapper in (RandomDynamics, RandomActionDelay):  # the innermost of their kind
-        return 0 if wrapper is RandomDynamics else 2
-    return {"dynamics": 1, "action": 3}.get(wrapper.kind, 4)
+    places = {RandomDynamics: 0, "dynamics": 1, RandomActionDelay: 2, "action": 3}
+    return places.get(wrapper, places.get(wrapper.kind, 4))
 
 
 def make_noisy(
@@ -1327,7 +1325,7 @@ def set_progress(env: Any, fraction: float) -> None:
     """
     progress = _number("fraction", fraction, low=0, high=1)
     if isinstance(env, gym.Env):
-        for layer in _noise_layers(env):
+        for layer in _layers(env, NoiseWrapper):
             layer.training_progress = progress
     else:
         _call_each(env, "set_wrapper_attr", "training_progress", progress, force=False)
@@ -1345,7 +1343,7 @@ def noise_wrappers(env: Env) -> dict[str, NoiseWrapper]:
         raise TypeError(f"noise_wrappers takes a gymnasium.Env, not a {type(env).__name__}")
     found: dict[str, NoiseWrapper] = {}
     count: Counter[str] = Counter()
-    for layer in reversed(_noise_layers(env)):
+    for layer in reversed(_layers(env, NoiseWrapper)):
         name = type(layer).__name__
         count[name] += 1
         found[name if count[name] == 1 else f"{name}_{count[name]}"] = layer
@@ -1470,16 +1468,13 @@ def rounded(value: float, spread: float | None = None) -> str:
 # ------------------------------------------------------------------------------ wrappers and spaces
 
 
-def _layers(env: Env) -> Iterator[gym.Wrapper[Any, Any, Any, Any]]:
-    """Yield an environment's wrappers, outermost first."""
+def _layers(env: Env, kind: Any = gym.Wrapper) -> list[Any]:
+    """Return an environment's wrappers, or those of a kind, outermost first."""
+    found = []
     while isinstance(env, gym.Wrapper):
-        yield env
+        found.append(env)
         env = env.env
-
-
-def _noise_layers(env: Env) -> list[NoiseWrapper]:
-    """Return an environment's noise wrappers, outermost first."""
-    return [layer for layer in _layers(env) if isinstance(layer, NoiseWrapper)]
+    return [layer for layer in found if isinstance(layer, kind)]
 
 
 def _entries(space: gym.Space[Any], path: EntryPath = ()) -> Iterator[tuple[EntryPath, Any]]:
@@ -1639,9 +1634,8 @@ def _is_field(name: Any) -> bool:
         return False
     rows = ("body_", "geom_", "pair_", "jnt_", "dof_", "actuator_", "tendon_")
     shapes = ("pos", "quat", "size", "axis", "aabb", "rbound")  # others depend on these
-    if not isinstance(name, str) or not name.startswith(rows) or name.endswith(shapes):
-        return False
-    if name in _DERIVED_FIELDS:
+    refused = (*shapes, *_DERIVED_FIELDS)
+    if not isinstance(name, str) or not name.startswith(rows) or name.endswith(refused):
         return False
     array = getattr(mujoco.MjModel.from_xml_string("<mujoco/>"), name, None)
     return isinstance(array, np.ndarray) and array.dtype == np.float64
@@ -1902,8 +1896,7 @@ def remarks(env_id: str, env: Env, step_limit: int) -> list[str]:
     registered = gym.spec(env_id.rpartition(":")[2]).max_episode_steps
     if registered is None and env.spec and env.spec.max_episode_steps == step_limit:
         found.append(f"{env_id} declares no time limit, so --max-episode-steps is {step_limit:,}")
-    running = gym.wrappers.NormalizeObservation | gym.wrappers.NormalizeReward
-    if any(isinstance(layer, running) for layer in _layers(env)):
+    if _layers(env, gym.wrappers.NormalizeObservation | gym.wrappers.NormalizeReward):
         found.append(f"{env_id} normalizes with statistics of its own, which tests do not share")
     return found
 
