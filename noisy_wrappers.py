@@ -1075,7 +1075,7 @@ def _bad_noise(text: str, reason: str) -> ValueError:
     return ValueError("\n  ".join([f"bad noise {text!r}: {reason}; valid are", *signatures()]))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, order=True)
 class Configuration:
     """The noises of a run or of a test, each with its rate; without any it is the baseline.
 
@@ -1213,10 +1213,6 @@ class Configuration:
         """Return the configuration as a sentence has it: "A(1.0) + B() at 0.05 + 1.0 to 0.0"."""
         noise, rate = self.columns
         return f"{noise} at {rate.replace(':', ' to ')}" if noise else "no noise"
-
-    def __lt__(self, other: "Configuration") -> bool:
-        """Order by noise, then by rates as numbers; the baseline comes first."""
-        return (self.noise, self.rates) < (other.noise, other.rates)
 
 
 BASELINE = Configuration()
