@@ -54,7 +54,6 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs import registration
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
 __version__ = "0.3.0"
@@ -1200,12 +1199,12 @@ class Configuration:
         if record_statistics and any(env.has_wrapper_attr(name) for name in _OF_RECORDERS):
             raise SpaceError(_RECORDED)
         for noise, rate in pairs:
-            if noise.wrapper.kind in _BEFORE_STATISTICS:
+            if noise.wrapper.kind in ("dynamics", "action"):
                 env = noise(env, rate)
         if record_statistics:
             env = RecordEpisodeStatistics(env)
         for noise, rate in pairs:
-            if noise.wrapper.kind not in _BEFORE_STATISTICS:
+            if noise.wrapper.kind in ("observation", "reward"):
                 env = noise(env, rate)
         return env
 
@@ -1267,8 +1266,6 @@ def make_noisy(
     return Configuration.read(noises, rates).wrap(env, record_statistics=record_statistics)
 
 
-# Noise of these kinds acts before an episode's statistics are recorded.
-_BEFORE_STATISTICS = ("dynamics", "action")
 # What gives away Gymnasium's RecordEpisodeStatistics and Stable-Baselines3's Monitor.
 _OF_RECORDERS = ("return_queue", "get_episode_rewards")
 _RECORDED = (
@@ -1291,9 +1288,8 @@ class RecordEpisodeStatistics(gym.wrappers.RecordEpisodeStatistics[Any, Any]):
                 raise
             raise ValueError(_RECORDED) from error
         if terminated or truncated:
-            recorded = dict(info)
-            del info[self._stats_key]  # the environment may return the same dict again
-            info = recorded
+            info, reused = dict(info), info
+            del reused[self._stats_key]  # the environment may return the same dict again
         return observation, reward, terminated, truncated, info
 
 
@@ -1763,7 +1759,7 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._steps = 0
         base, kinds = self.unwrapped, np.random.Generator | None
         if seed is not None and isinstance(getattr(base, "_np_random", 0), kinds):
-            base._np_random, _ = np_random(seed)  # some, as Meta-World's, ignore the seed
+            base._np_random = np.random.default_rng(seed)  # some, as Meta-World's, ignore it
         try:
             observation, info = self.env.reset(seed=seed, options=options)
         except (SystemExit, TypeError, ValueError) as error:
