@@ -263,14 +263,14 @@ class ObservationNoise(NoiseWrapper):
                 raise ValueError(f"keys={self.keys!r}: these observations have the keys {known}")
             entries = {path: part for path, part in entries.items() if path[0] in self.keys}
         boxes = {path: part for path, part in entries.items() if _is_box(part, "fiu")}
-        if not boxes and _has_categories(env):
+        if boxes:
+            return boxes
+        if _has_categories(env):
             raise ValueError(
                 f"{name} cannot perturb categories (Discrete, MultiDiscrete, MultiBinary), and "
                 "finds nothing else here: use reward noise, action noise or early termination"
             )
-        if not boxes:
-            raise ValueError(f"{name} needs observations of floats or integers, got {space}")
-        return boxes
+        raise ValueError(f"{name} needs observations of floats or integers, got {space}")
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and perturb the first observation with probability p."""
@@ -684,7 +684,7 @@ class RandomActionDelay(NoiseWrapper):
         result = super().reset(seed=seed, options=options)
         delay = int(self.noise.integers(self.low, self.high, endpoint=True))
         self._delay = delay if self.acts() else 0
-        self._actions.clear()
+        self._actions = deque(maxlen=self._delay + 1)
         return result
 
     def step(self, action: Any) -> Step:
@@ -692,8 +692,6 @@ class RandomActionDelay(NoiseWrapper):
         if not self._delay:
             return self.env.step(action)
         self._actions.append(copy.deepcopy(action))  # the caller may reuse an array
-        if len(self._actions) > self._delay + 1:
-            self._actions.popleft()
         *result, info = self.env.step(copy.deepcopy(self._actions[0]))
         waits = len(self._actions) > 1  # this step's action
         return *result, self.mark(info) if waits else info
@@ -2262,9 +2260,7 @@ def _set_stream(generator: Any, stream: Any) -> None:
 
 # The scripts' arguments that change nothing about what a run learns. A run may be resumed with
 # others, and a finished one counts as done whatever it had.
-MAY_DIFFER_IN_A_RUN = frozenset(
-    ("runs_dir", "overwrite", "torch_threads", "compile", "checkpoint_frequency")
-)
+MAY_DIFFER_IN_A_RUN = {"runs_dir", "overwrite", "torch_threads", "compile", "checkpoint_frequency"}
 # Runs with other values of these may stand in one row of a table, too: a GPU rounds otherwise, and
 # tests do not touch training. But a run keeps to the ones that it began with.
 MAY_DIFFER_IN_A_TABLE = MAY_DIFFER_IN_A_RUN | {"cuda", "eval_frequency"}
