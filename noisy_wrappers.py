@@ -174,6 +174,7 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return self.env.reset(seed=seed, options=options)
 
     def _begin(self, seed: int | None) -> None:
+        """Begin an episode, before the environment does; a wrapper may decide here what to do."""
         self._noise_rate = float(np.interp(self._training_progress, (0.0, 1.0), self.schedule))
         if seed is not None:
             self._seed(seed)
@@ -466,10 +467,9 @@ class RandomMixupObservation(ObservationNoise):
         super().__init__(env, noise_rate, factor=self.factor, recursive=self.recursive, keys=keys)
         self._previous: NDArray[Any] | None = None
 
-    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        """Reset the environment and forget the last episode."""
+    def _begin(self, seed: int | None) -> None:
+        super()._begin(seed)
         self._previous = None
-        return super().reset(seed=seed, options=options)
 
     def _observe(self, observation: Any, info: Info) -> tuple[Any, Info]:
         returned = observation
@@ -679,13 +679,11 @@ class RandomActionDelay(NoiseWrapper):
         self._delay = 0
         self._actions: deque[Any] = deque()  # the one that acts now, and those that wait
 
-    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        """Reset the environment and decide by how much the episode's actions are delayed."""
-        result = super().reset(seed=seed, options=options)
+    def _begin(self, seed: int | None) -> None:
+        super()._begin(seed)
         delay = int(self.noise.integers(self.low, self.high, endpoint=True))
         self._delay = delay if self.acts() else 0
         self._actions = deque(maxlen=self._delay + 1)
-        return result
 
     def step(self, action: Any) -> Step:
         """Step the environment with the action of some steps ago."""
@@ -755,14 +753,12 @@ class RandomEarlyTermination(NoiseWrapper):
             most = f"episodes have at most {limit} steps"
             warnings.warn(f"RandomEarlyTermination({low}) {effect}: {most}", stacklevel=2)
 
-    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        """Reset the environment and decide when the episode ends."""
-        result = super().reset(seed=seed, options=options)
+    def _begin(self, seed: int | None) -> None:
+        super()._begin(seed)
         self._steps = 0
         if not self.each_step:
             last_step = int(self.noise.integers(self.low, self.high, endpoint=True))
             self._last_step = last_step if self.acts() else None
-        return result
 
     def step(self, action: Any) -> Step:
         """Step the environment and end the episode if its time has come."""
