@@ -2096,23 +2096,40 @@ def start_again(reason: str) -> None:
     os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:], *options])
 
 
-def handle_signals(handler: Callable[[int, Any], None]) -> None:
-    """Let a handler have SIGTERM, SIGINT and SIGHUP, but a SIGHUP that is ignored, as by nohup."""
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
-            signal.signal(number, handler)
+def stop_at_signals() -> Callable[[], int]:
+    """Handle SIGTERM, SIGINT and SIGHUP, but a SIGHUP that is ignored, as by nohup.
 
-
-def reset_worker_signals() -> None:
-    """Undo a script's signal handlers in a worker process that an environment forked.
-
-    SIGTERM and SIGHUP end it again, as ``terminate()`` asks; SIGINT is ignored: Ctrl-C is the
-    script's. A script calls ``os.register_at_fork(after_in_child=reset_worker_signals)``.
+    Returns stop(), which a script asks whenever an episode ends: it returns the number of the first
+    signal, or 0. A second signal exits at once. In worker processes that an environment forks,
+    SIGTERM and SIGHUP act as by default, as ``terminate()`` asks, and SIGINT is ignored: Ctrl-C is
+    the script's.
     """
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        if callable(signal.getsignal(number)):
-            signal.signal(number, signal.SIG_DFL)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    received: list[int] = []
+
+    def remember(number: int, frame: Any) -> None:
+        received.append(number)
+        if len(received) > 1:
+            os._exit(128 + number)
+        told = b"stopping at the end of this episode; Ctrl-C again to stop without a checkpoint\n"
+        with contextlib.suppress(OSError):  # nobody may be left to read it; print is not safe here
+            os.write(1, told)
+
+    def stop() -> int:
+        # again and again, because the environment may take the signals over
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                signal.signal(number, remember)
+        return received[0] if received else 0
+
+    def reset_in_worker() -> None:
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            if callable(signal.getsignal(number)):
+                signal.signal(number, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    stop()
+    os.register_at_fork(after_in_child=reset_in_worker)
+    return stop
 
 
 class EnvState:

@@ -725,31 +725,18 @@ class Run:
 
 
 if __name__ == "__main__":
-    signals = []
-
-    def stop_run(number, frame):
-        """Remember the first signal for the end of the episode; exit at once at the second."""
-        signals.append(number)
-        if len(signals) > 1:
-            os._exit(128 + number)
-        told = b"stopping at the end of this episode; Ctrl-C again to stop without a checkpoint\n"
-        with contextlib.suppress(OSError):  # nobody may be left to read it; print is not safe here
-            os.write(1, told)
-
-    noisy.handle_signals(stop_run)
-    os.register_at_fork(after_in_child=noisy.reset_worker_signals)
+    stop = noisy.stop_at_signals()
     sys.path.append(os.getcwd())  # for what the module of --env-id module:Name-v0 imports
     finished = False
     try:
         with fail_on((noisy.NotFiniteError, noisy.SpaceError), "training stopped", code=1):
-            # again whenever an episode ends, because the environment may take the signals over
-            finished = train(read_args(), lambda: noisy.handle_signals(stop_run) or bool(signals))
+            finished = train(read_args(), stop)
     except Exception as error:
-        if not signals:  # the environment's processes may have got the signal, too
+        if not stop():  # the environment's processes may have got the signal, too
             if reason := noisy.compiler_failure(error):
                 say(f"not compiled, starting again: {reason}")
                 noisy.start_again(reason)
             raise
     if not finished:
         say("stopped; run the same command again to resume")
-        raise SystemExit(128 + signals[0])
+        raise SystemExit(128 + stop())
