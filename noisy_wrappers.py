@@ -2074,20 +2074,18 @@ def clean_compiler_cache() -> None:
                     path.unlink()
 
 
-def compiler_failure(error: Exception) -> str:
-    """Return in a line why PyTorch could not compile, or "" for any other error of a script."""
+def start_again_if_not_compiled(error: Exception) -> None:
+    """Start the program again if an error of a script says that PyTorch could not compile.
+
+    It starts with a new cache for the compiler, once, or without a compiler at all.
+    """
     compiling = type(error).__module__.startswith(("torch._dynamo", "torch._inductor"))
     if not compiling or "--no-compile" in sys.argv:  # then it is of the environment
-        return ""
+        return
     text = str(getattr(error, "inner_exception", error)).strip()
-    return text.partition("\n")[0] or type(error).__name__
-
-
-def start_again(reason: str) -> None:
-    """Start the program again: with a new cache for the compiler, or without a compiler at all.
-
-    ``reason`` is that of :func:`compiler_failure`. A new cache is tried once.
-    """
+    reason = text.partition("\n")[0] or type(error).__name__
+    with contextlib.suppress(OSError):  # nobody may be left to read it
+        print(f"not compiled, starting again: {reason}", flush=True)
     cache, options = f"torchinductor_{os.getpid()}_", []  # os.execv keeps the process number
     if "No working" in reason or cache in os.environ.get("TORCHINDUCTOR_CACHE_DIR", ""):
         options = ["--no-compile"]

@@ -734,9 +734,7 @@ if __name__ == "__main__":
             finished = train(read_args(), stop)
     except Exception as error:
         if not stop():  # the environment's processes may have got the signal, too
-            if reason := noisy.compiler_failure(error):
-                say(f"not compiled, starting again: {reason}")
-                noisy.start_again(reason)
+            noisy.start_again_if_not_compiled(error)
             raise
     if not finished:
         say("stopped; run the same command again to resume")
