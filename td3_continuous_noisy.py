@@ -402,9 +402,8 @@ def read_args():
     return tyro.cli(Args, args=words, description=f"{__doc__}\n{noises}")
 
 
-@contextlib.contextmanager
-def make_envs(args):
-    """Yield the arguments in full, the noisy environment and a clean one; close both at the end."""
+def train(args, stop=lambda: False):
+    """Train one agent and close its environments; return False if stop() ended it early."""
     if args.exp_name in ("", ".", ".."):
         fail(f"--exp-name must be a name, not {args.exp_name!r}")
     if args.cuda and not torch.cuda.is_available():
@@ -418,18 +417,12 @@ def make_envs(args):
     limit = {"max_episode_steps": args.max_episode_steps}
     noisy.seed_globals(args.seed)
     with make_env(env_id, **limit) as test_env, make_env(env_id, **limit) as env:
-        caught = warnings.catch_warnings(record=True)
         where = f"--noise in {env_id}" if noise else f"--env-id {env_id}"
-        with fail_on(ValueError, where), caught as notes:
+        with fail_on(ValueError, where), warnings.catch_warnings(record=True) as notes:
             env = noisy.make_noisy(env, noise, noise_rate)
         for text in [note.message for note in notes] + noisy.remarks(env_id, test_env, STEP_LIMIT):
             say(text)
-        yield replace(args, env_id=env_id, noise=noise, noise_rate=noise_rate), env, test_env
-
-
-def train(args, stop=lambda: False):
-    """Train one agent and close its environments; return False if stop() ended it early."""
-    with make_envs(args) as (args, env, test_env):
+        args = replace(args, env_id=env_id, noise=noise, noise_rate=noise_rate)
         return learn(args, env, test_env, stop)
 
 

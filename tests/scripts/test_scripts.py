@@ -368,7 +368,7 @@ def run_block(script):
 
 
 def test_repeated_helpers_are_word_for_word_identical():
-    everywhere = "make_env fail fail_on say read_args make_envs train evaluate "
+    everywhere = "make_env fail fail_on say read_args train evaluate "
     everywhere += "use_matmul_precision Run"
     off_policy = "mlp in_numpy TwinLinear Critic ReplayBuffer updater"
     by_design = {"Args", "Actor", "load_policy", "critic_loss", "actor_loss", "learn"}
