@@ -477,26 +477,25 @@ def use_matmul_precision(precision, device):
 class Run:
     """The run's folder: what is written into it, and read again to resume."""
 
-    FILES = ("result.json", "policy.pt", "checkpoint.pt", "config.json", "eval.csv")
+    FILES = ("result.json", "checkpoint.pt", "config.json", "policy.pt", "eval.csv")
     EVENTS = "events.out.tfevents.*"
 
     def __init__(self, args, algorithm, precision, env):
         """Open the folder; fail if another process uses it, or if it holds a different run."""
-        configuration = (args.env_id, args.exp_name, args.noise, args.noise_rate, args.seed)
-        self.folder = Path(args.runs_dir, noisy.run_name(*configuration))
+        name = noisy.run_name(args.env_id, args.exp_name, args.noise, args.noise_rate, args.seed)
+        self.folder = Path(args.runs_dir, name)
         self.args, self.start = args, time.monotonic() - 1e-6  # not 0 s ago: clocks may stand still
         self.noise, self.returns = noisy.noise_wrappers(env), env.get_wrapper_attr("return_queue")
         self.outcomes = deque(maxlen=100)  # of the last training episodes
         if self.folder.is_symlink():
             fail(f"{self.folder} is a link: remove it, or choose another --exp-name or --runs-dir")
-        in_use = fail_on(BlockingIOError, f"{self.folder} is in use by another process")
         with fail_on(OSError, "--runs-dir"):
             self.folder.mkdir(parents=True, exist_ok=True)
             lock = os.open(self.folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
             self.lock = os.fdopen(lock)
-            with in_use:
+            with fail_on(BlockingIOError, f"{self.folder} is in use by another process"):
                 fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
-            result, _, self.checkpoint, *_ = ours = [self.folder / name for name in self.FILES]
+            result, self.checkpoint, config, *_ = ours = [self.folder / f for f in self.FILES]
             old = [path.with_suffix(".tmp") for path in ours]  # of a process that was killed
             if args.overwrite:
                 old += [*ours, self.folder / "robustness.csv"]  # events: see resume()
@@ -504,11 +503,11 @@ class Run:
                 path.unlink(missing_ok=True)
         self.is_finished = result.exists()
         if any(path.exists() for path in ours):
-            self.config = self._old_config(algorithm)
+            self.config = self._old_config(config, algorithm)
         else:
             if args.eval_frequency is None:
                 args.eval_frequency = max(1, min(EVAL_FREQUENCY, args.total_timesteps // 10))
-            self.config = {"algorithm": algorithm, "args": asdict(args), "versions": {}}
+            self.config = {"algorithm": algorithm, "args": asdict(args)}
         if self.is_finished:
             with self._reading(result):
                 self.result = json.loads(result.read_text())
@@ -526,19 +525,16 @@ class Run:
                 torch.compiler.reset()  # forget what earlier runs of this process compiled
                 noisy.clean_compiler_cache()
 
-    def _old_config(self, algorithm):
-        path = self.folder / "config.json"
+    def _old_config(self, path, algorithm):
         with self._reading(path):
             config = json.loads(path.read_text())
-            made_by = config["algorithm"]
-            # one that an older version did not have is no difference
-            old = {name: config["args"].get(name, own) for name, own in asdict(self.args).items()}
+            # an argument that an older version did not have is no difference
+            old = asdict(self.args) | config["args"] | {"algorithm": config["algorithm"]}
         if self.args.eval_frequency is None:
             self.args.eval_frequency = old["eval_frequency"]
-        new = {k: v for k, v in asdict(self.args).items() if k not in noisy.MAY_DIFFER_IN_A_RUN}
+        new = {"algorithm": algorithm} | asdict(self.args)
+        new = {name: new[name] for name in new if name not in noisy.MAY_DIFFER_IN_A_RUN}
         differ = [f"{name} {old[name]}, not {new[name]}" for name in new if old[name] != new[name]]
-        if made_by != algorithm:
-            differ = [f"algorithm {made_by}, not {algorithm}"]
         if differ:
             advice = "choose another --exp-name or --runs-dir; --overwrite deletes that run"
             fail(f"{self.folder} holds a run with {'; '.join(differ)}: {advice}")
