@@ -543,7 +543,7 @@ class Run:
 
     def resume(self, state):
         """Restore the last checkpoint of the objects in a list; return its step, or 0."""
-        self.state, step, sizes = state, 0, {}
+        self.state, args, step, sizes = state, self.args, 0, {}
         self.eval_csv = "step,episode,episodic_return,episodic_length\n"
         if self.checkpoint.exists():
             with self._reading(self.checkpoint):
@@ -560,20 +560,19 @@ class Run:
                     path.unlink()
             self.writer = SummaryWriter(str(self.folder), purge_step=step + 1)
         if step == 0:
-            table = "".join(f"|{name}|{value}|\n" for name, value in asdict(self.args).items())
+            table = "".join(f"|{name}|{value}|\n" for name, value in asdict(args).items())
             self.writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + table)
             # for the table HPARAMS: what tells runs apart, and what they achieved
-            columns = {name: getattr(self.args, name) for name in ("env_id", "exp_name", "seed")}
-            columns["noise"] = " + ".join(self.args.noise) or "none"
-            columns["noise_rate"] = " + ".join(map(str, self.args.noise_rate)) or "none"
+            columns = {"env_id": args.env_id, "exp_name": args.exp_name, "seed": args.seed}
+            columns["noise"] = " + ".join(args.noise) or "none"
+            columns["noise_rate"] = " + ".join(map(str, args.noise_rate)) or "none"
             metrics = "eval/episodic_return_mean", "charts/episodic_return", "eval/success_rate"
             for summary in hparams(columns, dict.fromkeys(metrics, 0))[:2]:
                 self.writer.file_writer.add_summary(summary)
-        self.begun = step, time.monotonic() - 1e-6
-        self.printed, self.saved_step = self.begun[1], step
-        self.learning, self.last_test = None, ""
-        total = self.args.total_timesteps
-        self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None)
+        self.bar = tqdm(total=args.total_timesteps, initial=step, file=sys.stdout, disable=None)
+        self.saved_step, self.learning, self.last_test = step, None, ""
+        self.printed = time.monotonic() - 1e-6
+        self.begun = step, self.printed
         return step
 
     def _load(self):
@@ -612,13 +611,12 @@ class Run:
 
     def log(self, step, **groups):
         """Log numbers as group/name to TensorBoard, and the speed; show the progress."""
+        tags = {f"{g}/{n}": float(x) for g, values in groups.items() for n, x in values.items()}
         now = time.monotonic()
         if "losses" in groups and self.learning:
-            sps = (step - self.learning[0]) / (now - self.learning[1])
-            groups["charts"] = groups.get("charts", {}) | {"SPS": sps}
+            tags["charts/SPS"] = (step - self.learning[0]) / (now - self.learning[1])
         elif "losses" in groups:  # the first ones: the time until now went into compiling
             self.learning = step, now - 1e-6
-        tags = {f"{g}/{n}": float(x) for g, values in groups.items() for n, x in values.items()}
         if not all(map(math.isfinite, tags.values())):
             reason = f"step {step}: training diverged, some values are not finite: {tags}"
             raise noisy.NotFiniteError(reason)
@@ -630,7 +628,7 @@ class Run:
         self.bar.n = step  # update() does nothing where there is no terminal
         learned = self.learning and step > self.learning[0]
         first_step, since = self.learning if learned else self.begun
-        if self.bar.disable and step > first_step and now - self.printed > 10:
+        if self.bar.disable and now - self.printed > 10:
             total, sps = self.bar.total, (step - first_step) / (now - since)
             eta = tqdm.format_interval((total - step) / sps) if learned else "?"
             # analysis/folders.py reads this line
@@ -655,13 +653,13 @@ class Run:
         self._write("eval.csv", self.eval_csv)
         mean, length, _ = results.mean(0)
         std = results[:, 0].std(ddof=1) if len(results) > 1 else 0.0
-        self.result = {"final_return_mean": mean, "final_return_std": std}
-        self.result |= {f"final_{name}": rate for name, rate in success.items()}
+        test = {"return_mean": mean, "return_std": std}
+        self.result = {f"final_{name}": value for name, value in (test | success).items()}
         self.last_test, self.printed = f"eval_return={noisy.rounded(mean, std)} ", -math.inf
         self.last_test += "".join(f"{name}={rate:.2f} " for name, rate in success.items())
         self.bar.set_description_str(self.last_test)
-        values = {"return_mean": mean, "return_std": std, "length_mean": length}
-        self.log(step, eval={f"episodic_{name}": x for name, x in values.items()} | success)
+        test["length_mean"] = length
+        self.log(step, eval={f"episodic_{name}": x for name, x in test.items()} | success)
 
     def finish(self, step, policy):
         """Write policy.pt and, last of all, result.json; the checkpoint has served."""
