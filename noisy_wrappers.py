@@ -1942,9 +1942,11 @@ def reason(error: BaseException) -> str:
     >>> reason(SystemExit(1))
     'the environment called sys.exit(1)'
     """
-    text = " ".join(str(error).split())
     if isinstance(error, SystemExit):
         return f"the environment called sys.exit({error.code!r})"
+    if isinstance(error, RuntimeError) and isinstance(error.__context__, OSError):
+        error = error.__context__  # torch.save hides that the disk is full, say
+    text = " ".join(str(error).split())
     if not text and isinstance(error, AssertionError) and "gymnasium_robotics" in sys.modules:
         packages = ("gymnasium-robotics", "mujoco")
         now = " and ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)

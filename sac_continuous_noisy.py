@@ -392,9 +392,7 @@ def fail_on(errors, message, code=2):
     try:
         yield
     except errors as error:
-        # torch.save hides the reason: that the disk is full, say
-        hidden = isinstance(error, RuntimeError) and isinstance(error.__context__, OSError)
-        fail(f"{message}: {noisy.reason(error.__context__ if hidden else error)}", code)
+        fail(f"{message}: {noisy.reason(error)}", code)
     except Exception as error:  # of the environment, say: its traceback is what the user needs
         error.add_note(f"({message})")
         raise
