@@ -128,7 +128,19 @@ class Agent(nn.Module):
         return log_prob, entropy, self.critic(observations).squeeze(1)
 
 
-class Normalizer:
+class Saved:
+    """A base for what is numbers and arrays, all of which a checkpoint holds."""
+
+    def state_dict(self):
+        """Return the attributes as tensors that share the arrays' memory."""
+        return {name: torch.as_tensor(np.asarray(value)) for name, value in vars(self).items()}
+
+    def load_state_dict(self, state):
+        """Restore a state_dict."""
+        vars(self).update({name: np.asarray(value)[()] for name, value in state.items()})
+
+
+class Normalizer(Saved):
     """Running mean and variance of the samples so far, as in Gymnasium's Normalize wrappers."""
 
     def __init__(self, shape):
@@ -150,38 +162,15 @@ class Normalizer:
         """Return the distance of x from the mean, scaled."""
         return self.scale(x - self.mean)
 
-    def state_dict(self):
-        """Return mean, variance and count as tensors."""
-        state = {"mean": self.mean, "var": self.var, "count": np.float64(self.count)}
-        return {name: torch.as_tensor(value) for name, value in state.items()}
 
-    def load_state_dict(self, state):
-        """Restore a state_dict."""
-        self.mean, self.var = state["mean"].numpy()[()], state["var"].numpy()[()]
-        self.count = state["count"].item()
-
-
-class Rollout:
+class Rollout(Saved):
     """T steps, and the observation after them."""
-
-    ARRAYS = ("observations", "eps", "actions", "rewards", "dones")
 
     def __init__(self, steps, env):
         self.observations = np.zeros((steps + 1, *env.observation_space.shape), np.float32)
         self.eps, self.actions = np.zeros((2, steps, *env.action_space.shape), np.float32)
         self.rewards, self.dones = np.zeros((2, steps), np.float32)  # done: ended in whatever way
         self.discounted_return = 0.0
-
-    def state_dict(self):
-        """Return the arrays, as tensors that share their memory, and the discounted return."""
-        arrays = {name: torch.from_numpy(getattr(self, name)) for name in self.ARRAYS}
-        return {**arrays, "discounted_return": float(self.discounted_return)}
-
-    def load_state_dict(self, state):
-        """Copy a state_dict back."""
-        for name in self.ARRAYS:
-            getattr(self, name)[:] = state[name].numpy()
-        self.discounted_return = state["discounted_return"]
 
 
 def compute_gae(rewards, values, dones, gamma, gae_lambda):
