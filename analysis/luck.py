@@ -7,7 +7,6 @@ returns. Keeping the baseline fixed would not do: a baseline that was unlucky is
 
 import numpy as np
 
-from analysis.runs import STUDY
 from analysis.statistics import contrast, pooled_std
 
 DRAWS = 10_000
@@ -71,24 +70,6 @@ def luck_of_studies(studies):
 def clearly_worse(sample, baseline):
     """Tell whether the 95 % interval of the difference of two samples is below zero."""
     return len(sample) > 1 and len(baseline) > 1 and contrast([sample, baseline], [1, -1])[3] < 0
-
-
-def luck_of_paper(best, seeds, configurations):
-    """Draw the paper's sweep from its table of best noises; return what luck_of_studies does.
-
-    The standard deviation is the baseline's. That of the best noise is known, too, but belongs to a
-    winner, which had luck with its seeds.
-
-    best: the table; seeds: algorithm -> seeds of each configuration, of which there are
-    `configurations` in every environment.
-    """
-    lucks = {}
-    for key, rows in best.groupby(STUDY):
-        rng, n = np.random.default_rng(0), seeds[key[0]]
-        for row in rows.itertuples():
-            draws = draw_differences(row.baseline_std, n - 1, n, configurations * [n], rng)
-            lucks[*key, row.environment] = highest(draws)
-    return lucks
 
 
 def highest(draws):

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from analysis.luck import add_luck, luck_of_paper
-from analysis.runs import KEYS, VERSION, rows_of, script_name
+from analysis.luck import add_luck, draw_differences, highest
+from analysis.runs import KEYS, STUDY, VERSION, script_name
 from noisy_wrappers import BASELINE, Configuration
 
 PAPER_SEEDS = {"SAC": 5, "TD3": 5, "PPO": 10}
@@ -52,43 +52,46 @@ def compare_tables(paper, lengths, alone, consistency, early):
     `lengths` has the steps of each study, by the values of its columns STUDY: final returns after
     fewer steps than the paper's are shown beside them, without a difference.
     """
-    # The paper's table has baselines too: they are rows of their own here.
-    best = with_baseline_rows(add_luck_of_paper(paper["best"]))
-    yield "compare_best", only_equal_steps(compare_table(alone, best, *FINAL), lengths)
-    for name in ("consistent", "consistently_worse"):
-        table = compare_table(consistency, paper[name], *AVERAGE)
-        yield f"compare_{name}", only_equal_steps(table, lengths)
-    yield "compare_early_performance", compare_table(early, paper["early_performance"], *FINAL)
-
-
-def add_luck_of_paper(best):
-    """Add to the paper's table of best noises what luck alone would show."""
-    best = best.assign(difference=best["noisy_mean"] - best["baseline_mean"])
-    return add_luck(best, luck_of_paper(best, PAPER_SEEDS, PAPER_CONFIGURATIONS))
-
-
-def with_baseline_rows(paper):
-    """Turn rows with noise and baseline side by side into rows of noise and rows of baseline."""
-    noisy = paper.rename(columns={"noisy_mean": "mean", "noisy_std": "std"})
-    baseline = paper.rename(columns={"baseline_mean": "mean", "baseline_std": "std"})
+    # The paper's table has noise and baseline side by side: they are rows of their own here.
+    noisy = add_luck_of_paper(paper["best"])
+    baseline = noisy.rename(columns={"baseline_mean": "mean", "baseline_std": "std"})
     baseline = baseline.assign(noise=BASELINE.noise, noise_rate=BASELINE.noise_rate)
-    return pd.concat([noisy, baseline.drop(columns=LUCK)], ignore_index=True)
+    noisy = noisy.rename(columns={"noisy_mean": "mean", "noisy_std": "std"})
+    best = pd.concat([noisy, baseline.drop(columns=LUCK)], ignore_index=True)
+    for name, theirs in (paper | {"best": best}).items():
+        ours = {"best": alone, "early_performance": early}.get(name, consistency)
+        table = compare_table(ours, theirs)
+        if name != "early_performance":  # whose rows are of the same step
+            others = pd.MultiIndex.from_frame(table[STUDY]).map(lengths) != PAPER_STEPS
+            table.loc[others, "difference_se"] = np.nan
+        yield name, table
 
 
-def only_equal_steps(table, lengths):
-    """Take out the differences of studies that ran for other steps than the paper's."""
-    others = [key for key, steps in lengths.items() if steps != PAPER_STEPS]
-    for key in others:
-        table.loc[rows_of(table, key), "difference_se"] = np.nan
-    return table
+def add_luck_of_paper(best, seeds=PAPER_SEEDS):
+    """Add to the paper's table of best noises what luck alone would show: its sweep, drawn again.
+
+    The standard deviation is the baseline's. That of the best noise is known, too, but belongs to a
+    winner, which had luck with its seeds.
+
+    seeds: algorithm -> seeds of each of the PAPER_CONFIGURATIONS in every environment.
+    """
+    lucks = {}
+    for key, rows in best.groupby(STUDY):
+        rng, n = np.random.default_rng(0), seeds[key[0]]
+        for row in rows.itertuples():
+            n_noisy = PAPER_CONFIGURATIONS * [n]
+            draws = draw_differences(row.baseline_std, n - 1, n, n_noisy, rng)
+            lucks[*key, row.environment] = highest(draws)
+    return add_luck(best.assign(difference=best["noisy_mean"] - best["baseline_mean"]), lucks)
 
 
-def compare_table(ours, paper, mean, std, number):
+def compare_table(ours, paper):
     """Set our figures beside every row of the paper's table that has them, once for each study.
 
-    `ours` holds every configuration; `mean`, `std` and `number` name its columns. The difference is
-    in standard errors: (ours - paper) / sqrt(std^2 / n + paper_std^2 / paper_n).
+    `ours` holds every configuration. The difference is in standard errors: (ours - paper) /
+    sqrt(std^2 / n + paper_std^2 / paper_n).
     """
+    mean, std, number = FINAL if "mean" in paper else AVERAGE
     keys = [name for name in (*KEYS, "steps_millions") if name in paper]
     numbers = [name for name in (mean, std, number, "steps_millions") if name in ours]
     ours = ours.astype(dict.fromkeys(numbers, float))  # a table without rows has no types
@@ -103,9 +106,7 @@ def compare_table(ours, paper, mean, std, number):
     table = paper.merge(ours, on=shared, how="left")
     for name in set(keys) - set(shared):
         table[name] = table[name].fillna(table[f"paper_{name}"])
-    paper_n = table["algorithm"].map(PAPER_SEEDS)
-    if number == "environments":
-        paper_n = PAPER_ENVIRONMENTS
+    paper_n = table["algorithm"].map(PAPER_SEEDS) if number == "n" else PAPER_ENVIRONMENTS
     variance = table[std] ** 2 / table[number] + table[f"paper_{std}"] ** 2 / paper_n
     difference = table[mean] - table[f"paper_{mean}"]
     table["difference_se"] = difference / np.sqrt(variance.where(variance > 0))

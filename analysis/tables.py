@@ -335,8 +335,8 @@ def make_tables(studies, paper=None):
         steps = ", ".join(f"{study_name(*key)} {n:,}" for key, n in lengths.items())
         ours = alone[alone["phase"] != SEARCH], consistency, early
         for name, table in compare_tables(paper, lengths, *ours):
-            section, note = name.removeprefix("compare_"), f"Our steps: {steps}."
-            tables.append(table_of("compare", table, name=name, section=section, note=note))
+            more = {"name": f"compare_{name}", "section": name, "note": f"Our steps: {steps}."}
+            tables.append(table_of("compare", table, **more))
     return {table.name: table for table in tables}
 
 
