@@ -20,7 +20,6 @@ from noisy_wrappers import BASELINE, Configuration
 
 STUDY = ["algorithm", "exp_name", "phase"]  # the columns that name a study: see study_name
 KEYS = [*STUDY, "environment", "noise", "noise_rate"]
-ELSEWHERE = ", tested in "
 SUCCESS = "success rate"  # what a Study may have in place of returns
 EVAL_COLUMNS = ["step", "episode", "episodic_return", "episodic_length"]
 RUN_COLUMNS = ["run", "status", "reason", *KEYS, "configuration", "seed", "settings", "versions"]
@@ -45,7 +44,7 @@ def script_name(algorithm):
 
 def where_tested(environment, elsewhere):
     """Name where runs were tested: in their own environment, or in another one."""
-    return f"{environment}{ELSEWHERE}{elsewhere}" if elsewhere else environment
+    return f"{environment}, tested in {elsewhere}" if elsewhere else environment
 
 
 def rows_of(table, key):
@@ -132,11 +131,9 @@ def leave_out_different(runs):
         usual = usual_settings(group["settings"])
         for index, own in group["settings"].items():
             differing = folders.difference(own, usual)
+            said = ", ".join(f"{name} is {own[name]}, not {usual[name]}" for name in differing)
+            said += f" as in the runs of {exp_name} that count: give such runs another --exp-name"
             if differing:
-                said = ", ".join(f"{name} is {own[name]}, not {usual[name]}" for name in differing)
-                said += (
-                    f" as in the runs of {exp_name} that count: give such runs another --exp-name"
-                )
                 runs.loc[index, ["status", "reason"]] = ["different", said]
 
 
@@ -242,9 +239,8 @@ def left_out(runs):
     run whose config.json cannot be read has a row of its own.
     """
     out = pd.concat([runs[runs["status"] != "finished"], missing_runs(runs)], ignore_index=True)
-    nameless = out["run"].where(out["algorithm"].isna(), "")
-    keys = [out["status"], *(out[name] for name in KEYS), nameless.rename("nameless")]
-    groups = out.groupby(keys, sort=False, dropna=False)
+    out["nameless"] = out["run"].where(out["algorithm"].isna(), "")
+    groups = out.groupby(["status", *KEYS, "nameless"], sort=False, dropna=False)
     table = groups.agg(seeds=("seed", ranges), run=("run", few), reason=("reason", few))
     return table.droplevel("nameless").reset_index(), Counter(out["status"])
 
@@ -303,8 +299,6 @@ class Study:
 
     def sample(self, config, e):
         """Return the final test returns (seeds,) in one environment, of the runs that exist."""
-        if config not in self.returns:
-            return np.empty(0)
         returns = self.final(config)[:, e]
         return returns[np.isfinite(returns)]
 
@@ -322,18 +316,15 @@ def make_studies(runs, metric="return"):
     studies, notes = [], []
     column = "success_rates" if metric == SUCCESS else "returns"
     finished = runs[runs["status"] == "finished"]
-    if metric == SUCCESS:
-        told = finished[column].notna()
-        silent = ~told & told.groupby(finished["environment"]).transform("any")
-        for env, n in finished.loc[silent, "environment"].value_counts(sort=False).items():
-            notes.append(
-                f"runs on {env} that never tell success, as others do, count as 0 %: {n} (version "
-                "0.2 noted no success: leave its runs out)"
-            )
-        never = finished.loc[silent, "steps"].map(lambda steps: np.zeros(len(steps)))
-        finished = finished.assign(**{column: finished[column].where(~silent, never)})
-    finished = finished[finished[column].notna()]
-    for key, group in finished.groupby(STUDY):
+    told = finished[column].notna()
+    others_tell = told.groupby(finished["environment"]).transform("any")
+    silent = finished.loc[others_tell & ~told, "environment"]
+    for env, n in silent.value_counts(sort=False).items():
+        notes.append(
+            f"runs on {env} that never tell success, as others do, count as 0 %: {n} (version "
+            "0.2 noted no success: leave its runs out)"
+        )
+    for key, group in finished[others_tell].groupby(STUDY):
         name = study_name(*key)
         steps, longest = reduce(np.intersect1d, group["steps"]), group["steps"].map(len).max()
         if len(steps) < longest:
@@ -344,13 +335,12 @@ def make_studies(runs, metric="return"):
         envs, seeds = sorted(set(group["environment"])), sorted(set(group["seed"]))
         shape = (len(steps), len(seeds), len(envs))
         configs = sorted({*group["configuration"], BASELINE})
-        study = Study(
-            *key, envs, seeds, steps, {c: np.full(shape, np.nan) for c in configs}, metric
-        )
+        returns = {config: np.full(shape, np.nan) for config in configs}
         for run in group.itertuples():
             place = seeds.index(run.seed), envs.index(run.environment)
-            shared = np.isin(run.steps, steps)
-            study.returns[run.configuration][:, *place] = getattr(run, column)[shared]
+            tests, shared = getattr(run, column), np.isin(run.steps, steps)
+            returns[run.configuration][:, *place] = 0 if tests is None else tests[shared]
+        study = Study(*key, envs, seeds, steps, returns, metric)
         for e, env in enumerate(envs):
             if study.phase != SEARCH and len(study.sample(BASELINE, e)) == 0:
                 notes.append(f"{name}: no finished baseline on {env}, so no comparison there")
