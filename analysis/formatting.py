@@ -2,7 +2,7 @@
 
 import re
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -12,10 +12,18 @@ from analysis.runs import script_name
 from analysis.verdicts import percent
 from noisy_wrappers import rate_order, rounded
 
-# Formats of numbers that have no spread. z: no "-0"
 WHOLE_WORDS = {"break_long_words": False, "break_on_hyphens": False}  # of textwrap
 DASH = "\u2013"  # of what does not exist
-TENTH, WHOLE, PLAIN, SHARE, P_VALUE = "z,.1f", "z,.0f", "g", "z.2f", ".2g"
+TENTH = "z,.1f"  # z: no "-0"
+_COLUMNS_WITH = {  # a format of numbers that have no spread
+    "z,.0f": """n n_baseline n_baseline_most environments conditions chosen_from seeds seeds_needed
+        steps_to_baseline percent_of_environments""",
+    ".2g": "p p_adjusted p_holm smallest_p smallest_p_adjusted p_luck paper_p_luck",
+    "z.2f": "probability_of_improvement probability_low probability_high effect_size t",
+    TENTH: "difference_se",
+    "g": "steps_millions",
+}
+FORMATS = {name: form for form, names in _COLUMNS_WITH.items() for name in names.split()}
 
 
 @dataclass(frozen=True)
@@ -26,7 +34,6 @@ class Table:
     frame: pd.DataFrame  # all columns, as in the csv
     caption: str  # at most two lines
     section: str  # of the report: a key of report.SECTIONS
-    formats: dict = field(default_factory=dict)  # column -> format of numbers; others: see text_of
     note: str = ""  # what to know about these rows
     only_csv: tuple = ()  # columns that would make the table wider than a page
     view: pd.DataFrame | None = None  # what people read, if that is not the frame
@@ -82,7 +89,7 @@ def spreads(frame):
     return found
 
 
-def text_of(name, value, form, spread=None):
+def text_of(name, value, spread=None):
     """Return one value of the column `name` as text; a value that does not exist is a dash.
 
     The paper's numbers have the paper's one decimal, all others the digits that their spread
@@ -92,8 +99,8 @@ def text_of(name, value, form, spread=None):
         return DASH
     if isinstance(value, str):
         return value or ("no noise" if name == "noise" else DASH)
-    if form or name.startswith("paper_"):
-        return f"{value:{form or TENTH}}"
+    if name in FORMATS or name.startswith("paper_"):
+        return f"{value:{FORMATS.get(name, TENTH)}}"
     if name.endswith("_percent") and spread is None:
         return percent(value, sign="").removesuffix(" %")
     return rounded(value, spread)
@@ -121,8 +128,7 @@ def shown(table):
     The phase and environments without percent are shown where a row has any, and exp_name where one
     is not its script's; a row of all environments says so.
     """
-    frame = table.frame if table.view is None else table.view
-    frame = frame.reset_index(drop=True)
+    frame = (table.frame if table.view is None else table.view).reset_index(drop=True)
     known = spreads(frame)
     frame = frame.drop(columns=list(table.only_csv))
     if "scope" in frame:
@@ -135,8 +141,7 @@ def shown(table):
     cells = {}
     for name in frame:
         pairs = zip(frame[name], known.get(name, [None] * len(frame)), strict=True)
-        form = table.formats.get(name)
-        cells[name] = [text_of(name, value, form, spread) for value, spread in pairs]
+        cells[name] = [text_of(name, value, spread) for value, spread in pairs]
     text = pd.DataFrame(cells, dtype=object)
     if "n_baseline_most" in text:  # over several environments: "10 to 50"
         most = text.pop("n_baseline_most")

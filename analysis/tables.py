@@ -8,7 +8,7 @@ from scipy import stats
 
 from analysis import statistics, verdicts
 from analysis.folders import CONFIRMATION, PHASES, SEARCH
-from analysis.formatting import P_VALUE, PLAIN, SHARE, TENTH, WHOLE, Table
+from analysis.formatting import Table
 from analysis.luck import add_luck, luck_of_studies
 from analysis.paper import compare_tables
 from analysis.runs import KEYS, STUDY, SUCCESS, study_name
@@ -44,15 +44,6 @@ _COLUMNS = {
 }
 COLUMNS = {name: [*STUDY, *text.split()] for name, text in _COLUMNS.items()}
 COLUMNS["judged"] = [*dict.fromkeys(COLUMNS["summary"] + COLUMNS["statistics"])]
-_COLUMNS_WITH = {
-    WHOLE: """n n_baseline n_baseline_most environments conditions chosen_from seeds seeds_needed
-        steps_to_baseline percent_of_environments""",
-    P_VALUE: "p p_adjusted p_holm smallest_p smallest_p_adjusted p_luck paper_p_luck",
-    SHARE: "probability_of_improvement probability_low probability_high effect_size t",
-    TENTH: "difference_se",
-    PLAIN: "steps_millions",
-}
-FORMATS = {name: form for form, names in _COLUMNS_WITH.items() for name in names.split()}
 STATISTICS_ONLY_CSV = ("iqm", "iqm_low", "iqm_high", "t", "pooled_std", "environments")
 STATISTICS_ONLY_CSV += ("seeds_needed", "comparisons", "smallest_p", "smallest_p_adjusted")
 
@@ -166,16 +157,11 @@ def early_rows(study):
         if not any(len(study.sample(config, e)) for config in configs):
             continue  # not tried here: the baseline alone would be no comparison
         for i, config in product(places, [BASELINE, *configs]):
-            mean, std, n = statistics.mean_std(study.returns[config][i, :, e])
-            if n > 0:
-                yield {
-                    **row_keys(study, env, config),
-                    "noise": noise,
-                    "steps_millions": study.steps[i] / 1e6,
-                    "mean": mean,
-                    "std": std,
-                    "n": n,
-                }
+            row = row_keys(study, env, config) | {"noise": noise}
+            row["steps_millions"] = study.steps[i] / 1e6
+            row["mean"], row["std"], row["n"] = statistics.mean_std(study.returns[config][i, :, e])
+            if row["n"] > 0:
+                yield row
 
 
 # ------------------------------------------------------------------------------------------- tables
@@ -220,22 +206,21 @@ def family_notes(judged):
     """Say where there are too few seeds for a difference that is significant, if corrected."""
     notes = []
     compared = judged[judged["verdict"].notna() & (judged["verdict"] != ALL_EQUAL)]
-    keys = ["comparisons", "smallest_p"]
-    for study, rows in compared.groupby(STUDY):
-        best = rows.sort_values("smallest_p", kind="stable")
-        best = best.drop_duplicates(["scope", "environment"]).sort_index()
-        for (size, smallest), same in best.groupby(keys, sort=False, dropna=False):
-            places = same["environment"].mask(same["scope"] == "all", "all")
-            seeds = counted(min(same["n"].min(), same["n_baseline"].min()), "seed")
-            start = f"{study_name(*study)}, {', '.join(places)}: with {seeds}"
-            possible = f"smallest possible p: {smallest:.2g}"
-            if smallest > statistics.LEVEL:
-                notes.append(f"{start} no difference can be significant ({possible}).")
-            elif round(size * smallest, 9) > statistics.LEVEL:
-                notes.append(
-                    f"{start} and {size:.0f} comparisons no difference alone can be significant "
-                    f"after the correction ({possible}, corrected {min(1, size * smallest):.2g})."
-                )
+    best = compared.sort_values("smallest_p", kind="stable")
+    best = best.drop_duplicates([*STUDY, "scope", "environment"]).sort_index()
+    keys = [*STUDY, "comparisons", "smallest_p"]
+    for (*study, size, smallest), same in best.groupby(keys, sort=False, dropna=False):
+        places = same["environment"].mask(same["scope"] == "all", "all")
+        seeds = counted(same[["n", "n_baseline"]].min(axis=None), "seed")
+        start = f"{study_name(*study)}, {', '.join(places)}: with {seeds}"
+        possible = f"smallest possible p: {smallest:.2g}"
+        if smallest > statistics.LEVEL:
+            notes.append(f"{start} no difference can be significant ({possible}).")
+        elif round(size * smallest, 9) > statistics.LEVEL:
+            notes.append(
+                f"{start} and {size:.0f} comparisons no difference alone can be significant "
+                f"after the correction ({possible}, corrected {min(1, size * smallest):.2g})."
+            )
     return notes
 
 
@@ -305,26 +290,24 @@ def make_tables(studies, paper=None):
     rows = judge(studies)
     alone = rows[rows["scope"] == "environment"]
     # The seeds of a search chose the noise, so they cannot judge it.
-    judging = [study for study in studies if study.phase != SEARCH]
     judged = rows[rows["phase"] != SEARCH]
-    best = best_rows(judged)
+    best = add_luck(best_rows(judged), luck_of_studies(studies))
     consistency = pd.DataFrame(consistency_rows(judged), columns=COLUMNS["consistency"])
     good, bad = split_consistency(consistency)
     returns = (row for study in studies for row in early_rows(study))
     early = pd.DataFrame(returns, columns=COLUMNS["early_performance"])
-    best = add_luck(best, luck_of_studies(judging))
     failing = bad[bad["fails_at_every_rate"] == "yes"][[*STUDY, "noise"]].drop_duplicates()
     failing = "; ".join(f"{noise} ({study_name(*study)})" for *study, noise in failing.values)
     failing = f"Worse at every rate that was tried: {failing or 'none'}."
     note = percent_note(judged, studies[0].metric)
     compared = judged["verdict"].notna()
     table = judged.assign(n_baseline=judged["n_baseline"].where(compared))[COLUMNS["statistics"]]
-    shape = {"view": table[compared], "only_csv": STATISTICS_ONLY_CSV, "note": note}
+    more = {"view": table[compared], "only_csv": STATISTICS_ONLY_CSV, "note": note}
     tables = [
         table_of("best", best[COLUMNS["best"]], view=best_view(best), note=note),
         table_of("consistent", good, note=note),
         table_of("consistently_worse", bad, note=f"{failing} {note}".strip()),
-        table_of("statistics", table, **shape),
+        table_of("statistics", table, **more),
         table_of("early_performance", early, rates_beside=True),
     ]
     for algorithm, table in alone.groupby("algorithm"):
@@ -342,7 +325,7 @@ def make_tables(studies, paper=None):
 
 def table_of(kind, frame, name=None, section=None, **more):
     """Make a Table as this module describes its kind; name and section may be kind."""
-    return Table(name or kind, frame, CAPTIONS[kind], section or kind, FORMATS, **more)
+    return Table(name or kind, frame, CAPTIONS[kind], section or kind, **more)
 
 
 def best_view(best):

@@ -203,8 +203,7 @@ def test_of_many_comparisons_the_first_are_shown_and_all_are_counted():
 
 def test_a_row_of_all_environments_shows_the_range_of_its_baselines():
     columns = {"n_baseline": [10, 5], "n_baseline_most": [50, 5], "p": [0.5, 0.5]}
-    formats = analysis.tables.FORMATS
-    table = analysis.formatting.Table("t", pd.DataFrame(columns), "", "", formats)
+    table = analysis.formatting.Table("t", pd.DataFrame(columns), "", "")
     assert list(analysis.formatting.shown(table)["n baseline"]) == ["10 to 50", "5"]
     row = {"n": 5, "n_baseline": 10, "n_baseline_most": 50, "smallest_p": 0.1, "seeds_needed": 4}
     assert "5 seeds against 10 to 50 cannot" in analysis.verdicts.power(row)
