@@ -85,10 +85,9 @@ def write_report(out, results, drawn):
     pages = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True
     )
-    pages.filters |= {"breakable": breakable, "source": source}
+    pages.filters |= {"breakable": breakable, "source": source, "tally": tally}
     html = pages.get_template("report.html.jinja").render(
         results=results,
-        others_tally=tally(results.others["verdict"]),
         sections={
             key: SECTIONS[key] for key in SECTIONS if tables[key] or figures[key] or folded[key]
         },
