@@ -108,18 +108,17 @@ def forest_panel(ax, rows, inches):
     ax.axvline(0, color="black", linewidth=0.8)
     ax.grid(axis="y", color="0.92")
     ax.set_axisbelow(True)
+    side = {"color": "0.35", "fontsize": 7, "ha": "right"}
     for row in rows.itertuples():
         y = configs.index((row.noise, row.noise_rate))
         color = style.COLORS.get(row.verdict, style.UNCLEAR)
+        face = style.COLORS.get(row.verdict, "white")
         if pd.notna(row.difference_low):
             ax.hlines(y, row.difference_low, row.difference_high, color=color, linewidth=1.5)
-        face = color if row.verdict in style.COLORS else "white"
-        look = {"color": color, "markerfacecolor": face, "markersize": 6, "zorder": 3}
-        ax.plot(row.difference, y, "o", **look)
-        side = {"transform": ax.get_yaxis_transform(), "ha": "right", "va": "center"}
-        ax.text(1, y, seeds_of(row.n, row.n_baseline), color="0.35", fontsize=7, **side)
-    side = {"transform": ax.transAxes, "ha": "right", "va": "bottom"}
-    ax.text(1, 1, "n", color="0.35", fontsize=7, **side)
+        ax.plot(row.difference, y, "o", color=color, markerfacecolor=face, markersize=6, zorder=3)
+        n = seeds_of(row.n, row.n_baseline)
+        ax.text(1, y, n, transform=ax.get_yaxis_transform(), va="center", **side)
+    ax.text(1, 1, "n", transform=ax.transAxes, va="bottom", **side)
     ax.tick_params(axis="y", length=0)
     ax.set_ylim(len(configs) - 0.5, -0.5)  # the first noise on top
     ends = rows[["difference", "difference_low", "difference_high"]].astype(float)

@@ -126,8 +126,7 @@ def best_curves_figure(study, best):
         color = style.COLORS.get(row.verdict, style.UNCLEAR)
         pair = {"black": BASELINE, color: configs[row.noise, row.noise_rate]}
         for color, config in pair.items():
-            curves = study.returns[config][:, :, e]
-            curve(ax, steps, *mean_and_std(curves), 0.12, color=color, linewidth=1.6)
+            curve(ax, steps, study.returns[config][:, :, e], 0.12, color=color, linewidth=1.6)
         noise = row.noise if len(row.noise) < 50 else f"{row.noise[:47]}..."
         lines = f"{noise}, {row.noise_rate}\n{row.verdict} (n = {seeds_of(row.n, row.n_baseline)})"
         style.set_title(ax, row.environment, style.WIDTH / 3, f"\n{lines}")
@@ -142,14 +141,10 @@ def training_steps(study):
     return study.steps / unit, f"training steps ({word})"
 
 
-def mean_and_std(curves):
-    """Return mean and sample standard deviation (steps,) of the runs there are (steps x seeds)."""
-    curves = pd.DataFrame(curves)
-    return curves.mean(axis=1), curves.std(axis=1).fillna(0)
-
-
-def curve(ax, x, mean, std, alpha=0.07, **look):
-    """Draw a line, and shade one standard deviation around it."""
+def curve(ax, x, runs, alpha=0.07, **look):
+    """Draw the mean of runs (steps x seeds), and shade one sample standard deviation around it."""
+    runs = pd.DataFrame(runs)
+    mean, std = runs.mean(axis=1), runs.std(axis=1).fillna(0)
     ax.plot(x, mean, **look)
     ax.fill_between(x, mean - std, mean + std, color=look["color"], alpha=alpha, linewidth=0)
 
@@ -174,7 +169,7 @@ def curves_figure(study, noise):
     for (e, ax), (i, config) in product(zip(tried, axes, strict=True), enumerate(configs)):
         look = style.line_style(i, len(configs)) | {"linewidth": 1.1 if i else 1.8}
         look |= {"markevery": (min(i, every - 1), every), "markersize": 4.5, "label": labels[i]}
-        curve(ax, steps, *mean_and_std(study.returns[config][:, :, e]), **look)
+        curve(ax, steps, study.returns[config][:, :, e], **look)
     add_legend()
     return fig
 

@@ -189,7 +189,7 @@ def welch_t(values, chosen):
 
     t is 0 where the means are equal, and infinite where they differ and only the spread is 0.
 
-    values (n + m, comparisons), chosen (partitions, n + m) -> (partitions, comparisons).
+    values (n + m, ...), chosen (partitions, n + m) -> (partitions, ...).
     """
     n = chosen[0].sum()
     m = len(values) - n
@@ -221,10 +221,7 @@ def permutation_t(x, y):
     if min(map(min, sizes)) < 2:
         return nan, nan, 1.0
     ways = prod(comb(n + m, n) for n, m in sizes)
-    ts = [
-        welch_t(np.concatenate(pair)[:, None], partitions(*size))[:, 0]
-        for pair, size in zip(pairs, sizes, strict=True)
-    ]
+    ts = [welch_t(np.concatenate([a, b]), partitions(len(a), len(b))) for a, b in pairs]
     if len(ts) > 1:
         ts = list(map(normal_scores, ts))
     if len(ts) == 1 or ways <= MOST_PARTITIONS:

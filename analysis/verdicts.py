@@ -128,8 +128,8 @@ def sentence(row, unit=""):
     evidence = f"{difference(row, unit)}, p {p_value(row['p'])}{smallest(row)}"
     if row["verdict"] == UNCLEAR:
         return f"{start} shows {UNCLEAR}: {evidence}{power(row)}.{borderline(row)}"
-    alone = ", the only comparison there" if row["comparisons"] == 1 else ""
-    evidence += alone or corrected(row["p_adjusted"], row["comparisons"], "comparison")
+    several = corrected(row["p_adjusted"], row["comparisons"], "comparison")
+    evidence += several or ", the only comparison there"
     return f"{start} is {row['verdict']} than no noise: {evidence}.{borderline(row)}"
 
 
