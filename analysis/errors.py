@@ -61,21 +61,18 @@ class Terminal:
 
     def write(self, text):
         """Write text; once the reader has left, into nothing."""
-        try:
-            self._stream.write(CONTROL.sub("?", text))
-        except BrokenPipeError:
-            self._turn_off()
+        self._outlive_reader(self._stream.write, CONTROL.sub("?", text))
         return len(text)
 
     def flush(self):
         """Pass on what is buffered."""
-        try:
-            self._stream.flush()
-        except BrokenPipeError:
-            self._turn_off()
+        self._outlive_reader(self._stream.flush)
 
-    def _turn_off(self):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+    def _outlive_reader(self, action, *args):
+        try:
+            action(*args)
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
 
 
 def take_over_terminal():
