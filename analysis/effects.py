@@ -78,8 +78,7 @@ def effects_figure(rows, metric):
     write_below(quantity if is_forest else "noise rate", fontsize=9)
     if not is_forest:
         beyond = "both" if rows[column].abs().max() > limit else "neither"
-        place = {"fraction": 0.02, "pad": 0.01, "extend": beyond}
-        fig.colorbar(image, ax=axes, label=unit, **place)
+        fig.colorbar(image, ax=axes, label=unit, fraction=0.02, pad=0.01, extend=beyond)
     return fig
 
 

@@ -34,11 +34,8 @@ def draw_differences(std, df, n_baseline, n_noisy, rng, seeds=()):
         return rng.standard_normal(DRAWS) / np.sqrt(n)
 
     baseline = mean_of(n_baseline)
-    differences = np.full((len(n_noisy), DRAWS), np.nan)
-    for i, n in enumerate(n_noisy):
-        if n > 0:
-            differences[i] = spread * (mean_of(n) - baseline)
-    return differences
+    nothing = np.full(DRAWS, np.nan)
+    return np.array([spread * (mean_of(n) - baseline) if n else nothing for n in n_noisy])
 
 
 def luck_of_studies(studies):

@@ -16,12 +16,8 @@ PAPER_SEEDS = {"SAC": 5, "TD3": 5, "PPO": 10}
 PAPER_ENVIRONMENTS = 5
 PAPER_CONFIGURATIONS = 90  # 15 noises at 6 rates
 PAPER_STEPS = 1_000_000
-PAPER_FILES = {
-    "best": "best.csv",
-    "consistent": "consistent.csv",
-    "consistently_worse": "consistently_worse.csv",
-    "early_performance": "early_performance*.csv",  # one for each algorithm
-}
+# The names of its files; of the last, there is one for each algorithm
+PAPER_TABLES = ("best", "consistent", "consistently_worse", "early_performance*")
 LUCK = ["luck_median", "luck_95", "p_luck"]
 FINAL = ("mean", "std", "n")
 AVERAGE = ("average_improvement_percent", "std_improvement_percent", "environments")
@@ -33,8 +29,8 @@ def read_paper(folder):
     Raises ValueError where `folder` does not have them.
     """
     tables = {}
-    for name, pattern in PAPER_FILES.items():
-        parts = [pd.read_csv(path) for path in sorted(Path(folder).glob(pattern))]
+    for name in PAPER_TABLES:
+        parts = [pd.read_csv(path) for path in sorted(Path(folder).glob(f"{name}.csv"))]
         if not parts or "noise_as_run" not in parts[0]:
             raise ValueError(f"{folder} has no tables of the paper (results/paper has them)")
         table = pd.concat(parts, ignore_index=True)
@@ -42,7 +38,7 @@ def read_paper(folder):
         pairs = zip(table["noise"], table["noise_rate"], strict=True)
         table["noise_rate"] = [Configuration.parse(*pair).noise_rate for pair in pairs]
         names = [script_name(algorithm) for algorithm in table["algorithm"]]
-        tables[name] = table.assign(exp_name=names, phase="")
+        tables[name.rstrip("*")] = table.assign(exp_name=names, phase="")
     return tables
 
 

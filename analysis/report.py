@@ -78,6 +78,8 @@ def write_report(out, results, drawn):
         place = folded if several else figures
         place[FIGURES_OF.get(drawing.kind, drawing.kind)].append(drawing)
 
+    filled = tables.keys() | figures.keys() | folded.keys()
+
     def source(name):  # a URL that contains the figure
         picture = (out / f"{name}.svg").read_bytes()
         return f"data:image/svg+xml;base64,{base64.b64encode(picture).decode()}"
@@ -88,9 +90,7 @@ def write_report(out, results, drawn):
     pages.filters |= {"breakable": breakable, "source": source, "tally": tally}
     html = pages.get_template("report.html.jinja").render(
         results=results,
-        sections={
-            key: SECTIONS[key] for key in SECTIONS if tables[key] or figures[key] or folded[key]
-        },
+        sections={key: title for key, title in SECTIONS.items() if key in filled},
         tables=tables,
         figures=figures,
         folded=folded,
