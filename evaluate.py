@@ -76,9 +76,14 @@ class Args:
     """write a video of one episode of each condition into this folder and store nothing else"""
 
     @property
+    def drawing(self):
+        """How episodes are drawn, a mode of Gymnasium, or None."""
+        return "human" if self.render else "rgb_array" if self.video else None
+
+    @property
     def storing(self):
         """Whether episodes are stored: robustness.csv has no column for the seed."""
-        return self.seed == Args.seed
+        return self.seed == Args.seed and not self.drawing
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,12 +252,6 @@ def check_runs(runs, conditions, bad, storing):
     return stored
 
 
-def add_noise(env, condition):
-    """Wrap an environment in the noise of a condition; check_runs has told what it warns of."""
-    with warnings.catch_warnings(action="ignore"):
-        return condition.wrap(env)
-
-
 def tell(bad):
     """Print each reason why runs cannot be tested, with the first of them; bad: see check_runs."""
     folders_of = {}
@@ -264,37 +263,32 @@ def tell(bad):
 
 
 def play(run, condition, args):
-    """Play episodes; return what play_episodes does."""
-    with load(run) as (env, policy):
-        results = play_episodes(add_noise(env, condition), policy, args.episodes, args.seed)
+    """Play episodes, and store them; or draw one. Return what play_episodes does."""
+    with load(run, args.drawing) as (env, policy):
+        with warnings.catch_warnings(action="ignore"):  # check_runs has told them
+            noisy_env = condition.wrap(env)
+        if args.video:
+            place = f"__{slug(run.elsewhere)}" if run.elsewhere else ""
+            name = f"{run.folder.name}__{condition.slug or 'clean'}{place}.mp4"
+            return record(noisy_env, policy, args.seed, args.video / name)
+        results = play_episodes(noisy_env, policy, 1 if args.render else args.episodes, args.seed)
     if args.storing:
         store(run, run.key(condition), results)
     return results
 
 
-def draw(run, condition, args):
-    """Play an episode in a window or into a video; return its result."""
-    with load(run, "human" if args.render else "rgb_array") as (env, policy):
-        noisy_env = add_noise(env, condition)
-        if args.render:
-            return play_episodes(noisy_env, policy, 1, args.seed)[0]
-        place = f"__{slug(run.elsewhere)}" if run.elsewhere else ""
-        name = f"{run.folder.name}__{condition.slug or 'clean'}{place}.mp4"
-        return record(noisy_env, policy, args.seed, args.video / name)
-
-
 def record(env, policy, seed, path):
-    """Play an episode into a video; return its result."""
+    """Play an episode into a video; return what play_episodes does."""
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".") as temporary:
         folder = Path(temporary, "video")  # a new one: RecordVideo warns of one that exists
         video = RecordVideo(env, str(folder))  # of the first episode
         try:
-            [result] = play_episodes(video, policy, 1, seed)
+            results = play_episodes(video, policy, 1, seed)
         finally:
             if video.recording:
                 video.stop_recording()
         (folder / "rl-video-episode-0.mp4").replace(path)
-    return result
+    return results
 
 
 def play_episodes(env, policy, number, seed):
@@ -315,25 +309,25 @@ def play_episodes(env, policy, number, seed):
     return results
 
 
-def attempt(play, run, condition, args):
-    """Return what play(run, condition, args) returns, or in words why it cannot."""
+def attempt(run, condition, args):
+    """Return what `play` returns, or in words why it cannot."""
     try:
         return play(run, condition, args)
     except Exception as error:  # of the environment, or of any library that draws
         return with_place(error, (noisy.NotFiniteError, noisy.SpaceError))
 
 
-def play_all(play, tasks, args):
+def play_all(tasks, args):
     """Yield all tasks, (run, condition), in their order, with what `attempt` returns of each."""
     with tqdm(tasks, unit="condition", disable=None) as bar:
         if args.jobs == 1 or args.render:
             for task in bar:
-                yield task, attempt(play, *task, args)
+                yield task, attempt(*task, args)
             return
         context = multiprocessing.get_context("spawn")  # PyTorch does not survive a fork
         ignore = (signal.SIGINT, signal.SIG_IGN)  # at Ctrl-C they finish what they play
         with ProcessPoolExecutor(args.jobs, context, signal.signal, ignore) as pool:
-            futures = [pool.submit(attempt, play, *task, args) for task in tasks]
+            futures = [pool.submit(attempt, *task, args) for task in tasks]
             try:
                 for task, future in zip(bar, futures, strict=True):
                     yield task, future.result()
@@ -458,19 +452,6 @@ def draw_without_display():
     )
 
 
-def show(runs, conditions, args):
-    """Play an episode of each condition in a window or into a video; return whether one failed."""
-    failed = False
-    for (run, condition), result in play_all(draw, list(itertools.product(runs, conditions)), args):
-        name = f"{run.folder.name}, {condition.slug or 'clean'}"
-        if isinstance(result, str):
-            print(f"error: cannot draw {name}: {result}", file=sys.stderr)
-            failed = True
-        else:
-            print(f"{name}: return {noisy.rounded(result[0])}, {result[1]} steps")
-    return failed
-
-
 def main(args):
     """Check everything, play what is not stored, print the table; return the exit status."""
     if args.render and args.video:
@@ -512,23 +493,25 @@ def main(args):
             tempfile.TemporaryFile(dir=args.video).close()
         except OSError as error:
             fail(f"--video: cannot write to {args.video}: {error}")
-    if args.video or args.render:
-        return show(runs, conditions, args) or bool(bad)
-    if not args.storing:
+    if args.seed != Args.seed and not args.drawing:
         print(f"--seed {args.seed} is not the default: everything is played, nothing is stored")
     tasks = [
         (run, condition)
         for run, condition in itertools.product(runs, conditions)
-        if len(stored[run].get(run.key(condition), [])) < args.episodes
+        if args.drawing or len(stored[run].get(run.key(condition), [])) < args.episodes
     ]
     failed = {}
-    for (run, condition), results in play_all(play, tasks, args):
+    for (run, condition), results in play_all(tasks, args):
+        name = condition.slug or "clean"
         stored[run][run.key(condition)] = results
         if isinstance(results, str):
-            failed[run.folder] = f"{condition.slug or 'clean'}: {results}"
+            failed[run.folder] = f"{name}: {results}"
+        elif args.drawing:
+            [(drawn, steps, _)] = results
+            print(f"{run.folder.name}, {name}: return {noisy.rounded(drawn)}, {steps} steps")
     tell(failed)
     runs = [run for run in runs if run.folder not in failed]
-    if runs:
+    if runs and not args.drawing:
         print_table(runs, conditions, stored, args.episodes)
     return bool(bad or failed)
 
