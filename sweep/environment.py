@@ -85,28 +85,26 @@ def time_steps(env, time_limit, deadline, whole=False):
     env.reset(seed=1)
     env.step(env.action_space.sample())  # not timed: the first calls may load or compile something
     begin = now = time.perf_counter()
-    steps = resets = episodes = in_episodes = 0
-    stepping = resetting = 0.0
-    ended = True
     half = (begin + deadline) / 2
+    steps, resets, ends = [], [], []  # the seconds of each, and after which steps episodes ended
+    ended = True
     while not steps or (
         now < deadline
-        and (steps < STEPS or now < begin + SECONDS or (whole and not episodes and now < half))
+        and (len(steps) < STEPS or now < begin + SECONDS or (whole and not ends and now < half))
     ):
         if ended:
             start = time.perf_counter()
             env.reset()
-            resets, resetting = resets + 1, resetting + time.perf_counter() - start
+            resets.append(time.perf_counter() - start)
         action = env.action_space.sample()
         start = time.perf_counter()
         _, _, terminated, truncated, _ = env.step(action)
         now = time.perf_counter()
-        steps, stepping = steps + 1, stepping + now - start
-        ended = terminated or truncated
-        if ended:
-            episodes, in_episodes = episodes + 1, steps
-    length = in_episodes / episodes if episodes else time_limit
-    return stepping / steps + resetting / resets / length, steps, math.ceil(length)
+        steps.append(now - start)
+        if ended := terminated or truncated:
+            ends.append(len(steps))
+    length = ends[-1] / len(ends) if ends else time_limit
+    return fmean(steps) + fmean(resets) / length, len(steps), math.ceil(length)
 
 
 def why_unfit(env, configuration, time_limit, deadline):
@@ -218,20 +216,17 @@ def time_left(batches, jobs, elsewhere=False):
     """
     text = f"about {hours_of(sum(map(sum, batches)))} core-hours are left"
     if jobs:
-        clock = sum(clock_time(batch, jobs) for batch in batches)
+        clock = 0
+        for batch in batches:
+            ends = [0.0] * jobs
+            for seconds in batch:
+                heapq.heapreplace(ends, ends[0] + seconds)  # where the next place is free
+            clock += max(ends)
         runs = "1 run" if jobs == 1 else f"{jobs} runs"
         text += f", {hours_of(clock)} hours on the clock with {runs} at a time"
     if elsewhere:
         text += "; timed on this machine, others may be faster or slower"
     return text
-
-
-def clock_time(batch, jobs):
-    """Return how long a batch of runs takes, `jobs` at a time; batch: the seconds of each run."""
-    ends = [0.0] * jobs
-    for seconds in batch:
-        heapq.heapreplace(ends, ends[0] + seconds)  # where the next place is free
-    return max(ends)
 
 
 # --------------------------------------------------------------------------------------- the memory
