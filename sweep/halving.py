@@ -31,9 +31,8 @@ SCORED = 0.15  # a run's score in the search is the mean of its tests in this la
 class Round(NamedTuple):
     """A round of the search whose runs are all finished."""
 
-    noises: list[Configuration]
     seeds: int  # each noise has run with the seeds from 1 to this one
-    scores: dict[Configuration, float]
+    scores: dict[Configuration, float]  # of all its noises
     survivors: list[Configuration]
 
 
@@ -82,9 +81,8 @@ def advance(noises, budget, confirm, returns):
         scores = {noise: fmean(returns[noise, seed] for seed in seeds) for noise in noises}
         ranking = sorted(noises, key=scores.get, reverse=True)  # leaves equals in their order
         best = ranking[: math.ceil(len(noises) / 2)]
-        survivors = [noise for noise in noises if noise in best]
-        rounds.append(Round(noises, last_seed, scores, survivors))
-        noises = survivors
+        noises = [noise for noise in noises if noise in best]
+        rounds.append(Round(last_seed, scores, noises))
     seeds = range(FIRST_CONFIRMATION_SEED, FIRST_CONFIRMATION_SEED + confirm)
     return State(rounds, noises, seeds, missing([*noises, BASELINE], seeds, returns))
 
@@ -165,9 +163,8 @@ def records(algorithm, environment, state, returns, helped):
     """Yield the rows of choice.csv for one finished choice; their columns are CHOICE_COLUMNS."""
     kind = algorithm, environment
     for number, done in enumerate(state.rounds, start=1):
-        for noise in done.noises:
+        for noise, score in done.scores.items():
             survives = "yes" if noise in done.survivors else "no"
-            score = done.scores[noise]
             yield *kind, "search", number, *noise.columns, done.seeds, score, survives
     for noise, survives in ((BASELINE, ""), (*state.noises, "yes" if helped else "no")):
         score = fmean(returns[noise, seed] for seed in state.seeds)
