@@ -309,10 +309,10 @@ def play_episodes(env, policy, number, seed):
     return results
 
 
-def attempt(run, condition, args):
-    """Return what `play` returns, or in words why it cannot."""
+def attempt(task, args):
+    """Return what `play` returns of a task, (run, condition), or in words why it cannot."""
     try:
-        return play(run, condition, args)
+        return play(*task, args)
     except Exception as error:  # of the environment, or of any library that draws
         return with_place(error, (noisy.NotFiniteError, noisy.SpaceError))
 
@@ -320,19 +320,14 @@ def attempt(run, condition, args):
 def play_all(tasks, args):
     """Yield all tasks, (run, condition), in their order, with what `attempt` returns of each."""
     with tqdm(tasks, unit="condition", disable=None) as bar:
+        everything = attempt, tasks, itertools.repeat(args)
         if args.jobs == 1 or args.render:
-            for task in bar:
-                yield task, attempt(*task, args)
+            yield from zip(bar, map(*everything), strict=True)
             return
         context = multiprocessing.get_context("spawn")  # PyTorch does not survive a fork
         ignore = (signal.SIGINT, signal.SIG_IGN)  # at Ctrl-C they finish what they play
         with ProcessPoolExecutor(args.jobs, context, signal.signal, ignore) as pool:
-            futures = [pool.submit(attempt, *task, args) for task in tasks]
-            try:
-                for task, future in zip(bar, futures, strict=True):
-                    yield task, future.result()
-            finally:
-                pool.shutdown(cancel_futures=True)
+            yield from zip(bar, pool.map(*everything), strict=True)
 
 
 def end_at_once(number, frame):
@@ -493,7 +488,7 @@ def main(args):
             tempfile.TemporaryFile(dir=args.video).close()
         except OSError as error:
             fail(f"--video: cannot write to {args.video}: {error}")
-    if args.seed != Args.seed and not args.drawing:
+    if not (args.storing or args.drawing):
         print(f"--seed {args.seed} is not the default: everything is played, nothing is stored")
     tasks = [
         (run, condition)

@@ -95,7 +95,7 @@ def case(searched, tmp_path, monkeypatch):
     """The choice, a sweep with the same runs, and the run in each of them to be damaged."""
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(analyze, "figures", lambda *_: [])
-    monkeypatch.setattr(evaluate, "load", lambda run: nullcontext((gym.make("Pendulum-v1"), None)))
+    monkeypatch.setattr(evaluate, "load", lambda *_: nullcontext((gym.make("Pendulum-v1"), None)))
     monkeypatch.setattr(evaluate, "play_episodes", lambda *_: [(1.0, 1, 0.0)])
     choice = Path(shutil.copytree(searched, tmp_path / "choice"))
     runs = Path(shutil.copytree(searched / "search", tmp_path / "runs"))
