@@ -53,6 +53,12 @@ def runs_of(runs_dir):
     return sorted(filter(is_run, children))
 
 
+def logged(runs_dir):
+    """Return the run folders that the logs of sweeps tell of, whether they exist or not."""
+    places = [runs_dir / phase for phase in ("", *PHASES)]
+    return [place / log.stem for place in places for log in sorted(place.glob("logs/*__*.log"))]
+
+
 def flat_choice(runs_dir):
     """Say how to sort the runs of a choice that an earlier version left side by side."""
     fresh = "*_s1[0-9][0-9][0-9]_*"  # the seeds of its confirmation

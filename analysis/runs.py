@@ -112,10 +112,10 @@ def read_runs(runs_dir):
     say, where their study has a newer version of an environment, and empty for all others.
     """
     runs_dir, rows = Path(runs_dir), []
-    for folder in folders.runs_of(runs_dir):
-        row = read_run(folder) | {"run": str(folder.relative_to(runs_dir))}
-        rows.append(row | {"phase": "" if folder.parent == runs_dir else folder.parent.name})
-    rows += failed_without_a_folder(runs_dir)
+    found = {folder: read_run(folder) for folder in folders.runs_of(runs_dir)}
+    for folder, row in (found | failed_without_a_folder(runs_dir)).items():
+        phase = "" if folder.parent == runs_dir else folder.parent.name
+        rows.append(row | {"run": str(folder.relative_to(runs_dir)), "phase": phase})
     runs = pd.DataFrame(rows, columns=RUN_COLUMNS, dtype=object)
     leave_out_different(runs)
     set_older_versions_apart(runs)
@@ -169,20 +169,16 @@ def set_older_versions_apart(runs):
 
 
 def failed_without_a_folder(runs_dir):
-    """Return the runs of a sweep that failed before they wrote anything: only their logs tell.
+    """Return {folder: row} of the runs of a sweep of which only their logs tell that they failed.
 
     A run that ended well or was stopped, and has no folder, was moved or deleted by somebody.
     """
-    rows = []
-    for phase in ("", *folders.PHASES):
-        for path in sorted(runs_dir.glob(f"{phase or '.'}/logs/*__*.log")):
-            folder = runs_dir / phase / path.stem
-            log = folders.read_log(folder)
-            failed = log.exit_status not in (None, 0, *folders.STOPPED)
-            if failed and not folder.exists():
-                row = {"run": str(folder.relative_to(runs_dir)), "phase": phase}
-                rows.append(row | {"status": "failed", "reason": log.last_line})
-    return rows
+    logs = {path: folders.read_log(path) for path in folders.logged(runs_dir) if not path.exists()}
+    return {
+        path: {"status": "failed", "reason": log.last_line}
+        for path, log in logs.items()
+        if log.exit_status not in (None, 0, *folders.STOPPED)
+    }
 
 
 def choice_file(metric="return"):

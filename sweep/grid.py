@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from analysis.errors import fail
-from analysis.folders import PHASES, DamageError, read_config, read_result, runs_of
+from analysis.folders import DamageError, logged, read_config, read_result, runs_of
 from noisy_wrappers import BASELINE, MAY_DIFFER_IN_A_RUN, Configuration, run_name
 
 PROJECT = Path(__file__).resolve().parent.parent
@@ -151,19 +151,16 @@ def grid(args):
     runs = {}
     for algorithm, env_id in itertools.product(args.algos, args.envs):
         noisy = configurations(args, algorithm, env_id)
-        for seed in sorted(itertools.chain(*(args.seeds or [SEEDS[algorithm]]))):
-            for configuration in [BASELINE, *noisy]:
-                run = make_run(args, algorithm, env_id, configuration, seed)
-                runs.setdefault(run.folder, run)
+        seeds = itertools.chain(*(args.seeds or [SEEDS[algorithm]]))
+        for seed, configuration in itertools.product(seeds, [BASELINE, *noisy]):
+            run = make_run(args, algorithm, env_id, configuration, seed)
+            runs.setdefault(run.folder, run)
     return list(runs.values())
 
 
 def runs_in(folder):
     """Return the runs that a folder or its logs tell of, for a status that names no grid."""
-    folder = Path(folder)
-    folders = set(runs_of(folder))
-    for place in (folder, *(folder / phase for phase in PHASES)):
-        folders |= {place / log.stem for log in place.glob("logs/*__*.log")}
+    folders = {*runs_of(Path(folder)), *logged(Path(folder))}
     if not folders:
         fail(f"no runs in {folder}; name their folder with --runs-dir")
     runs = []
