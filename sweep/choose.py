@@ -24,6 +24,7 @@ from sweep import halving
 from sweep.environment import ask_all, remember, remembered, run_seconds, time_left, wall_time
 from sweep.grid import PlannedRun, configuration_of, configurations, make_run, result
 
+UNITS = {"return": "", SUCCESS: POINTS}  # of a difference, by the metric
 NO_SUCCESS = "it tells no `is_success` or `success`, as --metric success_rate needs"
 
 
@@ -32,7 +33,7 @@ class Choice(NamedTuple):
 
     kind: tuple[str, str]  # algorithm, in capitals, and environment
     noises: int  # that it began with
-    schedule: list[tuple[int, int]]  # of its search
+    batches: list[int]  # how many runs each round of the search has, and the confirmation
     state: halving.State
     runs: dict[tuple[Configuration, int], PlannedRun]  # those that have been due so far
     returns: dict[tuple[Configuration, int], float]  # of the finished ones: returns, or the metric
@@ -60,11 +61,10 @@ def choices(args):
         )
     known = {env_id: remembered(args.runs_dir, env_id) for env_id in args.envs}
     listed = args.view in ("list", "dry-run")
-    noises = {env_id: untried(args, env_id, known[env_id]) for env_id in args.envs if listed}
+    noises = {env_id: untried(args, env_id, known[env_id].tried) for env_id in args.envs if listed}
     noises = {env_id: new for env_id, new in noises.items() if new}
     for env_id, answer in ask_all(args, noises).items():
-        before = known[env_id].tried if known[env_id] else {}
-        known[env_id] = answer._replace(tried=before | answer.tried)
+        known[env_id] = answer._replace(tried=known[env_id].tried | answer.tried)
         if (unfit := unfit_noises(answer.tried)) and not args.noises:
             text = f"{env_id}: left out, because they cannot act there: {unfit}"
             print(text, file=sys.stderr)
@@ -80,17 +80,15 @@ def choices(args):
     return [choice for choice in found if not choice.problem]
 
 
-def untried(args, env_id, environment):
-    """Return the noises to try in an environment, of which `environment` is known, or None.
+def untried(args, env_id, tried):
+    """Return the noises to try in an environment; tried: as in Environment.
 
     All of them until the first run of a choice there is finished. From then on a choice keeps its
     noises: only such as were never tried, or were refused and are named all the same.
     """
-    tried = environment.tried if environment else {}
     noises = candidates(args, args.algos[0], env_id)
-    kept = candidates(args, args.algos[0], env_id, None if args.noises else environment)
-    walks = (walk(args, algorithm, env_id, kept, len(kept)) for algorithm in args.algos)
-    if not any(returns for _, _, _, returns in walks):
+    walks = (walk(args, algorithm, env_id, noises, len(noises)) for algorithm in args.algos)
+    if not any(returns for *_, returns in walks):
         return noises
     return [n for n in noises if n.noise not in tried or (args.noises and tried[n.noise])]
 
@@ -106,11 +104,8 @@ def unfit_noises(tried):
 
 
 def follow(args, algorithm, env_id, environment):
-    """Return one choice: where the finished runs have brought it.
-
-    environment: what is known of it, or None.
-    """
-    noises = candidates(args, algorithm, env_id, environment)
+    """Return one choice: where the finished runs have brought it."""
+    noises = candidates(args, algorithm, env_id, environment.tried)
     budget = 3 * len(noises) if args.budget is None else args.budget
     if budget < len(noises):
         fail(f"--budget must be at least {len(noises)}, a run for each noise, not {budget}")
@@ -131,7 +126,7 @@ def follow(args, algorithm, env_id, environment):
         )
     spread = halving.spread({run: values[-1] for run, (_, values, _) in tests.items()})
     seconds = wall_time(map(runs.get, returns))
-    if environment and seconds is None:
+    if seconds is None and environment.timed_steps:
         seconds = run_seconds(next(iter(runs.values())), environment)
     kind = algorithm.upper(), env_id
     results, problem = set().union(*(values for _, values, _ in tests.values())), ""
@@ -144,7 +139,8 @@ def follow(args, algorithm, env_id, environment):
             f"{len(returns)}), so further runs would say nothing about noise; change "
             "--total-timesteps, or leave this out"
         )
-    return Choice(kind, len(noises), schedule, state, runs, returns, spread, seconds, problem)
+    batches = [number * seeds for number, seeds in schedule] + [2 * args.confirm]
+    return Choice(kind, len(noises), batches, state, runs, returns, spread, seconds, problem)
 
 
 def walk(args, algorithm, env_id, noises, budget):
@@ -177,21 +173,20 @@ def read(run):
     runs_dir, phase = run.folder.parents[1], run.folder.parent
     if not phase.exists() and os.path.exists(runs_dir / run.folder.name):
         fail(f"{flat_choice(runs_dir)} (or choose another --runs-dir, if it is another sweep)")
-    if not result(run)[0]:
-        return run, None
-    row = read_run(run.folder)
-    if row["status"] == "finished":
-        return run, row
-    damage = f"{run.folder}/{row['reason']}; move its folder away to run it again"
+    finished, damage = result(run)
+    if finished:
+        row = read_run(run.folder)
+        if row["status"] == "finished":
+            return run, row
+        damage = f"{run.folder}/{row['reason']}; move its folder away to run it again"
     return run._replace(damage=damage), None
 
 
-def candidates(args, algorithm, env_id, environment=None):
+def candidates(args, algorithm, env_id, tried=()):
     """Return the noises to choose from, each once, but for those that cannot act there.
 
-    environment: what is known of it, or None. Exits if the user has named one that cannot act.
+    tried: as in Environment. Exits if the user has named one that cannot act.
     """
-    tried = environment.tried if environment else {}
     noises = dict.fromkeys(configurations(args, algorithm, env_id))
     noises.pop(BASELINE, None)  # at rate 0 a noise is none
     if any(rate is None for pairs in args.exclude for _, rate in pairs):
@@ -219,25 +214,20 @@ def plan(found, args):
     """
     if not any(choice.state.due for choice in found):
         return []
-    lines = list(map(describe, found))
+    lines = []
     if not any(choice.returns for choice in found):
-        lines = [*(question(choice, args.confirm) for choice in found), *lines]
-    lines.append(total(found, args))
+        fresh = f"{args.confirm} fresh seeds of each will decide"
+        for choice in found:
+            which = f"the best of {choice.noises} noises" if choice.noises > 1 else "the noise"
+            lines.append(f"{choice.name}: is {which} better than no noise? {fresh}")
+    lines += [*map(describe, found), total(found, args)]
     lines += filter(None, (detectable_gain(choice, args, len(found)) for choice in found))
     return [*dict.fromkeys(lines), f"runs, logs and the verdict are stored in {args.runs_dir}"]
 
 
-def question(choice, confirm):
-    """Say what a choice will decide."""
-    which = f"the best of {choice.noises} noises" if choice.noises > 1 else "the noise"
-    return (
-        f"{choice.name}: is {which} better than no noise? {confirm} fresh seeds of each will decide"
-    )
-
-
 def total(found, args):
     """Say how many runs all choices take, and what is left of them."""
-    search = sum(noises * seeds for choice in found for noises, seeds in choice.schedule)
+    search = sum(sum(choice.batches[:-1]) for choice in found)
     confirm = 2 * args.confirm * len(found)
     finished = sum(len(choice.returns) for choice in found)
     text = (
@@ -248,8 +238,7 @@ def total(found, args):
         return text
     left = []  # of each choice, the batches that are left: the seconds of their runs
     for choice in found:
-        runs = [noises * seeds for noises, seeds in choice.schedule] + [2 * args.confirm]
-        runs = [len(choice.state.due), *runs[len(choice.state.rounds) + 1 :]]
+        runs = [len(choice.state.due), *choice.batches[len(choice.state.rounds) + 1 :]]
         left.append([number * [choice.run_seconds] for number in runs])
     batches = [sum(batch, []) for batch in itertools.zip_longest(*left, fillvalue=[])]
     return f"{text}, {time_left(batches, args.jobs, args.elsewhere and not finished)}"
@@ -264,17 +253,15 @@ def detectable_gain(choice, args, verdicts):
         return f"{seeds} {gain:.1f} standard deviations over seeds {power}"
     if not choice.spread > 0:
         return ""
-    shift = gain * choice.spread
-    return (
-        f"{choice.name}: {seeds} about {rounded(shift, shift)}{unit(args)} ({gain:.1f} standard "
-        f"deviations of the last tests in the search) {power}"
-    )
+    shift = rounded(gain * choice.spread, gain * choice.spread) + UNITS[args.metric]
+    deviations = f"{gain:.1f} standard deviations of the last tests in the search"
+    return f"{choice.name}: {seeds} about {shift} ({deviations}) {power}"
 
 
 def describe(choice):
     """Say where a choice stands."""
     state = choice.state
-    number, rounds = len(state.rounds) + 1, len(choice.schedule)
+    number, rounds = len(state.rounds) + 1, len(choice.batches) - 1
     if not state.due:
         return f"{choice.name}: all runs are done"
     seeds = f"seeds {state.seeds[0]} to {state.seeds[-1]}" if len(state.seeds) > 1 else "seed 1"
@@ -316,11 +303,6 @@ def report(found, args):
     write_choice(Path(args.runs_dir, choice_file(args.metric)), rows)
 
 
-def unit(args):
-    """Return what stands behind a difference."""
-    return POINTS if args.metric == SUCCESS else ""
-
-
 def verdicts(found, args):
     """Return of finished choices whether the noise helps, and the verdict in a sentence."""
     comparisons = [
@@ -333,7 +315,7 @@ def verdicts(found, args):
         if args.metric == SUCCESS:
             comparison = comparison._replace(difference_percent=math.nan)  # never percent of a rate
         what = choice.name, *choice.state.noises, choice.noises, comparison, p, len(found)
-        judged.append((halving.helps(comparison, p), halving.sentence(*what, unit(args))))
+        judged.append((halving.helps(comparison, p), halving.sentence(*what, UNITS[args.metric])))
     return judged
 
 

@@ -378,10 +378,10 @@ def test_a_refusal_holds_until_the_noise_is_named_again(tmp_path):
 
 
 def test_what_cannot_be_read_is_asked_again(tmp_path):
-    assert remembered(tmp_path, "m:A-v0") is None
+    assert not remembered(tmp_path, "m:A-v0").timed_steps
     remember(tmp_path, "m:A-v0", KNOWN)
     assert remembered(tmp_path, "m:A-v0") == KNOWN
     [path] = tmp_path.glob("logs/*")
     for text in ("{", "[]", '{"step_seconds": 1}'):
         path.write_text(text)
-        assert remembered(tmp_path, "m:A-v0") is None
+        assert not remembered(tmp_path, "m:A-v0").timed_steps
