@@ -2162,23 +2162,18 @@ class EnvState:
         of_numpy = np.random.Generator | np.random.RandomState
         return [generator for generator in found if isinstance(generator, of_numpy)]
 
-    def _attributes(self) -> dict[str, Any]:
-        """Return the generators that an environment holds beside its np_random, by their places."""
-        known = [id(generator) for generator in self._generators()]
-        held = _held_generators(self.env)
-        return {place: held[place] for place in held if id(held[place]) not in known}
-
     def _returns(self) -> deque[float]:
         recorded = self.env.has_wrapper_attr("return_queue")
         return self.env.get_wrapper_attr("return_queue") if recorded else deque()
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state in Python's own types, to be taken between two episodes."""
+        generators, held = self._generators(), _held_generators(self.env)
         return {
             "python": _stream(random),
             "numpy": _stream(np.random),
-            "generators": [_stream(generator) for generator in self._generators()],
-            "attributes": {place: _stream(held) for place, held in self._attributes().items()},
+            "generators": [_stream(generator) for generator in generators],
+            "attributes": {place: _stream(generator) for place, generator in held.items()},
             "noise": [_without_arrays(w.state_dict()) for w in noise_wrappers(self.env).values()],
             "returns": [float(value) for value in self._returns()],
         }
@@ -2193,9 +2188,9 @@ class EnvState:
         _set_stream(np.random, state["numpy"])
         for generator, stream in zip(self._generators(), state["generators"], strict=True):
             _set_stream(generator, stream)
-        attributes, streams = self._attributes(), state.get("attributes", {})
-        for place in attributes.keys() & streams.keys():
-            _set_stream(attributes[place], streams[place])
+        held, streams = _held_generators(self.env), state.get("attributes", {})
+        for place in held.keys() & streams.keys():
+            _set_stream(held[place], streams[place])
         wrappers = noise_wrappers(self.env).values()
         for wrapper, part in zip(wrappers, state["noise"], strict=True):
             wrapper.load_state_dict(part)
@@ -2203,22 +2198,18 @@ class EnvState:
         self._returns().extend(state["returns"])
 
 
-def _held_generators(env: Env) -> dict[str, Any]:
-    """Return the random generators that an environment holds, by their places."""
+def _held_generators(env: Env, place: str = "") -> dict[str, Any]:
+    """Return the generators that an environment, or one that it holds, holds, by their places."""
     layers = [*_layers(env), env.unwrapped]
-    holders = {f"{i}": layer for i, layer in enumerate(layers)}
-    for place, layer in [*holders.items()]:
-        for name, value in vars(layer).items():
-            if isinstance(value, gym.Env) and value not in layers:
-                inside = [*_layers(value), value.unwrapped]
-                holders |= {f"{place}.{name}.{i}": part for i, part in enumerate(inside)}
     found, kinds = {}, np.random.Generator | np.random.RandomState | random.Random
     if torch := sys.modules.get("torch"):
         kinds |= torch.Generator
-    for place, holder in holders.items():
-        for name, value in _members(holder):
+    for i, layer in enumerate(layers):
+        for name, value in _members(layer):
             if isinstance(value, kinds) and not isinstance(value, random.SystemRandom):
-                found[f"{place}.{name}"] = value
+                found[f"{place}{i}.{name}"] = value
+            elif isinstance(value, gym.Env) and value not in layers and not place:
+                found |= _held_generators(value, f"{i}.{name}.")
     return found
 
 
@@ -2233,15 +2224,13 @@ def _package_of(value: Any) -> str:
 
 def _members(holder: Any, depth: int = 3) -> Iterator[tuple[str, Any]]:
     """Yield what an object holds, also in its containers, its spaces and objects of no library."""
-    package = _package_of(holder)
+    libraries = _LIBRARIES - {_package_of(holder)}
     parts = vars(holder) if hasattr(holder, "__dict__") else holder
     for name, value in [*_items(parts)]:
-        if isinstance(holder, NoiseWrapper) and name in ("_gate", "noise"):
-            continue  # which state_dict has
         yield str(name), value
         few = isinstance(value, list | tuple | dict) and len(value) <= 1000
-        own = _package_of(value) == package or _package_of(value) not in _LIBRARIES
-        goes_on = few or (own and hasattr(value, "__dict__")) or isinstance(value, gym.Space)
+        own = hasattr(value, "__dict__") and _package_of(value) not in libraries
+        goes_on = few or own or isinstance(value, gym.Space)
         if depth and goes_on and not isinstance(value, gym.Env):
             for inner, part in _members(value, depth - 1):
                 yield f"{name}.{inner}", part
