@@ -44,7 +44,7 @@ import time
 import traceback
 import warnings
 import zlib
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -1328,11 +1328,10 @@ def noise_wrappers(env: Env) -> dict[str, NoiseWrapper]:
     if not isinstance(env, gym.Env):
         raise TypeError(f"noise_wrappers takes a gymnasium.Env, not a {type(env).__name__}")
     found: dict[str, NoiseWrapper] = {}
-    count: Counter[str] = Counter()
     for layer in reversed(_layers(env, NoiseWrapper)):
         name = type(layer).__name__
-        count[name] += 1
-        found[name if count[name] == 1 else f"{name}_{count[name]}"] = layer
+        before = sum(type(other).__name__ == name for other in found.values())
+        found[f"{name}_{before + 1}" if before else name] = layer
     return found
 
 
@@ -1488,11 +1487,10 @@ def _replaced(nested: Any, entries: dict[EntryPath, Any]) -> Any:
     """Return a nested observation, or its space, with other entries in containers of its own."""
     if () in entries:
         return entries[()]
-    of_key: dict[Any, dict[EntryPath, Any]] = {}
-    for (key, *path), entry in entries.items():
-        of_key.setdefault(key, {})[tuple(path)] = entry
     parts = dict(_items(nested))
-    parts |= {key: _replaced(parts[key], inner) for key, inner in of_key.items()}
+    for key in {path[0] for path in entries}:
+        inner = {path[1:]: entry for path, entry in entries.items() if path[0] == key}
+        parts[key] = _replaced(parts[key], inner)
     if isinstance(nested, gym.spaces.Dict):
         return gym.spaces.Dict(list(parts.items()))
     if isinstance(nested, gym.spaces.Tuple):
