@@ -1015,17 +1015,11 @@ def _read_noise(text: str) -> Noise:
     written += [f"{p.name}={recorded[p.name]!r}" for p in keywords]
     owner = "" if wrapper is WRAPPERS.get(name) else f"{module}:"
     noise = Noise(wrapper, f"{owner}{wrapper.__name__}({', '.join(written)})")
-    try:  # what is written must make the same noise again
-        same = noise(_ProbeEnv(), 1.0).parameters == recorded
-    except (TypeError, ValueError):
-        same = False
-    if not same:
-        raise _bad_noise(
-            text,
-            "its constructor must name its arguments (no *args or **kwargs) and pass them on as "
-            f"they came; {noise} would be another noise",
-        )
-    return noise
+    with contextlib.suppress(TypeError, ValueError):
+        if noise(_ProbeEnv(), 1.0).parameters == recorded:  # what is written makes the same again
+            return noise
+    wanted = "name its arguments (no *args or **kwargs) and pass them on as they came"
+    raise _bad_noise(text, f"its constructor must {wanted}; {noise} would be another noise")
 
 
 def _read_call(text: str) -> tuple[str, str, list[Any], dict[str, Any]]:
@@ -1103,14 +1097,12 @@ class Configuration:
             raise ValueError("noise without a noise rate: give one for all noises, or one for each")
         if rates and not noises:
             raise ValueError("a noise rate without noise: name a noise, or leave the rate out")
-        if len(rates) not in (1, len(noises)):
-            raise ValueError(
-                "give one noise rate for all noises, or one for each "
-                f"(noises: {len(noises)}, noise rates: {len(rates)})"
-            )
+        if len(rates) == 1:
+            rates = rates * len(noises)
+        if len(rates) != len(noises):
+            counts = f"(noises: {len(noises)}, noise rates: {len(rates)})"
+            raise ValueError(f"give one noise rate for all noises, or one for each {counts}")
         schedules = [_schedule(rate) for rate in rates]
-        if len(schedules) == 1:
-            schedules = schedules * len(noises)
         parsed = [n if stored and _read_call(n)[0] else parse_noise(n) for n in noises]
         pairs = [pair for pair in zip(parsed, schedules, strict=True) if pair[1] != (0.0, 0.0)]
         if not stored:
