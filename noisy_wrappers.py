@@ -1146,11 +1146,6 @@ class Configuration:
         return " + ".join(written)
 
     @property
-    def is_baseline(self) -> bool:
-        """Whether there is no noise."""
-        return not self.noises
-
-    @property
     def wrappers(self) -> list[str]:
         """The names of the wrappers, in order, as they are written: perhaps with a module."""
         return [noise.partition("(")[0] for noise in self.noises]
@@ -1166,7 +1161,7 @@ class Configuration:
     @property
     def slug(self) -> str:
         """Part of a file's name: "p0.05_NormalNoisyReward_1.0", or "" for the baseline."""
-        if self.is_baseline:
+        if not self.noises:
             return ""
         rates = "+".join(map(str, self.texts[1])).replace(":", "to")
         names = [_words(noise).removeprefix("Random") for noise in self.noises]

@@ -160,7 +160,7 @@ def curves_figure(study, noise):
     tried = np.flatnonzero(counts[noisy].any(axis=0))
     labels = []
     for config, n in zip(configs, counts[:, tried], strict=True):
-        name = "no noise" if config.is_baseline else f"rate {config.noise_rate}"
+        name = "no noise" if config == BASELINE else f"rate {config.noise_rate}"
         labels.append(f"{name} (n = {span(n[n > 0])})")  # in the panels that have the line
     environments = [study.environments[e] for e in tried]
     steps, below = training_steps(study)

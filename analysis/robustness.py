@@ -109,7 +109,7 @@ def is_unseen(condition, config):
     ends = "RandomEarlyTermination" in condition.wrappers
     changes_behaviour = "reward" not in condition.kinds and not ends
     new = set(condition.wrappers).isdisjoint(config.wrappers)
-    return not condition.is_baseline and changes_behaviour and new
+    return condition != CLEAN and changes_behaviour and new
 
 
 def tested_on(condition, config):

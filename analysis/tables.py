@@ -151,7 +151,7 @@ def early_rows(study):
     wanted = np.arange(1, round(total / stride) + 1) * stride
     places = np.unique(np.searchsorted(study.steps, wanted, side="right") - 1)
     places = places[places >= 0]
-    noises = sorted({config.noise for config in study.returns if not config.is_baseline})
+    noises = sorted({config.noise for config in study.returns if config != BASELINE})
     for (e, env), noise in product(enumerate(study.environments), noises):
         configs = [config for config in study.returns if config.noise == noise]
         if not any(len(study.sample(config, e)) for config in configs):

@@ -29,7 +29,7 @@ def test_it_is_read_and_written(noises, rates, noise, noise_rate):
     )
     assert Configuration.parse(noise, noise_rate) == config
     assert config.texts == (noises, rates)
-    assert config.is_baseline == (not noises)
+    assert (config == BASELINE) == (not noises)
 
 
 def test_there_is_one_baseline():
