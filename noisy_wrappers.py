@@ -1952,14 +1952,7 @@ def seed_globals(seed: int) -> None:
 
 @contextlib.contextmanager
 def kept_generators(env: Env | None = None) -> Iterator[None]:
-    """Restore after some lines of code the global generators, and those that an environment holds.
-
-    >>> first = random.getstate()
-    >>> with kept_generators(gym.make("Pendulum-v1")):
-    ...     seed_globals(1)
-    >>> random.getstate() == first
-    True
-    """
+    """Restore after some lines the global generators, and those that an environment holds."""
     generators: list[Any] = [random, np.random]
     if torch := sys.modules.get("torch"):
         generators.append(torch.default_generator)
@@ -2120,20 +2113,11 @@ def stop_at_signals() -> Callable[[], int]:
 class EnvState:
     """What an environment carries from one episode to the next, to resume training.
 
-    That is the random generators of the environment, of its action space, and those that its
-    wrappers, itself or an environment inside it hold; the random streams and the counters
-    of its noise wrappers, the returns that RecordEpisodeStatistics remembers, and the global
-    generators of ``random`` and NumPy, from which an environment may draw. Further ``generators``
-    are kept with them. After loading, call :func:`set_progress`, or assign a rate, again. An
-    environment that carries anything else from one episode to the next does not resume exactly.
-
-    >>> env = make_noisy(gym.make("Pendulum-v1"), ["RandomNormalNoisyObservation(1)"], [0.5])
-    >>> _ = env.reset(seed=1)
-    >>> saved = EnvState(env).state_dict()
-    >>> first, _ = env.reset()
-    >>> EnvState(env).load_state_dict(saved)
-    >>> bool((env.reset()[0] == first).all())
-    True
+    That is all random generators that it, its wrappers or an environment inside it hold; the random
+    streams and the counters of its noise wrappers, the returns that RecordEpisodeStatistics
+    remembers, and the global generators of ``random`` and NumPy, from which an environment may
+    draw. Further ``generators`` are kept with them. After loading, call :func:`set_progress`, or
+    assign a rate, again. An environment that carries anything else does not resume exactly.
     """
 
     def __init__(self, env: Env, *generators: np.random.Generator):
