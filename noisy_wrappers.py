@@ -1672,7 +1672,7 @@ def _import_module(module: str, problem: str) -> None:
     except SystemExit as error:
         raise ValueError(f"{problem}: {module} called sys.exit({error.code!r})") from error
     except ModuleNotFoundError as error:
-        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+        if not f"{module}.".startswith(f"{error.name}."):
             raise  # it exists, and imports another one that does not
         raise ValueError(f"{problem}: {error}") from error
     except Exception as error:
@@ -2123,28 +2123,23 @@ class EnvState:
     def __init__(self, env: Env, *generators: np.random.Generator):
         """Take an environment that has been reset with a seed."""
         self.env = env
-        self.generators = generators
-
-    def _generators(self) -> list[Any]:
-        found = [self.env.unwrapped.np_random, self.env.action_space.np_random, *self.generators]
+        found = [env.unwrapped.np_random, env.action_space.np_random, *generators]
         # an environment may have put a generator of another library there, or a module
         of_numpy = np.random.Generator | np.random.RandomState
-        return [generator for generator in found if isinstance(generator, of_numpy)]
-
-    def _returns(self) -> deque[float]:
-        recorded = self.env.has_wrapper_attr("return_queue")
-        return self.env.get_wrapper_attr("return_queue") if recorded else deque()
+        self.generators = [generator for generator in found if isinstance(generator, of_numpy)]
+        recorded = env.has_wrapper_attr("return_queue")
+        self.returns = env.get_wrapper_attr("return_queue") if recorded else deque()
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state in Python's own types, to be taken between two episodes."""
-        generators, held = self._generators(), _held_generators(self.env)
+        held = _held_generators(self.env)
         return {
             "python": _stream(random),
             "numpy": _stream(np.random),
-            "generators": [_stream(generator) for generator in generators],
+            "generators": [_stream(generator) for generator in self.generators],
             "attributes": {place: _stream(generator) for place, generator in held.items()},
             "noise": [_without_arrays(w.state_dict()) for w in noise_wrappers(self.env).values()],
-            "returns": [float(value) for value in self._returns()],
+            "returns": [float(value) for value in self.returns],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -2155,7 +2150,7 @@ class EnvState:
         """
         _set_stream(random, state["python"])
         _set_stream(np.random, state["numpy"])
-        for generator, stream in zip(self._generators(), state["generators"], strict=True):
+        for generator, stream in zip(self.generators, state["generators"], strict=True):
             _set_stream(generator, stream)
         held, streams = _held_generators(self.env), state.get("attributes", {})
         for place in held.keys() & streams.keys():
@@ -2163,8 +2158,8 @@ class EnvState:
         wrappers = noise_wrappers(self.env).values()
         for wrapper, part in zip(wrappers, state["noise"], strict=True):
             wrapper.load_state_dict(part)
-        self._returns().clear()
-        self._returns().extend(state["returns"])
+        self.returns.clear()
+        self.returns.extend(state["returns"])
 
 
 def _held_generators(env: Env, place: str = "") -> dict[str, Any]:
