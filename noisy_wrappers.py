@@ -1440,13 +1440,12 @@ def rounded(value: float, spread: float | None = None) -> str:
 # ------------------------------------------------------------------------------ wrappers and spaces
 
 
-def _layers(env: Env, kind: Any = gym.Wrapper) -> list[Any]:
-    """Return an environment's wrappers, or those of a kind, outermost first."""
-    found = []
-    while isinstance(env, gym.Wrapper):
-        found.append(env)
-        env = env.env
-    return [layer for layer in found if isinstance(layer, kind)]
+def _layers(env: Env, kind: Any = gym.Env) -> list[Any]:
+    """Return an environment's wrappers and itself, or those of a kind, outermost first."""
+    layers = [env]
+    while isinstance(layers[-1], gym.Wrapper):
+        layers.append(layers[-1].env)
+    return [layer for layer in layers if isinstance(layer, kind)]
 
 
 def _entries(space: gym.Space[Any], path: EntryPath = ()) -> Iterator[tuple[EntryPath, Any]]:
@@ -2164,8 +2163,8 @@ class EnvState:
 
 def _held_generators(env: Env, place: str = "") -> dict[str, Any]:
     """Return the generators that an environment, or one that it holds, holds, by their places."""
-    layers = [*_layers(env), env.unwrapped]
-    found, kinds = {}, np.random.Generator | np.random.RandomState | random.Random
+    layers, found = _layers(env), {}
+    kinds = np.random.Generator | np.random.RandomState | random.Random
     if torch := sys.modules.get("torch"):
         kinds |= torch.Generator
     for i, layer in enumerate(layers):
