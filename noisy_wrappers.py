@@ -1661,10 +1661,8 @@ def _import_module(module: str, problem: str) -> None:
             raise ValueError(f"{problem}: {module!r} is not a module name")
         loaded, found = sys.modules.get(top), importlib.machinery.PathFinder.find_spec(top)
         if loaded and found and found.origin != getattr(loaded, "__file__", found.origin):
-            raise ValueError(
-                f"{problem}: a module {top!r} is loaded already, from "
-                f"{loaded.__file__}; rename yours"
-            )
+            other = f"a module {top!r} is loaded already, from {loaded.__file__}"
+            raise ValueError(f"{problem}: {other}; rename yours")
         with kept_generators():
             seed_globals(0)  # what the module draws is the same in every run and in all tests
             importlib.import_module(module)
