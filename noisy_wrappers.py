@@ -32,6 +32,7 @@ import importlib.machinery
 import importlib.metadata
 import inspect
 import math
+import numbers
 import operator
 import os
 import random
@@ -54,6 +55,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs import registration
 from gymnasium.utils import RecordConstructorArgs
+from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
 __version__ = "0.3.0"
@@ -177,6 +179,7 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """Begin an episode, before the environment does; a wrapper may decide here what to do."""
         self._noise_rate = float(np.interp(self._training_progress, (0.0, 1.0), self.schedule))
         if seed is not None:
+            np_random(seed)  # raises Gymnasium's error if it is no seed
             self._seed(seed)
 
     def state_dict(self) -> dict[str, Any]:
@@ -313,9 +316,11 @@ class ObservationNoise(NoiseWrapper):
         """Return a new observation with these numbers in place of :meth:`_numbers`."""
         if () in self._boxes:
             return _cast(numbers, self._boxes[()].dtype)
+        ends = np.cumsum([math.prod(box.shape) for box in self._boxes.values()])
         parts = {}
-        for path, box in self._boxes.items():
-            part, numbers = np.split(numbers, [math.prod(box.shape)])
+        for (path, box), part in zip(
+            self._boxes.items(), np.split(numbers, ends[:-1]), strict=True
+        ):
             parts[path] = _cast(part.reshape(box.shape), box.dtype)
         return _replaced(observation, parts)
 
@@ -640,9 +645,10 @@ class RandomNormalNoisyAction(NoiseWrapper):
         noise = self.noise.normal(self.loc, self.scale, space.shape)
         unclipped = np.asarray(action, np.float64) + noise
         noisy = np.asarray(np.clip(unclipped, space.low, space.high), space.dtype)
-        *result, info = self.env.step(noisy)
-        changed = (noisy != np.asarray(action, space.dtype)).any()
-        return *result, self.mark(info) if changed else info
+        observation, reward, terminated, truncated, info = self.env.step(noisy)
+        if (noisy != np.asarray(action, space.dtype)).any():
+            info = self.mark(info)
+        return observation, reward, terminated, truncated, info
 
 
 class RandomActionDelay(NoiseWrapper):
@@ -683,16 +689,18 @@ class RandomActionDelay(NoiseWrapper):
         super()._begin(seed)
         delay = int(self.noise.integers(self.low, self.high, endpoint=True))
         self._delay = delay if self.acts() else 0
-        self._actions = deque(maxlen=self._delay + 1)
+        self._actions = deque(maxlen=min(self._delay + 1, sys.maxsize))
 
     def step(self, action: Any) -> Step:
         """Step the environment with the action of some steps ago."""
         if not self._delay:
             return self.env.step(action)
         self._actions.append(copy.deepcopy(action))  # the caller may reuse an array
-        *result, info = self.env.step(copy.deepcopy(self._actions[0]))
-        waits = len(self._actions) > 1  # this step's action
-        return *result, self.mark(info) if waits else info
+        delayed = copy.deepcopy(self._actions[0])
+        observation, reward, terminated, truncated, info = self.env.step(delayed)
+        if len(self._actions) > 1:  # so this step's action waits
+            info = self.mark(info)
+        return observation, reward, terminated, truncated, info
 
 
 class RandomEarlyTermination(NoiseWrapper):
@@ -861,8 +869,10 @@ class RandomDynamics(NoiseWrapper):
 
     def step(self, action: Any) -> Step:
         """Step the environment; every step of a chosen episode is a perturbed one."""
-        *result, info = self.env.step(action)
-        return *result, self.mark(info) if self._chosen else info
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if self._chosen:
+            info = self.mark(info)
+        return observation, reward, terminated, truncated, info
 
     def _draw(self, model: Any) -> dict[str, NDArray[Any]]:
         """Return factors for all rows of the fields."""
@@ -1269,8 +1279,8 @@ class RecordEpisodeStatistics(gym.wrappers.RecordEpisodeStatistics[Any, Any]):
                 raise
             raise ValueError(_RECORDED) from error
         if terminated or truncated:
-            info, reused = dict(info), info
-            del reused[self._stats_key]  # the environment may return the same dict again
+            own, info = info, dict(info)
+            del own[self._stats_key]  # the environment may return the same dict again
         return observation, reward, terminated, truncated, info
 
 
@@ -1514,8 +1524,9 @@ class _ProbeEnv(gym.Env[Any, Any]):
     So a wrapper leaves alone what only the environment can tell: its keys, its simulator.
     """
 
-    observation_space = gym.spaces.Box(-1.0, 1.0, (1,))
-    action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+    def __init__(self) -> None:
+        self.observation_space = gym.spaces.Box(-1.0, 1.0, (1,))
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,))
 
 
 def _parameters(wrapper: type[NoiseWrapper]) -> list[inspect.Parameter]:
@@ -1526,8 +1537,8 @@ def _parameters(wrapper: type[NoiseWrapper]) -> list[inspect.Parameter]:
 
 def _number(name: str, value: float, low: float = -math.inf, high: float = math.inf) -> float:
     number = _without_arrays(value)
-    finite = type(number) in (int, float) and abs(number) <= sys.float_info.max
-    if not (finite and low <= number <= high):
+    is_real = isinstance(number, numbers.Real) and not isinstance(number, bool)
+    if not (is_real and abs(number) <= sys.float_info.max and low <= number <= high):
         raise ValueError(f"{name} must be a finite number in [{low}, {high}], got {value!r}")
     return float(number) + 0.0  # -0.0 becomes 0.0
 
@@ -1547,9 +1558,10 @@ def _whole_interval(low: int | None, high: int | None, least: int) -> tuple[int,
     ends = []
     for name, value in (("low", low), ("high", low if high is None else high)):
         end = _without_arrays(value)
-        if type(end) is not int or not least <= end < 2**63:  # numpy draws 64-bit integers
+        is_whole = isinstance(end, numbers.Integral) and not isinstance(end, bool)
+        if not (is_whole and least <= end < 2**63):  # NumPy draws 64-bit integers
             raise ValueError(f"{name} must be an integer in [{least}, 2**63), got {value!r}")
-        ends.append(end)
+        ends.append(int(end))
     return _ordered(*ends)
 
 
@@ -1604,8 +1616,9 @@ def _is_field(name: Any) -> bool:
         return False
     rows = ("body_", "geom_", "pair_", "jnt_", "dof_", "actuator_", "tendon_")
     shapes = ("pos", "quat", "size", "axis", "aabb", "rbound")  # others depend on these
-    refused = (*shapes, *_DERIVED_FIELDS)
-    if not isinstance(name, str) or not name.startswith(rows) or name.endswith(refused):
+    if not isinstance(name, str) or not name.startswith(rows) or name.endswith(shapes):
+        return False
+    if name in _DERIVED_FIELDS:
         return False
     array = getattr(mujoco.MjModel.from_xml_string("<mujoco/>"), name, None)
     return isinstance(array, np.ndarray) and array.dtype == np.float64
@@ -1617,7 +1630,7 @@ def _schedule(noise_rate: Rate) -> tuple[float, float]:
     try:
         if isinstance(noise_rate, str):
             start, end = map(float, noise_rate.split(":"))
-        return _number("start", start, low=0, high=1), _number("end", end, low=0, high=1)
+        return _number("noise_rate", start, 0, 1), _number("noise_rate", end, 0, 1)
     except ValueError:
         raise ValueError(
             'a noise_rate must be a number in [0, 1], or "start:end" of two such numbers, as '
@@ -1735,7 +1748,7 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._steps = 0
         base, kinds = self.unwrapped, np.random.Generator | None
         if seed is not None and isinstance(getattr(base, "_np_random", 0), kinds):
-            base._np_random = np.random.default_rng(seed)  # some, as Meta-World's, ignore it
+            base._np_random, _ = np_random(seed)  # some, as Meta-World's, ignore the seed
         try:
             observation, info = self.env.reset(seed=seed, options=options)
         except (SystemExit, TypeError, ValueError) as error:
@@ -2054,15 +2067,17 @@ def clean_compiler_cache() -> None:
 def start_again_if_not_compiled(error: Exception) -> None:
     """Start the program again if an error of a script says that PyTorch could not compile.
 
-    It starts with a new cache for the compiler, once, or without a compiler at all.
+    At first with a new cache for the compiler, then, or where there is no compiler, without it.
     """
     compiling = type(error).__module__.startswith(("torch._dynamo", "torch._inductor"))
     if not compiling or "--no-compile" in sys.argv:  # then it is of the environment
         return
     text = str(getattr(error, "inner_exception", error)).strip()
     reason = text.partition("\n")[0] or type(error).__name__
-    with contextlib.suppress(OSError):  # nobody may be left to read it
+    try:
         print(f"not compiled, starting again: {reason}", flush=True)
+    except OSError:  # nobody is left to read it, nor what comes
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     cache, options = f"torchinductor_{os.getpid()}_", []  # os.execv keeps the process number
     if "No working" in reason or cache in os.environ.get("TORCHINDUCTOR_CACHE_DIR", ""):
         options = ["--no-compile"]

@@ -129,7 +129,7 @@ class Agent(nn.Module):
 
 
 class Saved:
-    """A base for what is numbers and arrays, all of which a checkpoint holds."""
+    """Base of a class whose attributes, numbers and arrays, all go into a checkpoint."""
 
     def state_dict(self):
         """Return the attributes as tensors that share the arrays' memory."""
@@ -171,6 +171,10 @@ class Rollout(Saved):
         self.eps, self.actions = np.zeros((2, steps, *env.action_space.shape), np.float32)
         self.rewards, self.dones = np.zeros((2, steps), np.float32)  # done: ended in whatever way
         self.discounted_return = 0.0
+
+    def state_dict(self):
+        """Return the arrays as tensors that share their memory, and the discounted return."""
+        return super().state_dict() | {"discounted_return": float(self.discounted_return)}
 
 
 def compute_gae(rewards, values, dones, gamma, gae_lambda):
@@ -465,7 +469,7 @@ def use_matmul_precision(precision, device):
 class Run:
     """The run's folder: what is written into it, and read again to resume."""
 
-    FILES = ("result.json", "checkpoint.pt", "config.json", "policy.pt", "eval.csv")
+    FILES = ("result.json", "checkpoint.pt", "policy.pt", "eval.csv", "config.json")
     EVENTS = "events.out.tfevents.*"
 
     def __init__(self, args, algorithm, precision, env):
@@ -483,7 +487,7 @@ class Run:
             self.lock = os.fdopen(lock)
             with fail_on(BlockingIOError, f"{self.folder} is in use by another process"):
                 fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
-            result, self.checkpoint, config, *_ = ours = [self.folder / f for f in self.FILES]
+            result, self.checkpoint, *_, config = ours = [self.folder / f for f in self.FILES]
             old = [path.with_suffix(".tmp") for path in ours]  # of a process that was killed
             if args.overwrite:
                 old += [*ours, self.folder / "robustness.csv"]  # events: see resume()
@@ -523,6 +527,8 @@ class Run:
         new = {"algorithm": algorithm} | asdict(self.args)
         new = {name: new[name] for name in new if name not in noisy.MAY_DIFFER_IN_A_RUN}
         differ = [f"{name} {old[name]}, not {new[name]}" for name in new if old[name] != new[name]]
+        if algorithm != old["algorithm"]:
+            differ = differ[:1]  # others may be due to the scripts' defaults
         if differ:
             advice = "choose another --exp-name or --runs-dir; --overwrite deletes that run"
             fail(f"{self.folder} holds a run with {'; '.join(differ)}: {advice}")

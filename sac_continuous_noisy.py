@@ -475,7 +475,7 @@ def use_matmul_precision(precision, device):
 class Run:
     """The run's folder: what is written into it, and read again to resume."""
 
-    FILES = ("result.json", "checkpoint.pt", "config.json", "policy.pt", "eval.csv")
+    FILES = ("result.json", "checkpoint.pt", "policy.pt", "eval.csv", "config.json")
     EVENTS = "events.out.tfevents.*"
 
     def __init__(self, args, algorithm, precision, env):
@@ -493,7 +493,7 @@ class Run:
             self.lock = os.fdopen(lock)
             with fail_on(BlockingIOError, f"{self.folder} is in use by another process"):
                 fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
-            result, self.checkpoint, config, *_ = ours = [self.folder / f for f in self.FILES]
+            result, self.checkpoint, *_, config = ours = [self.folder / f for f in self.FILES]
             old = [path.with_suffix(".tmp") for path in ours]  # of a process that was killed
             if args.overwrite:
                 old += [*ours, self.folder / "robustness.csv"]  # events: see resume()
@@ -533,6 +533,8 @@ class Run:
         new = {"algorithm": algorithm} | asdict(self.args)
         new = {name: new[name] for name in new if name not in noisy.MAY_DIFFER_IN_A_RUN}
         differ = [f"{name} {old[name]}, not {new[name]}" for name in new if old[name] != new[name]]
+        if algorithm != old["algorithm"]:
+            differ = differ[:1]  # others may be due to the scripts' defaults
         if differ:
             advice = "choose another --exp-name or --runs-dir; --overwrite deletes that run"
             fail(f"{self.folder} holds a run with {'; '.join(differ)}: {advice}")

@@ -3,10 +3,10 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from cases import streams
+from cases import GenericEnv, streams
 from test_action_noise import actions_env
 
-from noisy_wrappers import RandomActionDelay
+from noisy_wrappers import RandomActionDelay, make_noisy
 
 ACTIONS = gym.spaces.Discrete(100)
 
@@ -24,7 +24,16 @@ def test_a_delay_by_hand():
     assert received(2)[:2] == ([0, 0, 0, 1, 2, 3], [None] + 5 * [name])
     assert received(1)[0] == [0, 0, 1, 2, 3, 4]
     assert received(0)[:2] == ([0, 1, 2, 3, 4, 5], 6 * [None])
-    assert received(10**6)[0] == 6 * [0]
+    assert received(10**6)[0] == received(2**63 - 1)[0] == 6 * [0]
+
+
+@pytest.mark.parametrize("noise", ["RandomActionDelay(1)", "RandomNormalNoisyAction(0.1)"])
+def test_a_step_of_four_values_is_an_error(noise):
+    env = GenericEnv(step=lambda env, action: (0.0, 1.0, False, {}))
+    env = make_noisy(env, [noise], [1.0], record_statistics=False)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="expected 5, got 4"):
+        env.step(env.action_space.sample())
 
 
 def test_it_counts_the_episodes_in_which_an_action_came_late():

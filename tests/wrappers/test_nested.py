@@ -10,6 +10,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import FlattenObservation
 
 from noisy_wrappers import (
+    ObservationNoise,
     RandomDropoutObservation,
     RandomMixupObservation,
     RandomNormalNoisyObservation,
@@ -185,6 +186,16 @@ def test_a_scale_for_each_dimension_of_the_vector():
     assert (got["observation"] != clean["observation"]).all()
     with pytest.raises(ValueError, match=r"scale has 7 numbers and .* has shape \(10,"):
         RandomNormalNoisyObservation(sampled(GOALS)[0], 1.0, scale)
+
+
+@pytest.mark.parametrize("surplus", [-1, 1])
+def test_a_noise_must_return_as_many_numbers_as_it_gets(surplus):
+    class Other(ObservationNoise):
+        def _perturb(self, observation):
+            return np.ones(len(observation) + surplus)
+
+    with pytest.raises(ValueError, match="reshape"):
+        Other(make_goals(), 1.0).reset(seed=0)
 
 
 def test_keys_in_the_notation_and_in_the_folders_name():

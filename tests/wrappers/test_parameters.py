@@ -2,6 +2,7 @@
 
 import math
 import re
+from fractions import Fraction
 
 import gymnasium as gym
 import numpy as np
@@ -18,6 +19,7 @@ from noisy_wrappers import (
     RandomNormalNoisyObservation,
     RandomNormalNoisyReward,
     RandomUniformNoisyReward,
+    make_flat,
     make_noisy,
     parse_noise,
     run_name,
@@ -103,6 +105,13 @@ def test_noise_rate_is_writable_and_checked(text):
     assert env.applied_fraction == 1.0
 
 
+@pytest.mark.parametrize("seed", [-1, 1.5, "1"])
+def test_a_bad_seed_is_gymnasiums_error(seed):
+    for env in (build(NOISES[0], GenericEnv(WIDE), 0), make_flat(GenericEnv(WIDE))):
+        with pytest.raises(gym.error.Error, match="[Ss]eed"):
+            env.reset(seed=seed)
+
+
 SCALES = "RandomNormalNoisyObservation((0.1, 0.2, 0.0), loc=1.0)"
 
 
@@ -152,7 +161,8 @@ def test_limits_of_the_parameters_are_allowed():
     RandomNormalNoisyObservation(env, 0, 0)
     RandomNormalNoisyReward(RandomNormalNoisyReward(env, 1, -0.0), 1, 0).reset(seed=0)
     RandomUniformNoisyReward(env, 1, 0.5, 0.5)
-    RandomMixupObservation(env, np.float64(0.5), 1)
+    RandomMixupObservation(env, np.float64(0.5), Fraction(1, 2))
+    RandomMixupObservation(env, np.longdouble(0.5), 1)
     RandomDropoutObservation(env, 1, 0)
     RandomEarlyTermination(env, 1, np.int64(1), np.int32(1))
     quiet = RandomNormalNoisyReward(env, 1, -0.0)  # Generator.normal refuses -0.0
