@@ -559,19 +559,26 @@ def test_progress_goes_forward(algorithm, tmp_path, monkeypatch, capsys):
 # THE COMPILER'S CACHE
 
 
-def compiler(cache):
-    """Return the environment of a compiler that asks what this processor can do."""
-    return {"TORCHINDUCTOR_CACHE_DIR": str(cache), "TORCHINDUCTOR_VEC_ISA_OK": ""}
+COMPILED = """
+import torch
+import noisy_wrappers as noisy
+
+noisy.clean_compiler_cache()
+try:
+    update = torch.compile(lambda x: (x.sin().exp() * x).sum())
+    print("result", update(torch.linspace(-1, 1, 1001)).item().hex())
+except Exception as error:
+    noisy.start_again_if_not_compiled(error)
+    raise
+"""
 
 
-def compiled_run(runs_dir, cache, **environment):
-    """Run a command whose updates are compiled into a cache -> (its output, its policy)."""
-    short = {"total_timesteps": 24, "eval_frequency": 0, "matmul_precision": "highest"}
-    words = flags(arguments("PPO", runs_dir, compile=True, **ALONE | short))
-    result = real_command("PPO", *words, **compiler(cache), **environment)
-    assert (result.code, result.err) == (0, "")
-    [run_dir] = runs_dir.iterdir()
-    return result.out, policy(run_dir)
+def compiled(words, cache, **environment):
+    """Run Python with a cache for its compiler -> what it prints."""
+    environment |= {"TORCHINDUCTOR_CACHE_DIR": str(cache), "PYTHONPATH": str(ROOT)}
+    return subprocess.check_output(
+        [sys.executable, *words], env=os.environ | environment, text=True
+    )
 
 
 def empty(paths, seconds):
@@ -586,25 +593,30 @@ def empty(paths, seconds):
 @pytest.mark.slow
 @pytest.mark.skipif(not shutil.which("g++"), reason="no C++ compiler")
 def test_what_a_killed_compiler_leaves_changes_nothing(tmp_path):
-    cache = tmp_path / "cache"
+    program, cache = tmp_path / "program.py", tmp_path / "cache"
+    program.write_text(COMPILED)
     # what the compiler tries first: which vector instructions this processor has
     ask = "from torch._inductor.cpu_vec_isa import pick_vec_isa; pick_vec_isa()"
-    subprocess.run([sys.executable, "-c", ask], env=os.environ | compiler(cache), check=True)
+    compiled(["-c", ask], cache, TORCHINDUCTOR_VEC_ISA_OK="")
     empty(cache.rglob("*.so"), seconds=100)
-    out, first = compiled_run(tmp_path / "probe", cache)
-    assert "not compiled" not in out
-    # now a part of the update, too young to be removed: a compiler may be at work
+    first = compiled([program], cache, TORCHINDUCTOR_VEC_ISA_OK="")
+    assert first.startswith("result")
+    # now a kernel, too young to be removed: a compiler may be at work
     empty(cache.rglob("*.main.so"), seconds=0)
-    out, again = compiled_run(tmp_path / "kernel", cache, TMPDIR=str(tmp_path))
-    assert out.count("not compiled, starting again: ") == 1 and "file too short" in out
-    torch.testing.assert_close(again, first, rtol=0, atol=0)
+    said, again = compiled([program], cache, TMPDIR=str(tmp_path)).split("\n", 1)
+    assert said.startswith("not compiled, starting again: ") and "file too short" in said
+    assert again == first
 
 
 @pytest.mark.slow
 def test_without_a_compiler_it_starts_again_and_trains_eagerly(tmp_path):
-    no_compiler = {"CXX": str(tmp_path / "no-compiler"), "TMPDIR": str(tmp_path)}
-    out, eager = compiled_run(tmp_path / "runs", tmp_path / "cache", **no_compiler)
-    assert out.count("not compiled, starting again: No working C++ compiler found") == 1
-    short = {"total_timesteps": 24, "eval_frequency": 0, "matmul_precision": "highest"}
-    plain = policy(run("PPO", tmp_path / "plain", **ALONE | short))
-    torch.testing.assert_close(eager, plain, rtol=0, atol=0)
+    short = ALONE | {"total_timesteps": 24, "eval_frequency": 0, "matmul_precision": "highest"}
+    words = flags(arguments("PPO", tmp_path / "runs", compile=True, **short))
+    caches = {"TORCHINDUCTOR_CACHE_DIR": str(tmp_path / "cache"), "TMPDIR": str(tmp_path)}
+    no_compiler = {"CXX": str(tmp_path / "no-compiler"), "TORCHINDUCTOR_VEC_ISA_OK": ""}
+    result = real_command("PPO", *words, **caches, **no_compiler)
+    assert (result.code, result.err) == (0, "")
+    assert result.out.count("not compiled, starting again: No working C++ compiler found") == 1
+    [run_dir] = (tmp_path / "runs").iterdir()
+    plain = policy(run("PPO", tmp_path / "plain", **short))
+    torch.testing.assert_close(policy(run_dir), plain, rtol=0, atol=0)
