@@ -501,13 +501,16 @@ def main(args):
         stored[run][run.key(condition)] = results
         if isinstance(results, str):
             failed[run.folder] = f"{name}: {results}"
+            if args.drawing:
+                text = f"cannot draw {run.folder.name}, {failed[run.folder]}"
+                print(f"error: {text}", file=sys.stderr)
         elif args.drawing:
             [(drawn, steps, _)] = results
             print(f"{run.folder.name}, {name}: return {noisy.rounded(drawn)}, {steps} steps")
-    tell(failed)
-    runs = [run for run in runs if run.folder not in failed]
-    if runs and not args.drawing:
-        print_table(runs, conditions, stored, args.episodes)
+    if not args.drawing:
+        tell(failed)
+        if runs := [run for run in runs if run.folder not in failed]:
+            print_table(runs, conditions, stored, args.episodes)
     return bool(bad or failed)
 
 

@@ -1308,8 +1308,8 @@ def set_progress(env: Any, fraction: float) -> None:
     """
     progress = _number("fraction", fraction, low=0, high=1)
     if isinstance(env, gym.Env):
-        for layer in _layers(env, NoiseWrapper):
-            layer.training_progress = progress
+        for outermost in _layers(env, NoiseWrapper)[:1]:
+            outermost.training_progress = progress  # and that of those inside
     else:
         _call_each(env, "set_wrapper_attr", "training_progress", progress, force=False)
 

@@ -291,7 +291,8 @@ def make_tables(studies, paper=None):
     alone = rows[rows["scope"] == "environment"]
     # The seeds of a search chose the noise, so they cannot judge it.
     judged = rows[rows["phase"] != SEARCH]
-    best = add_luck(best_rows(judged), luck_of_studies(studies))
+    judging = [study for study in studies if study.phase != SEARCH]
+    best = add_luck(best_rows(judged), luck_of_studies(judging))
     consistency = pd.DataFrame(consistency_rows(judged), columns=COLUMNS["consistency"])
     good, bad = split_consistency(consistency)
     returns = (row for study in studies for row in early_rows(study))

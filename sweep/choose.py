@@ -87,7 +87,8 @@ def untried(args, env_id, tried):
     noises: only such as were never tried, or were refused and are named all the same.
     """
     noises = candidates(args, args.algos[0], env_id)
-    walks = (walk(args, algorithm, env_id, noises, len(noises)) for algorithm in args.algos)
+    kept = candidates(args, args.algos[0], env_id, () if args.noises else tried)
+    walks = (walk(args, algorithm, env_id, kept, len(kept)) for algorithm in args.algos)
     if not any(returns for *_, returns in walks):
         return noises
     return [n for n in noises if n.noise not in tried or (args.noises and tried[n.noise])]

@@ -151,7 +151,7 @@ def grid(args):
     runs = {}
     for algorithm, env_id in itertools.product(args.algos, args.envs):
         noisy = configurations(args, algorithm, env_id)
-        seeds = itertools.chain(*(args.seeds or [SEEDS[algorithm]]))
+        seeds = sorted(itertools.chain(*(args.seeds or [SEEDS[algorithm]])))
         for seed, configuration in itertools.product(seeds, [BASELINE, *noisy]):
             run = make_run(args, algorithm, env_id, configuration, seed)
             runs.setdefault(run.folder, run)

@@ -506,7 +506,9 @@ gym.register("Blind-v0", lambda **given: Blind(gym.make("InvertedPendulum-v5", *
     result = run(first, second, "--video", videos, "--jobs", 2, cwd=tmp_path)
     assert result.returncode == 1
     cause = r"\w+Error: nothing to see \(.*blind.py, line \d+\)"
-    assert re.fullmatch(rf"error: {re.escape(str(first))}: clean: {cause}\n", result.stderr)
+    assert re.fullmatch(
+        rf"error: cannot draw {re.escape(first.name)}, clean: {cause}\n", result.stderr
+    )
     assert result.stdout.startswith(f"{second.name}, clean: return")
     assert list(videos.iterdir()) == [videos / f"{second.name}__clean.mp4"]
 
