@@ -738,8 +738,12 @@ class RandomEarlyTermination(NoiseWrapper):
 
         Nor may ``env`` record its episodes: the record would miss those that this one ends.
         """
-        if any(env.has_wrapper_attr(name) for name in _OF_RECORDERS):
-            raise ValueError(_RECORDED)
+        of_recorders = ("return_queue", "get_episode_rewards")  # Gymnasium's, Stable-Baselines3's
+        if any(env.has_wrapper_attr(name) for name in of_recorders):
+            raise ValueError(
+                "this environment records its episodes, as RecordEpisodeStatistics and Monitor do, "
+                "and the record would miss those that RandomEarlyTermination ends: apply that first"
+            )
         self.each_step = _flag("each_step", each_step)
         self.truncate = _flag("truncate", truncate)
         if not each_step:
@@ -1187,12 +1191,10 @@ class Configuration:
             noisy = self.wrap(env.env, record_statistics=record_statistics)
             return gym.wrappers.FlattenObservation(noisy)
         pairs = [(parse_noise(noise), rate) for noise, rate in zip(*self.texts, strict=True)]
-        if record_statistics and any(env.has_wrapper_attr(name) for name in _OF_RECORDERS):
-            raise SpaceError(_RECORDED)
         for noise, rate in pairs:
             if noise.wrapper.kind in ("dynamics", "action"):
                 env = noise(env, rate)
-        if record_statistics:
+        if record_statistics and not _layers(env, RecordEpisodeStatistics):
             env = RecordEpisodeStatistics(env)
         for noise, rate in pairs:
             if noise.wrapper.kind in ("observation", "reward"):
@@ -1240,47 +1242,37 @@ def make_noisy(
     Dynamics noise is innermost (:class:`RandomDynamics`, then early termination), then action noise
     (:class:`RandomActionDelay` first), then
     ``gymnasium.wrappers.RecordEpisodeStatistics``, then the other noises in the order given, so
-    ``info["episode"]`` has the return before reward noise. ``record_statistics=False`` leaves the
-    record out, for an environment that keeps one itself, such as Stable-Baselines3's Monitor.
-    Early termination must then be inside that record, which would miss the episodes that it ends.
-    Where dictionaries or tuples are flattened by the outermost wrapper, all goes inside that one.
+    ``info["episode"]`` has the return before reward noise, also where the environment records its
+    episodes itself. ``record_statistics=False`` leaves the record out: one that is there already,
+    such as Stable-Baselines3's Monitor, stays. Early termination must be inside of any such record,
+    which would miss the episodes that it ends. Where dictionaries or tuples are flattened by the
+    outermost wrapper, all goes inside that one.
 
     >>> make_noisy(gym.make("CartPole-v1").unwrapped, ["RandomNormalNoisyReward(1)"], [0.1])
     <RandomNormalNoisyReward<RecordEpisodeStatistics<CartPoleEnv<CartPole-v1>>>>
 
     Raises:
-        ValueError: as :meth:`Configuration.read`, a space that a noise cannot work on, or an
-            environment that records its episodes already; if it shows this only when an episode
-            ends, by an "episode" in its info, the error comes then.
+        ValueError: as :meth:`Configuration.read`, a space that a noise cannot work on, or early
+            termination of an environment that records its episodes already.
         TypeError: not a single environment (a vector environment, for example).
     """
     return Configuration.read(noises, rates).wrap(env, record_statistics=record_statistics)
 
 
-# What gives away Gymnasium's RecordEpisodeStatistics and Stable-Baselines3's Monitor.
-_OF_RECORDERS = ("return_queue", "get_episode_rewards")
-_RECORDED = (
-    "this environment records its episodes already (in info['episode'], as RecordEpisodeStatistics "
-    "and Monitor do): take that off, or use make_noisy(..., record_statistics=False); apply "
-    "RandomEarlyTermination before such a record, which would miss the episodes that it ends"
-)
-
-
 class RecordEpisodeStatistics(gym.wrappers.RecordEpisodeStatistics[Any, Any]):
-    """Gymnasium's wrapper, with a clear error if the environment records its episodes itself."""
+    """Gymnasium's wrapper, whose record takes the place of one that the environment keeps."""
+
+    def __init__(self, env: Env, **recorded: Any):
+        """Wrap an environment; ``recorded`` are Gymnasium's arguments, which a spec holds."""
+        super().__init__(env, **recorded)
+        self._stats_key = "episode of noisy_wrappers"  # Gymnasium's asserts that its key is free
 
     def step(self, action: Any) -> Step:
-        """Step the environment; raise ValueError if its info has an "episode" already."""
-        steps = self.episode_lengths
-        try:
-            observation, reward, terminated, truncated, info = super().step(action)
-        except AssertionError as error:
-            if self.episode_lengths == steps:  # it comes from the environment's own step
-                raise
-            raise ValueError(_RECORDED) from error
+        """Step the environment; the info of an episode's last step has "episode"."""
+        observation, reward, terminated, truncated, info = super().step(action)
         if terminated or truncated:
-            own, info = info, dict(info)
-            del own[self._stats_key]  # the environment may return the same dict again
+            record = info.pop(self._stats_key)  # the environment may return the same dict again
+            info = {**info, "episode": record}
         return observation, reward, terminated, truncated, info
 
 

@@ -87,7 +87,7 @@ def test_a_vec_env_without_noise():
 def test_make_vec_env_and_early_termination_lose_no_episode():
     kwargs = {"noise_rate": 1, "low": 5}
     kwargs = {"wrapper_class": RandomEarlyTermination, "wrapper_kwargs": kwargs}
-    with pytest.raises(ValueError, match="apply RandomEarlyTermination before such a record"):
+    with pytest.raises(ValueError, match="RandomEarlyTermination ends: apply that first"):
         make_vec_env("Pendulum-v1", 1, **kwargs)  # it would be above SB3's Monitor
     venv = make_vec_env(lambda: RandomEarlyTermination(gym.make("Pendulum-v1"), 1.0, 5), 1)
     venv.reset()
