@@ -944,12 +944,13 @@ def test_figures_have_labels_units_and_n(sweep):
         returns[:, :, 0] = np.nan if config.noise == ENDING else 1.0
     fig = analysis.figures.curves_figure(study, ENDING)
     assert [ax.get_title() for ax in fig.axes] == ["Pusher-v5"]
-    study.returns[Configuration.parse(SCALE, 0.05)][:, :, 0] = (
-        np.nan
-    )  # nor has a rate that was not tried a line
+    # nor has a rate that was not tried, or the baseline of a search, a line
+    study.returns[Configuration.parse(SCALE, 0.05)][:, :, 0] = np.nan
+    study.returns[BASELINE][:] = np.nan
     fig = analysis.figures.curves_figure(study, SCALE)
     legend = [text.get_text() for text in fig.legends[0].get_texts()]
-    assert legend[1] == "rate 0.05 (n = 4)" and len(fig.axes) == 2
+    assert legend == ["rate 0.05 (n = 4)", "rate 0.20 (n = 4)"] and len(fig.axes) == 2
+    assert "black" not in {line.get_color() for line in fig.axes[0].lines}
 
 
 def test_ablation_bars_stand_side_by_side(tmp_path):
