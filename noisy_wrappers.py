@@ -1194,7 +1194,8 @@ class Configuration:
         for noise, rate in pairs:
             if noise.wrapper.kind in ("dynamics", "action"):
                 env = noise(env, rate)
-        if record_statistics and not _layers(env, RecordEpisodeStatistics):
+        inside = next(layer for layer in _layers(env) if not isinstance(layer, NoiseWrapper))
+        if record_statistics and not isinstance(inside, RecordEpisodeStatistics):
             env = RecordEpisodeStatistics(env)
         for noise, rate in pairs:
             if noise.wrapper.kind in ("observation", "reward"):

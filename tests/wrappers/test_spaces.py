@@ -224,6 +224,11 @@ def test_the_true_return_stays_where_noises_are_added_later():
     assert layers(env).count("RecordEpisodeStatistics") == 1
     env.reset(seed=0)
     assert [env.step(0) for _ in range(5)][-1][4]["episode"]["r"] == 10.0
+    # an environment may have been made with noise, and changes the reward or the end itself
+    env = make_noisy(gym.wrappers.TimeLimit(Bonus(env), 3), [], [])
+    env.reset(seed=0)
+    steps = [env.step(0) for _ in range(3)]
+    assert steps[-1][4]["episode"]["r"] == pytest.approx(sum(step[1] for step in steps))
 
 
 def test_an_environment_may_return_one_info_with_an_episode_of_its_own():
