@@ -426,15 +426,18 @@ def train(args, stop=lambda: False):
     except ValueError as error:
         fail(error)
     limit = {"max_episode_steps": args.max_episode_steps}
-    noisy.seed_globals(args.seed)
-    with make_env(env_id, **limit) as test_env, make_env(env_id, **limit) as env:
-        where = f"--noise in {env_id}" if noise else f"--env-id {env_id}"
-        with fail_on(ValueError, where), warnings.catch_warnings(record=True) as notes:
-            env = noisy.make_noisy(env, noise, noise_rate)
-        for text in [note.message for note in notes] + noisy.remarks(env_id, test_env, STEP_LIMIT):
-            say(text)
-        args = replace(args, env_id=env_id, noise=noise, noise_rate=noise_rate)
-        return learn(args, env, test_env, stop)
+    noisy.seed_globals(TEST_SEED)  # a constructor may draw, too: all runs have the same tests
+    with make_env(env_id, **limit) as test_env:
+        noisy.seed_globals(args.seed)
+        with make_env(env_id, **limit) as env:
+            where = f"--noise in {env_id}" if noise else f"--env-id {env_id}"
+            with fail_on(ValueError, where), warnings.catch_warnings(record=True) as notes:
+                env = noisy.make_noisy(env, noise, noise_rate)
+            told = [note.message for note in notes]
+            for text in told + noisy.remarks(env_id, test_env, STEP_LIMIT):
+                say(text)
+            args = replace(args, env_id=env_id, noise=noise, noise_rate=noise_rate)
+            return learn(args, env, test_env, stop)
 
 
 def evaluate(policy, env, episodes, stop=lambda: False):

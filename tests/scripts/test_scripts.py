@@ -23,6 +23,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+import toy_envs
 import tqdm
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -549,6 +550,29 @@ def test_a_test_that_was_stopped_is_not_written(algorithm, tmp_path):
     alone = run(algorithm, tmp_path / "alone", **ends)
     assert (whole / "eval.csv").read_bytes() == (alone / "eval.csv").read_bytes()
     torch.testing.assert_close(policy(whole), policy(alone), rtol=0, atol=0)
+
+
+@one_script
+def test_what_a_constructor_draws_is_the_same_in_the_tests_of_all_runs(
+    algorithm, tmp_path, monkeypatch
+):
+    class Goal(toy_envs.Count):
+        def __init__(self):
+            super().__init__()
+            self.goal = np.random.normal()
+
+    gym.register("Goal-v0", Goal, max_episode_steps=8)
+    goals = []
+
+    def learn(args, env, test_env, stop):
+        goals.append((env.unwrapped.goal, test_env.unwrapped.goal))
+
+    monkeypatch.setattr(SCRIPTS[algorithm], "learn", learn)
+    for seed in (1, 2, 1):
+        SCRIPTS[algorithm].train(arguments(algorithm, tmp_path, env_id="Goal-v0", seed=seed))
+    (first, test), (second, same), again = goals
+    assert test == same and again == (first, test)
+    assert len({first, second, test}) == 3
 
 
 @one_script
