@@ -354,8 +354,10 @@ def version_notes(runs):
     notes = []
     for key, group in runs[runs["status"] == "finished"].groupby(STUDY):
         for library in sorted(set().union(*group["versions"])):
-            counts = Counter(str(versions.get(library)) for versions in group["versions"])
-            if len(counts) > 1:
+            used = group["versions"].map(lambda versions, name=library: str(versions.get(name)))
+            mixed = used.groupby(group["environment"]).transform("nunique") > 1
+            if mixed.any():
+                counts = Counter(used[mixed])
                 found = ", ".join(f"{version} (n = {n})" for version, n in sorted(counts.items()))
                 code = library == "git commit"
                 what = "of different code versions" if code else f"with different {library}"

@@ -673,6 +673,8 @@ def test_paths_threads_and_evaluation_steps_do_not_split_rows(tmp_path, capsys):
     runs = analysis.runs.read_runs(tmp_path / "runs")
     (study,), notes = analysis.runs.make_studies(runs)
     notes += analysis.runs.version_notes(runs)
+    apart = runs["environment"].where(runs["seed"] != 3, "Other-v0")  # in no row with the others
+    assert analysis.runs.version_notes(runs.assign(environment=apart)) == []
     assert study.algorithm == "SAC" and study.steps.tolist() == [20_000, 40_000]
     assert study.returns[BASELINE][:, :, 0].tolist() == [[2, 6, 2], [4, 8, 5]]
     assert "cut to the 2 steps that all share (of up to 4)" in notes[0]
