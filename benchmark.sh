@@ -180,6 +180,8 @@ case $executor in
       fail "a machine of --sshlogin cannot run the project in ${remote_dir:-$PWD} with $PYTHON" ;;
   slurm)
     command -v sbatch >/dev/null || fail "--executor slurm needs sbatch, on a Slurm cluster"
+    array_size=$(scontrol show config 2>/dev/null | awk '$1 == "MaxArraySize" {print $3}') || true
+    [ "${array_size:-0}" -gt 0 ] || fail "Slurm does not answer: scontrol show config has no MaxArraySize"
     words=$(xargs -rn1 printf '%s\n' <<<"$slurm_args" 2>/dev/null) ||
       fail "--slurm-args has a quote that does not end: $slurm_args"
     [ -z "$words" ] || mapfile -t slurm_options <<<"$words" ;;
@@ -239,7 +241,7 @@ run_todo() {
     { [ "$stopped" -ne 0 ] && kill -0 -- "-$group" 2>/dev/null; }; do
     sleep 1 & wait $! || true # a trap interrupts wait, not sleep
   done
-  kill -- "-$guard" || true
+  kill -- "-$guard" 2>/dev/null || true
   kill "$watch" 2>/dev/null && { [ ! -t 2 ] || echo >&2; } || true
   group='' ids=()
   tried+=$'\n'$todo

@@ -100,12 +100,10 @@ stop_parallel() { # HUP: parallel starts no more runs, and waits for those that 
 # -------------------------------------------------------------------------------------------- slurm
 
 submit() { # the array's indices are line numbers, counted from the offset of its part
-  local count size offset n id
+  local count offset n id
   count=$(wc -l <"$list")
-  size=$(scontrol show config | awk '$1 == "MaxArraySize" {print $3}') || true
-  [ "${size:-0}" -gt 0 ] || [ "$stopped" -ne 0 ] || fail "scontrol show config does not show MaxArraySize"
-  for ((offset = 0; offset < count && stopped == 0; offset += size)); do
-    n=$((count - offset < size ? count - offset : size))
+  for ((offset = 0; offset < count && stopped == 0; offset += array_size)); do
+    n=$((count - offset < array_size ? count - offset : array_size))
     id=$(sbatch --parsable --array="0-$((n - 1))${jobs:+%$jobs}" --requeue --signal=B:USR1@180 \
       --ntasks=1 --cpus-per-task=1 --job-name=noisy-sweep \
       --open-mode=append --output="${logs//%/%%}/slurm-%A.out" \

@@ -287,6 +287,8 @@ def parse(argv):
         value = getattr(options, name)
         if value is not None and not value >= low:
             parser.error(f"--{name} must be at least {low}, not {value}")
+    if options.jobs and options.jobs > (cores := len(options.cores)):
+        parser.error(f"--jobs {options.jobs} needs as many cores, and there are {cores}")
     others = (options.against_cleanrl, options.against_sbx, options.against_checkout)
     if options.jobs and any(others):
         parser.error("--jobs compares runs of this version only: leave out --against-...")
@@ -320,4 +322,5 @@ if __name__ == "__main__":
     if len(sys.argv) > 3 and sys.argv[3] in CHILDREN:
         start_child(*sys.argv[1:])
     else:
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # which ends what it has started
         main(sys.argv[1:])

@@ -674,6 +674,7 @@ def test_a_module_of_ones_own_is_imported(runs_dir, trained, tmp_path, monkeypat
         ({"noises": (ACTION,), "noise_rates": (1.5,)}, "1.5"),
         ({"noises": (ACTION,), "noise_rates": ("x",)}, "'x'"),
         ({"noises": (ACTION,), "noise_rates": ("1:0",)}, "constant rates"),
+        ({"noise_rates": (0.5,)}, "--noise-rates without --noises"),
         ({"env_id": "Nowhere-v0"}, "--env-id: there is no environment"),
         ({"noises": (f"{OBSERVATION[:-4]}(1, 2))",), "noise_rates": (1.0,)}, "has 2 numbers"),
         ({"episodes": 0}, "--episodes must be at least 1, not 0"),
