@@ -180,8 +180,6 @@ case $executor in
       fail "a machine of --sshlogin cannot run the project in ${remote_dir:-$PWD} with $PYTHON" ;;
   slurm)
     command -v sbatch >/dev/null || fail "--executor slurm needs sbatch, on a Slurm cluster"
-    array_size=$(scontrol show config 2>/dev/null | awk '$1 == "MaxArraySize" {print $3}') || true
-    [ "${array_size:-0}" -gt 0 ] || fail "Slurm does not answer: scontrol show config has no MaxArraySize"
     words=$(xargs -rn1 printf '%s\n' <<<"$slurm_args" 2>/dev/null) ||
       fail "--slurm-args has a quote that does not end: $slurm_args"
     [ -z "$words" ] || mapfile -t slurm_options <<<"$words" ;;
@@ -217,6 +215,7 @@ stop() { # EXIT_STATUS
 # reaches every run once.
 run_todo() {
   local folders reason guard watch # the folders of the logs
+  [ "$executor" != slurm ] || ask_slurm
   mapfile -t folders < <(cut -f1 <<<"$todo" | LC_ALL=C sed 's,/[^/]*$,/logs,' | LC_ALL=C sort -u)
   reason=$( (mkdir -p "${folders[@]}" && printf '%s\n' "$todo" >"$list") 2>&1) ||
     fail "--runs-dir: cannot write to $logs: ${reason##*: }"

@@ -99,6 +99,12 @@ stop_parallel() { # HUP: parallel starts no more runs, and waits for those that 
 
 # -------------------------------------------------------------------------------------------- slurm
 
+ask_slurm() { # before anything is written; sets array_size
+  array_size=$(scontrol show config 2>/dev/null | awk '$1 == "MaxArraySize" {print $3}') || true
+  [ "${array_size:-0}" -gt 0 ] || [ "$stopped" -ne 0 ] ||
+    fail "Slurm does not answer: scontrol show config has no MaxArraySize"
+}
+
 submit() { # the array's indices are line numbers, counted from the offset of its part
   local count offset n id
   count=$(wc -l <"$list")

@@ -827,6 +827,15 @@ def test_missing_engine(executor, program, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_slurm_that_does_not_answer_leaves_nothing_behind(tmp_path):
+    need("sbatch", "scontrol")
+    env = ENV | {"SLURM_CONF": str(tmp_path / "nothing")}
+    result = run("demo", "--runs-dir", tmp_path / "runs", "--executor", "slurm", env=env)
+    assert result.code == 2 and "error: Slurm does not answer" in result.err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
 def test_help():
     shown = run("--help")
     assert shown.code == 0 and not shown.err
