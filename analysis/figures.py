@@ -158,17 +158,17 @@ def curves_figure(study, noise):
     noisy = [config.noise == noise for config in configs]
     counts = np.stack([np.isfinite(study.final(config)).sum(axis=0) for config in configs])
     tried = np.flatnonzero(counts[noisy].any(axis=0))
-    present, labels = np.flatnonzero(counts[:, tried].any(axis=1)), []  # a search has no baseline
-    for i in present:
+    labels = {}  # by the number of the configuration
+    for i, n in enumerate(counts[:, tried]):
         name = "no noise" if configs[i] == BASELINE else f"rate {configs[i].noise_rate}"
-        n = counts[i, tried]
-        labels.append(f"{name} (n = {span(n[n > 0])})")  # in the panels that have the line
+        if n.any():  # a search has no baseline
+            labels[i] = f"{name} (n = {span(n[n > 0])})"  # in the panels that have the line
     environments = [study.environments[e] for e in tried]
     steps, below = training_steps(study)
-    fig, axes, add_legend = panels(environments, labels, study.metric, below)
+    texts = list(labels.values())
+    fig, axes, add_legend = panels(environments, texts, study.metric, below)
     every = max(1, len(steps) // 8)
-    lines = list(zip(present, labels, strict=True))
-    for (e, ax), (i, label) in product(zip(tried, axes, strict=True), lines):
+    for (e, ax), (i, label) in product(zip(tried, axes, strict=True), labels.items()):
         look = style.line_style(i, len(configs)) | {"linewidth": 1.1 if i else 1.8}
         look |= {"markevery": (min(i, every - 1), every), "markersize": 4.5, "label": label}
         curve(ax, steps, study.returns[configs[i]][:, :, e], **look)
