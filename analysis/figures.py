@@ -179,41 +179,46 @@ def curves_figure(study, noise):
 def ablation_figures(study, summary):
     """Yield a Drawing for every wrapper that a study has with several parameters."""
     summary = summary[rows_of(summary, study.key)]
+    has_baseline = (summary["noise"] == "").any()  # a search has none
+    dotted = "; dotted: no noise" if has_baseline else ""
     single = [config for config in study.returns if len(config.noises) == 1]  # sorted by noise
     for wrapper, configs in groupby(single, lambda config: config.wrappers[0]):
         noises = sorted({config.noise for config in configs})
         if len(noises) > 1:
             caption = (
                 f"{study.name}, {wrapper}: final test {study.metric} by parameters and noise rate. "
-                f"Bars: mean over n seeds, whiskers {ONE_STD}; dotted: no noise."
+                f"Bars: mean over n seeds, whiskers {ONE_STD}{dotted}."
             )
-            draw = partial(ablation_figure, study, summary, noises)
+            draw = partial(ablation_figure, study, summary, noises, has_baseline)
             yield Drawing("parameters", f"{study.name} {wrapper}", caption, draw)
 
 
-def ablation_figure(study, summary, noises):
+def ablation_figure(study, summary, noises, has_baseline):
     """Draw bars of the final return: a wrapper's parameters side by side, grouped by noise rate."""
-    labels = []
-    for noise in ["", *noises]:
+    labels = {}
+    for noise in ["", *noises] if has_baseline else noises:
         n = summary.loc[summary["noise"] == noise, "n"]
-        labels.append(f"{noise or 'no noise'} (n = {span(n)})")
+        labels[noise] = f"{noise or 'no noise'} (n = {span(n)})"
     noisy = summary[summary["noise"].isin(noises)]
     rates = sorted(set(noisy["noise_rate"]), key=rate_order)
     environments = list(noisy["environment"].unique())
     finals = summary.set_index(["environment", "noise", "noise_rate"])[["mean", "std"]]
-    fig, axes, add_legend = panels(environments, labels, study.metric, "noise rate")
+    texts = list(labels.values())
+    fig, axes, add_legend = panels(environments, texts, study.metric, "noise rate")
     width = 0.8 / len(noises)
     for ax, env in zip(axes, environments, strict=True):
-        baseline = finals.reindex([(env, BASELINE.noise, BASELINE.noise_rate)])
-        bars(ax, [-1], baseline, 0.6, color="white", label=labels[0])
-        ax.axhline(baseline["mean"].iloc[0], color="black", linewidth=0.6, linestyle=":")
+        if has_baseline:
+            baseline = finals.reindex([(env, BASELINE.noise, BASELINE.noise_rate)])
+            bars(ax, [-1], baseline, 0.6, color="white", label=labels[""])
+            ax.axhline(baseline["mean"].iloc[0], color="black", linewidth=0.6, linestyle=":")
         ax.axhline(0, color="black", linewidth=0.6)
         for i, noise in enumerate(noises):
             rows = finals.reindex([(env, noise, rate) for rate in rates])
             place = np.arange(len(rates)) + width * (i - (len(noises) - 1) / 2)
-            color = style.line_style(i + 1, len(labels))["color"]
-            bars(ax, place, rows, width, color=color, label=labels[i + 1])
-        ax.set_xticks([-1, *range(len(rates))], ["none", *rates])
+            color = style.line_style(i + 1, 1 + len(noises))["color"]
+            bars(ax, place, rows, width, color=color, label=labels[noise])
+        marks = ({-1: "none"} if has_baseline else {}) | dict(enumerate(rates))
+        ax.set_xticks(list(marks), marks.values())
     add_legend()
     return fig
 

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from contextlib import nullcontext
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
@@ -969,6 +970,18 @@ def test_ablation_bars_stand_side_by_side(tmp_path):
     assert [text.get_text() for text in ax.get_xticklabels()] == ["none", "0.05", "0.50"]
     legend = [text.get_text() for text in figure.legends[0].get_texts()]
     assert legend == ["no noise (n = 2)", f"{SCALE} (n = 2)", f"{other} (n = 2)"]
+
+
+def test_ablation_bars_of_a_search_show_no_baseline(tmp_path):
+    other = "RandomUniformScaleReward(0.8, 1.2)"
+    for noise, seed in product((SCALE, other), (1, 2)):
+        write_run(tmp_path, [10 * seed], seed=seed, noise=noise, rate=0.5)
+    drawing = drawn_of(tmp_path)["parameters_SAC_RandomUniformScaleReward"]
+    figure = drawing.draw()
+    (ax,) = figure.axes
+    assert [text.get_text() for text in ax.get_xticklabels()] == ["0.50"] and len(ax.patches) == 2
+    legend = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert legend == [f"{SCALE} (n = 2)", f"{other} (n = 2)"] and "dotted" not in drawing.caption
 
 
 def test_markdown_and_latex_tables(sweep):
