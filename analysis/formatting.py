@@ -3,6 +3,7 @@
 import re
 import zlib
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -12,7 +13,7 @@ from analysis.runs import script_name
 from analysis.verdicts import percent
 from noisy_wrappers import rate_order, rounded
 
-WHOLE_WORDS = {"break_long_words": False, "break_on_hyphens": False}  # of textwrap
+WHOLE_WORDS = {"break_long_words": False, "break_on_hyphens": False}  # when text is wrapped
 DASH = "\u2013"  # of what does not exist
 TENTH = "z,.1f"  # z: no "-0"
 _COLUMNS_WITH = {  # a format of numbers that have no spread
@@ -160,13 +161,18 @@ def shown(table):
 
 
 def text_table(table, width):
-    """Format a table for a terminal of this width, without the last columns if need be."""
+    """Format a table for a terminal of this width.
+
+    Wide cells are wrapped if need be; the last columns are left out if that is not enough.
+    """
     text = shown(table)
-    while True:
-        lines = tabulate(text.values, text.columns, disable_numparse=True)
-        if text.shape[1] == 1 or max(map(len, lines.splitlines())) <= width:
-            return lines
-        text = text.iloc[:, :-1]
+    for columns, wrap in product(range(text.shape[1], 0, -1), (None, 30, 20)):
+        cells = text.iloc[:, :columns]
+        wrapped = {"maxcolwidths": wrap, "maxheadercolwidths": wrap} | WHOLE_WORDS
+        lines = tabulate(cells.values, list(cells), disable_numparse=True, **wrapped)
+        if max(map(len, lines.splitlines())) <= width:
+            break
+    return lines
 
 
 def write_table(out, table, latex=False):
