@@ -518,6 +518,12 @@ class RandomDropoutObservation(ObservationNoise):
 # --------------------------------------------------------------------------------- noise on rewards
 
 
+def _number_in(reward: Any) -> Any:
+    """Return a reward as a number; it may be an array of one element, of NumPy, PyTorch or JAX."""
+    is_array = hasattr(reward, "shape") and not isinstance(reward, np.generic)
+    return reward.item() if is_array else reward
+
+
 class RewardNoise(NoiseWrapper):
     """Base of the reward wrappers: subclasses define ``_perturb``.
 
@@ -530,7 +536,7 @@ class RewardNoise(NoiseWrapper):
         """Step the environment and perturb the reward with probability p."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         if self.acts():
-            given: Any = reward.item() if isinstance(reward, np.ndarray) else reward
+            given: Any = _number_in(reward)
             reward = self._perturb(given)
             if reward != given and not math.isnan(given):
                 info = self.mark(info)
@@ -1761,7 +1767,7 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         number = math.nan
         if not isinstance(reward, str):
             with contextlib.suppress(TypeError, ValueError):  # of None, or of several numbers
-                number = float(reward.item() if isinstance(reward, np.ndarray) else reward)
+                number = float(_number_in(reward))
         if not math.isfinite(number):
             self._blame("returned the reward", reward, action)
         observation, info = self._checked(observation, action), dict(info or {})
@@ -2193,16 +2199,25 @@ def _package_of(value: Any) -> str:
 
 def _members(holder: Any, depth: int = 3) -> Iterator[tuple[str, Any]]:
     """Yield what an object holds, also in its containers, its spaces and objects of no library."""
-    libraries = _LIBRARIES - {_package_of(holder)}
-    parts = vars(holder) if hasattr(holder, "__dict__") else holder
-    for name, value in [*_items(parts)]:
+    containers, libraries = list | tuple | dict, _LIBRARIES - {_package_of(holder)}
+    parts: list[tuple[Any, Any]] = [*_attributes(holder).items()]
+    if isinstance(holder, containers):
+        parts += _items(holder)
+    for name, value in parts:
         yield str(name), value
-        few = isinstance(value, list | tuple | dict) and len(value) <= 1000
-        own = hasattr(value, "__dict__") and _package_of(value) not in libraries
-        goes_on = few or own or isinstance(value, gym.Space)
+        goes_on = isinstance(value, gym.Space) or _package_of(value) not in libraries
+        if isinstance(value, containers):
+            goes_on = len(value) <= 1000
         if depth and goes_on and not isinstance(value, gym.Env):
             for inner, part in _members(value, depth - 1):
                 yield f"{name}.{inner}", part
+
+
+def _attributes(holder: Any) -> dict[str, Any]:
+    """Return the attributes of an object, those in ``__slots__``, too."""
+    state: Any = object.__getstate__(holder)  # its dict, or a pair of that and of its slots
+    parts = state if isinstance(state, tuple) else (state,)
+    return {name: value for part in parts if part for name, value in part.items()}
 
 
 def _stream(generator: Any) -> Any:

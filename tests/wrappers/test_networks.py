@@ -4,6 +4,7 @@ import copy
 import json
 import random
 import sys
+from dataclasses import dataclass
 
 import gymnasium as gym
 import numpy as np
@@ -104,7 +105,19 @@ def test_make_flat_refuses_what_networks_cannot_take(observations, actions, word
     assert str(actions if "actions" in word or "dim" in word else observations) in str(error.value)
 
 
-@pytest.mark.parametrize("reward", [2, np.float32(2), np.array([2.0], np.float32), np.array(2)])
+class OneOfJax:
+    """An array of one element, which float() does not take, as JAX's."""
+
+    shape = (1,)
+
+    def item(self):
+        return 2.0
+
+
+@pytest.mark.parametrize(
+    "reward",
+    [2, np.float32(2), np.array([2.0], np.float32), np.array(2), torch.tensor([2]), OneOfJax()],
+)
 def test_rewards_are_floats(reward):
     env = FiniteNumbers(Given(BOX))
     env.env.reward = reward
@@ -226,15 +239,24 @@ class Simulator:
         self.torch = torch.Generator().manual_seed(0)
 
 
+@dataclass(slots=True)
+class Wind:
+    """Another part, without a __dict__."""
+
+    rng: np.random.Generator
+
+
 class Drawing(gym.Env):
     """Draws from generators that it holds, in many ways, and one that a helper or space holds."""
 
-    observation_space = gym.spaces.Box(-9, 9, (8,), np.float64)
+    observation_space = gym.spaces.Box(-9, 9, (10,), np.float64)
     action_space = gym.spaces.Box(-1, 1, (1,))
+    __slots__ = ("gust",)
 
     def __init__(self):
         self.robot = gym.make("Pendulum-v1")
         self.simulator, self.goals = Simulator(), gym.spaces.Box(-1, 1, (1,))
+        self.wind, self.gust = Wind(np.random.default_rng(0)), np.random.default_rng(1)
         self.several = {"of one kind": [np.random.default_rng(i) for i in range(2)]}
         self.goals.seed(0)
         self.world = Nameless("World", (), {})()
@@ -248,6 +270,7 @@ class Drawing(gym.Env):
             self.robot.reset(seed=seed)
         drawn = [self.rng.normal(), self.old.normal(), self.python.random()]
         drawn += [self.simulator.rng.normal(), self.goals.sample()[0]]
+        drawn += [self.wind.rng.normal(), self.gust.normal()]
         drawn.append(self.several["of one kind"][1].normal())
         drawn.append(torch.rand((), generator=self.simulator.torch).item())
         return np.array([*drawn, self.robot.reset()[0][0]]), {}
