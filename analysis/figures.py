@@ -94,7 +94,7 @@ def panels(environments, labels, metric, below):
     fig = Figure(figsize=(width, height))
     # Placed by hand: matplotlib's automatic layouts take as long as the drawing itself.
     bottom, top = (legend + 0.45) / height, 1 - 0.3 / height
-    fig.subplots_adjust(0.9 / width, bottom, 1 - 0.3 / width, top, wspace=0.25, hspace=0.45)
+    fig.subplots_adjust(1.1 / width, bottom, 1 - 0.3 / width, top, wspace=0.25, hspace=0.45)
     axes = [fig.add_subplot(down, across, i + 1) for i in range(len(environments))]
     for ax, env in zip(axes, environments, strict=True):
         style.set_title(ax, env, width / across)

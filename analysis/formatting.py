@@ -10,7 +10,7 @@ import pandas as pd
 from tabulate import tabulate
 
 from analysis.runs import script_name
-from analysis.verdicts import percent
+from analysis.verdicts import not_zero, percent, two_digits
 from noisy_wrappers import rate_order, rounded
 
 WHOLE_WORDS = {"break_long_words": False, "break_on_hyphens": False}  # when text is wrapped
@@ -19,11 +19,12 @@ TENTH = "z,.1f"  # z: no "-0"
 _COLUMNS_WITH = {  # a format of numbers that have no spread
     "z,.0f": """n n_baseline n_baseline_most environments conditions chosen_from seeds seeds_needed
         steps_to_baseline percent_of_environments""",
-    ".2g": "p p_adjusted p_holm smallest_p smallest_p_adjusted p_luck paper_p_luck",
     "z.2f": "probability_of_improvement probability_low probability_high effect_size t",
     TENTH: "difference_se",
     "g": "steps_millions",
 }
+P_VALUES = ["p", "p_adjusted", "p_holm", "p_luck", "paper_p_luck", "smallest_p"]
+P_VALUES += ["smallest_p_adjusted"]
 FORMATS = {name: form for form, names in _COLUMNS_WITH.items() for name in names.split()}
 
 
@@ -100,6 +101,10 @@ def text_of(name, value, spread=None):
         return DASH
     if isinstance(value, str):
         return value or ("no noise" if name == "noise" else DASH)
+    if name in P_VALUES:
+        return two_digits(value)
+    if name in ("difference_low", "difference_high") and spread is not None:
+        return not_zero(value, spread)
     if name in FORMATS or name.startswith("paper_"):
         return f"{value:{FORMATS.get(name, TENTH)}}"
     if name.endswith("_percent") and spread is None:

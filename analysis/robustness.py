@@ -54,12 +54,33 @@ def read_robustness(runs_dir, runs, metric="return"):
         for (condition, elsewhere), results in tests.items():
             row |= {"condition": condition, "elsewhere": elsewhere}
             row["environment"] = where_tested(run.environment, elsewhere)
-            rows.append(row | {"mean": results.mean()})
+            rows.append(row | {"mean": results})
     table = pd.DataFrame(rows, columns=RUN_COLUMNS)
     place = [table["environment"], table["condition"]]
-    told = table["mean"].notna().groupby(place).transform("any")
-    table = table[told].fillna({"mean": 0.0})
-    return table, notes + incomplete_notes(table)
+    told = table["mean"].map(np.mean).notna().groupby(place).transform("any")
+    table, more = shortened(table[told])
+    return table.fillna({"mean": 0.0}), notes + more + incomplete_notes(table)
+
+
+def shortened(table):
+    """Return the table with means of the results of episodes, and notes where not all count.
+
+    Episode i begins in the same state in all tests of an environment, so the tests are compared
+    over the episodes that all of them have.
+    """
+    place = [table[name] for name in (*STUDY, "environment")]
+    played = table["mean"].map(len).groupby(place)
+    least = played.transform("min")
+    means = [results[:n].mean() for results, n in zip(table["mean"], least, strict=True)]
+    notes = []
+    for (*study, environment), numbers in played:
+        if numbers.min() < numbers.max():
+            notes.append(
+                f"{study_name(*study)} on {environment}: tests have {numbers.min()} to "
+                f"{numbers.max()} episodes; the first {numbers.min()} count, which begin alike "
+                f"(evaluate.py --episodes {numbers.max()} plays the others)"
+            )
+    return table.assign(mean=np.array(means, float)), notes
 
 
 def incomplete_notes(runs):

@@ -325,8 +325,8 @@ def make_studies(runs, metric="return"):
         steps, longest = reduce(np.intersect1d, group["steps"]), group["steps"].map(len).max()
         if len(steps) < longest:
             notes.append(
-                f"{name}: runs differ in their evaluation steps; curves are cut to the "
-                f"{len(steps)} steps that all share (of up to {longest})"
+                f"{name}: runs differ in their evaluation steps; curves are cut to "
+                f"those that all share, {len(steps)} of up to {longest}"
             )
         envs, seeds = sorted(set(group["environment"])), sorted(set(group["seed"]))
         shape = (len(steps), len(seeds), len(envs))

@@ -20,6 +20,7 @@ PROBABILITY = ("probability_of_improvement", "probability_low", "probability_hig
 IQM_CHANGE = ("iqm_change_percent", "iqm_change_low", "iqm_change_high")
 # What a comparison does not tell where all returns are equal
 UNKNOWN = ("t", "p", "difference_low", "difference_high", "difference_percent", *IQM_CHANGE)
+UNKNOWN += ("improvement_percent",)
 # The best noises as people read them; a terminal may lack room for the last columns
 BEST_VIEW = ["algorithm, environment", "noise", "noise_rate", "difference", "p_adjusted", "n"]
 BEST_VIEW += ["luck_95", "p_luck", "baseline_mean", "baseline_std", "noisy_mean", "noisy_std"]
@@ -125,12 +126,14 @@ def best_rows(judged):
 def consistency_rows(judged):
     """Yield per noise and rate the share of envs that are matched or better, and by how much.
 
-    Every environment counts in the share, by the sign of its difference; the average is over those
-    whose baseline has a percentage, and the others are named. p is that of all environments.
+    Every environment counts in the share, by the sign of its difference, but those in which all
+    returns are equal; the average is over those whose baseline has a percentage, and the others are
+    named. p is that of all environments.
     """
     keys = [*STUDY, "noise", "noise_rate"]
     tests = judged[judged["scope"] == "all"].set_index(keys)[["p", "p_adjusted"]].to_dict("index")
-    for key, group in judged[judged["difference"].notna()].groupby(keys):
+    told = judged["difference"].notna() & (judged["verdict"] != ALL_EQUAL)
+    for key, group in judged[told].groupby(keys):
         mean, std, _ = statistics.mean_std(group["improvement_percent"])
         without = group.loc[group["improvement_percent"].isna(), "environment"]
         row = dict(zip(keys, key, strict=True)) | tests.get(key, {})

@@ -40,8 +40,10 @@ def significant(p):
 
 
 def percent(value, sign="+"):
-    """Write a percentage: whole from 10 on, with a decimal below."""
-    return f"{value:{sign}z,.{0 if abs(value) >= 10 else 1}f} %"
+    """Write a percentage: whole from 10 on, with a decimal below, without a sign if that is 0.0."""
+    if abs(value) < 0.05:
+        return "0.0 %"
+    return f"{value:{sign},.{0 if abs(value) >= 10 else 1}f} %"
 
 
 def counted(number, word):
@@ -54,15 +56,28 @@ def seeds_of(n, n_baseline):
     return f"{n:.0f}" if n == n_baseline else f"{n:.0f}/{n_baseline:.0f}"
 
 
+def two_digits(p):
+    """Write a p-value with two significant digits, with more if it would look like LEVEL."""
+    text = f"{p:.2g}"
+    return f"{p:.4g}" if float(text) <= LEVEL < p else text
+
+
 def p_value(p):
     """Write a p-value for a sentence: "= 0.04", or "< 0.001"."""
-    return f"= {p:.2g}" if p >= 0.001 else "< 0.001"
+    return f"= {two_digits(p)}" if p >= 0.001 else "< 0.001"
 
 
 def spread_of(row):
     """Return what a comparison's difference may be off by: half its interval, or its spread."""
     half = (row.difference_high - row.difference_low) / 2
     return row.pooled_std if pd.isna(half) else half
+
+
+def not_zero(value, spread):
+    """Write a number as `rounded` does, with more digits if it would look like zero and is not."""
+    text = rounded(value, spread)
+    looks_like_zero = abs(value) > 1e-9 * spread and not float(text.replace(",", ""))
+    return rounded(value, abs(value)) if looks_like_zero else text
 
 
 def difference(row, unit=""):
@@ -77,10 +92,10 @@ def difference(row, unit=""):
     else:
         spread = spread_of(row)
         text = rounded(row.difference, spread)
-        text = text if text.startswith("-") else f"+{text}"
+        text = f"+{text}" if float(text.replace(",", "")) > 0 else text
         if pd.notna(row.difference_low):
             ends = row.difference_low, row.difference_high
-            text += f" [{', '.join(rounded(end, spread) for end in ends)}]"
+            text += f" [{', '.join(not_zero(end, spread) for end in ends)}]"
         text += unit
     if pd.notna(row.difference_percent):
         average = " on average" if pd.isna(row.difference) else ""
@@ -163,7 +178,7 @@ def power(row):
     needed = row["seeds_needed"]
     if needed > max(n, m) and row["difference"]:
         needed = f"about {needed:.0f}" if needed <= MAX_SEEDS else f"more than {MAX_SEEDS:,}"
-        observed = rounded(abs(row["difference"]), spread_of(row))
+        observed = not_zero(abs(row["difference"]), spread_of(row))
         parts.append(f"{observed} would take {needed} seeds each")
     return "; " + ", and ".join(parts) if parts else ""
 
@@ -180,23 +195,25 @@ def luck_sentence(best):
 
     best: its rows of the table of best noises, one for each environment.
     """
-    best = best[best["p_luck"].notna()]
-    if best.empty:
+    judged = best[best["p_luck"].notna()]  # the others have too few seeds
+    if judged.empty:
         return ""
     if not (best["difference"] > 0).any():
         return "Nothing that was tried has a higher mean than no noise."
-    tried = set(best["chosen_from"])
+    tried = set(judged["chosen_from"])
     number = "as many" if len(tried) > 1 else f"{max(tried):.0f}"
     rivals = f"the best of {number} useless noises would"
     if tried == {1}:
         rivals = "one useless noise might"
-    best = best.assign(p_luck=holm(best["p_luck"].to_numpy(float)))  # over environments
-    beyond = best[best["p_luck"] <= LEVEL]
+    judged = judged.assign(p_luck=holm(judged["p_luck"].to_numpy(float)))  # over environments
+    beyond = judged[judged["p_luck"] <= LEVEL]
     if beyond.empty:
-        where = " in each environment" if len(best) > 1 else ""
+        where = " in each environment" if len(judged) > 1 else ""
+        if len(judged) < len(best):
+            where = f" on {listed(list(judged['environment']))}"
         return f"The best noise{where} looks no better than {rivals}."
     where = [f"{row.environment} (p {p_value(row.p_luck)})" for row in beyond.itertuples()]
-    elsewhere = "; elsewhere it does not" if len(beyond) < len(best) else ""
+    elsewhere = "; elsewhere it does not" if len(beyond) < len(judged) else ""
     return f"On {listed(where)} the best noise looks better than {rivals}{elsewhere}."
 
 

@@ -245,6 +245,19 @@ def test_fails_at_every_rate_needs_every_rate(tmp_path):
     }
 
 
+@pytest.mark.parametrize("same", [0.0, -7.3])
+def test_an_environment_without_any_difference_makes_no_noise_consistent(same, tmp_path):
+    for seed in range(1, 6):
+        for env, final in (("Hopper-v5", 100 + seed), *((f"Equal{i}-v0", same) for i in range(4))):
+            write_run(tmp_path / "runs", [final], env=env, seed=seed)
+            noisy = final if env.startswith("Equal") else final - 60
+            write_run(tmp_path / "runs", [noisy], env=env, noise=SCALE, rate=0.1, seed=seed)
+    tables = run(tmp_path)
+    assert tables["consistent"].empty and tables["consistently_worse"].empty  # one is left
+    best = row(tables["best"], environment="Equal0-v0")
+    assert best["difference"] == 0 and np.isnan(best["improvement_percent"])
+
+
 def test_early_performance_by_hand(sweep):
     table = sweep.tables["early_performance"]
     assert list(table.columns) == analysis.tables.COLUMNS["early_performance"]
@@ -678,7 +691,7 @@ def test_paths_threads_and_evaluation_steps_do_not_split_rows(tmp_path, capsys):
     assert analysis.runs.version_notes(runs.assign(environment=apart)) == []
     assert study.algorithm == "SAC" and study.steps.tolist() == [20_000, 40_000]
     assert study.returns[BASELINE][:, :, 0].tolist() == [[2, 6, 2], [4, 8, 5]]
-    assert "cut to the 2 steps that all share (of up to 4)" in notes[0]
+    assert "cut to those that all share, 2 of up to 4" in notes[0]
     assert (
         "some rows average runs with different mujoco" in notes[1] and "3.14.0 (n = 1)" in notes[1]
     )
@@ -953,6 +966,9 @@ def test_figures_have_labels_units_and_n(sweep):
     fig = analysis.figures.curves_figure(study, SCALE)
     legend = [text.get_text() for text in fig.legends[0].get_texts()]
     assert legend == ["rate 0.05 (n = 4)", "rate 0.20 (n = 4)"] and len(fig.axes) == 2
+    fig.axes[0].set_ylim(-12_000, -11_000)
+    fig.draw_without_rendering()
+    assert fig.axes[0].yaxis.label.get_window_extent().x0 >= 0
     assert "black" not in {line.get_color() for line in fig.axes[0].lines}
 
 

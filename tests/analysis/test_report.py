@@ -237,6 +237,12 @@ def test_of_many_versions_is_said_at_the_end(tmp_path):
             "best noise looks better than the best of 90 useless noises would.",
         ),
         ([float("nan")], [float("nan")], [3], ""),
+        (  # too few seeds on the first
+            [100, -5],
+            [float("nan"), 0.7],
+            [1, 1],
+            "The best noise on Hopper-v5 looks no better than one useless noise might.",
+        ),
     ],
 )
 def test_luck_is_said_in_one_sentence(improvements, p_luck, tried, expected):

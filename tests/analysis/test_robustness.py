@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import re
 import shutil
 
 import numpy as np
@@ -220,6 +221,23 @@ def test_conditions_that_a_run_lacks_do_not_count(tmp_path):
     push = row(run(tmp_path)["robustness_score"], noise=PUSH)
     assert push["conditions"] == 1 and push["score_percent"] == pytest.approx(87.5 - 100)
     assert push["baseline_score_percent"] == pytest.approx(-20)
+
+
+def test_tests_are_compared_over_the_same_episodes(tmp_path, capsys):
+    """Episode i begins alike in all tests, so more episodes are other ones."""
+    write_tests(tmp_path / "runs", HOPPER, "Hopper-v5")
+    shorter = [path for path in (tmp_path / "runs").rglob("robustness.csv") if PUSH in str(path)]
+    for path in shorter:
+        lines = path.read_text().splitlines(keepends=True)
+        path.write_text(
+            "".join(line for line in lines if not re.search(r",[4-9],[^,]+,1000", line))
+        )
+    push = row(run(tmp_path)["robustness_score"], noise=PUSH)
+    assert len(shorter) == 4 and push["difference"] == pytest.approx((87.5 + 60) / 2 - 60)
+    assert (
+        "note: PPO on Hopper-v5: tests have 4 to 10 episodes; the first 4 count, which begin alike "
+        "(evaluate.py --episodes 10 plays the others)"
+    ) in capsys.readouterr().out
 
 
 @pytest.mark.slow

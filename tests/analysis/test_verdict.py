@@ -111,7 +111,9 @@ def test_no_clear_difference_says_what_the_seeds_could_have_shown():
     assert f"; 10 seeds could have shown {shift * spread:.1f} (80 % power), and 1.5 would" in text
     assert f" would take about {row['seeds_needed']:.0f} seeds each." in text
     _, said = judge(TEN, {"0.10": TEN + 0.01})
-    assert "0.0 would take more than 1,000 seeds each." in said["sentence"].iloc[0]
+    [text] = said["sentence"]
+    assert ": 0.0 [" in text and "] (0.0 %), p" in text  # no sign of what is written as zero
+    assert " and 0.010 would take more than 1,000 seeds each." in text
     _, said = judge(TEN, {"0.10": TEN})
     assert "would take" not in said["sentence"].iloc[0]
 
@@ -182,6 +184,22 @@ def test_where_interval_and_p_differ_is_borderline():
 def test_numbers_of_any_size(baseline, noisy, expected):
     _, said = judge(baseline, {"0.10": noisy})
     assert expected in said["sentence"].iloc[0]
+
+
+@pytest.mark.parametrize(
+    ("value", "spread", "expected"),
+    [(0.013, 2.4, "0.013"), (-0.013, 2.4, "-0.013"), (0.06, 2.4, "0.1"), (0.0, 2.4, "0.0")]
+    + [(1e-12, 2.4, "0.0"), (4.7, 2.4, "4.7")],  # 1e-12 is a rounding error
+)
+def test_an_end_of_an_interval_looks_like_zero_only_if_it_is(value, spread, expected):
+    assert analysis.verdicts.not_zero(value, spread) == expected
+    assert analysis.formatting.text_of("difference_low", value, spread) == expected
+
+
+def test_a_p_above_the_level_does_not_look_like_it():
+    said = [analysis.verdicts.p_value(p) for p in (0.0496, 0.05, 0.0504, 0.051, 0.0004)]
+    assert said == ["= 0.05", "= 0.05", "= 0.0504", "= 0.051", "< 0.001"]
+    assert analysis.formatting.text_of("p_adjusted", 0.0504) == "0.0504"
 
 
 def test_of_many_comparisons_the_first_are_shown_and_all_are_counted():
