@@ -39,7 +39,7 @@ def row(claim, page, paper, ours, tests, runs, claimed=1, of=all, after=False):
     inside = "–"
     if not isinstance(ours, str):
         change, low, high = ours
-        ours = f"{round(change):+d} % [{low:.0f}, {high:.0f}]"
+        ours = f"{change:+z.0f} % [{low:z.0f}, {high:z.0f}]".replace("+0 %", "0 %")
         if not isinstance(paper, str):
             inside = "yes" if low <= paper <= high else "no"
     if not isinstance(paper, str):

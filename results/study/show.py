@@ -15,7 +15,7 @@ COMPARISON = {  # of the columns of compare.comparisons
     "n": "{n:.0f} + {n_without:.0f}",
     "with noise": "{mean:,.1f} ± {sd:,.1f}",
     "without": "{mean_without:,.1f} ± {sd_without:,.1f}",
-    "change [95 %]": "{difference_percent:+z.0f} % [{low_percent:.0f}, {high_percent:.0f}]",
+    "change [95 %]": "{difference_percent:+z.0f} % [{low_percent:z.0f}, {high_percent:z.0f}]",
     "p": "{p:.2g}",
     "Holm": "{holm:.2g}",
     "verdict": "{verdict}",
@@ -42,7 +42,7 @@ COLUMNS = {
     "consistent_rows.csv": {
         "noise": "`{noise}`, p = {rate:g}",
         "improved": "{improved:.0f} of 5",
-        "average [95 %]": "{average_percent:+z.0f} % [{low_percent:.0f}, {high_percent:.0f}]",
+        "average [95 %]": "{average_percent:+z.0f} % [{low_percent:z.0f}, {high_percent:z.0f}]",
         "p (Welch)": "{p:.2f}",
         "the paper": "{paper_percent:+z.0f} %",
     },
@@ -50,7 +50,7 @@ COLUMNS = {
         "question": "{question}",
         "environments": "{environments}",
         "seeds": "{seeds}",
-        "change [95 %]": "{change_percent:+z.0f} % [{low_percent:.0f}, {high_percent:.0f}]",
+        "change [95 %]": "{change_percent:+z.0f} % [{low_percent:z.0f}, {high_percent:z.0f}]",
         "p": "{p:.2g}",
         "Holm": "{holm:.2g}",
         "verdict": "{verdict}",
@@ -88,7 +88,8 @@ def fields(form):
 def formatted(form, row):
     """Return a cell by its format, empty where a value is."""
     values = {field: number(row[field]) for field in fields(form)}
-    return "" if "" in values.values() else form.format(**values)
+    text = "" if "" in values.values() else form.format(**values)
+    return text.replace("+0 %", "0 %")  # zero has no sign
 
 
 def number(text):
