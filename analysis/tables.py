@@ -19,8 +19,8 @@ CONSISTENT_PERCENT = 80  # of the environments, as in the paper
 PROBABILITY = ("probability_of_improvement", "probability_low", "probability_high")
 IQM_CHANGE = ("iqm_change_percent", "iqm_change_low", "iqm_change_high")
 # What a comparison does not tell where all returns are equal
-UNKNOWN = ("t", "p", "difference_low", "difference_high", "difference_percent", *IQM_CHANGE)
-UNKNOWN += ("improvement_percent",)
+UNKNOWN = ("t", "p", "difference_low", "difference_high", *IQM_CHANGE)
+UNKNOWN += ("difference_percent", "improvement_percent")
 # The best noises as people read them; a terminal may lack room for the last columns
 BEST_VIEW = ["algorithm, environment", "noise", "noise_rate", "difference", "p_adjusted", "n"]
 BEST_VIEW += ["luck_95", "p_luck", "baseline_mean", "baseline_std", "noisy_mean", "noisy_std"]
