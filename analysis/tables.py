@@ -216,13 +216,14 @@ def family_notes(judged):
         places = same["environment"].mask(same["scope"] == "all", "all")
         seeds = counted(same[["n", "n_baseline"]].min(axis=None), "seed")
         start = f"{study_name(*study)}, {', '.join(places)}: with {seeds}"
-        possible = f"smallest possible p: {smallest:.2g}"
+        possible = f"smallest possible p: {verdicts.two_digits(smallest)}"
         if smallest > statistics.LEVEL:
             notes.append(f"{start} no difference can be significant ({possible}).")
         elif round(size * smallest, 9) > statistics.LEVEL:
+            corrected = verdicts.two_digits(min(1, size * smallest))
             notes.append(
                 f"{start} and {size:.0f} comparisons no difference alone can be significant "
-                f"after the correction ({possible}, corrected {min(1, size * smallest):.2g})."
+                f"after the correction ({possible}, corrected {corrected})."
             )
     return notes
 

@@ -73,11 +73,16 @@ def spread_of(row):
     return row.pooled_std if pd.isna(half) else half
 
 
+def is_zero(text):
+    """Tell whether a number looks like zero as it is written."""
+    return not float(text.replace(",", ""))
+
+
 def not_zero(value, spread):
     """Write a number as `rounded` does, with more digits if it would look like zero and is not."""
     text = rounded(value, spread)
-    looks_like_zero = abs(value) > 1e-9 * spread and not float(text.replace(",", ""))
-    return rounded(value, abs(value)) if looks_like_zero else text
+    is_rounding_error = not abs(value) > 1e-9 * spread
+    return rounded(value, abs(value)) if is_zero(text) and not is_rounding_error else text
 
 
 def difference(row, unit=""):
@@ -92,7 +97,7 @@ def difference(row, unit=""):
     else:
         spread = spread_of(row)
         text = rounded(row.difference, spread)
-        text = f"+{text}" if float(text.replace(",", "")) > 0 else text
+        text = f"+{text}" if row.difference > 0 and not is_zero(text) else text
         if pd.notna(row.difference_low):
             ends = row.difference_low, row.difference_high
             text += f" [{', '.join(not_zero(end, spread) for end in ends)}]"
@@ -166,7 +171,9 @@ def power(row):
         seeds += f" against {m}"
     parts = []
     if not significant(row["smallest_p"]):
-        parts.append(f"{seeds} cannot show any (smallest possible p: {row['smallest_p']:.2g})")
+        parts.append(
+            f"{seeds} cannot show any (smallest possible p: {two_digits(row['smallest_p'])})"
+        )
     elif row["detectable"] > 0:
         before, number = "80 % power", row["comparisons"]
         if number > 1:
