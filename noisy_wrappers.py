@@ -2089,16 +2089,22 @@ def stop_at_signals() -> Callable[[], int]:
     """Handle SIGTERM, SIGINT and SIGHUP, but a SIGHUP that is ignored, as by nohup.
 
     Returns stop(), which a script asks whenever an episode ends: it returns the number of the first
-    signal, or 0. A second signal exits at once. In worker processes that an environment forks,
-    SIGTERM and SIGHUP act as by default, as ``terminate()`` asks, and SIGINT is ignored: Ctrl-C is
-    the script's.
+    signal, or 0. A second signal exits at once, but SIGTERM or SIGHUP within a second of the first:
+    pkill and timeout signal a program as well as the one that passes the signal on to it. In worker
+    processes that an environment forks, SIGTERM and SIGHUP act as by default, as ``terminate()``
+    asks, and SIGINT is ignored: Ctrl-C is the script's.
     """
     received: list[int] = []
+    time_of_first = 0.0
 
     def remember(number: int, frame: Any) -> None:
+        nonlocal time_of_first
+        if received:
+            if number == signal.SIGINT or time.monotonic() - time_of_first > 1:
+                os._exit(128 + number)
+            return
         received.append(number)
-        if len(received) > 1:
-            os._exit(128 + number)
+        time_of_first = time.monotonic()
         told = b"stopping at the end of this episode; Ctrl-C again to stop without a checkpoint\n"
         with contextlib.suppress(OSError):  # nobody may be left to read it; print is not safe here
             os.write(1, told)

@@ -44,10 +44,11 @@ def tests_of(*run):
 
 
 def stop(number, frame):
-    """Ask for a checkpoint; a second signal ends the run at once, as in the scripts."""
-    if STOPPED:
+    """Ask for a checkpoint; a second signal, not at once, ends the run, as in the scripts."""
+    if not STOPPED:
+        STOPPED.extend([number, time.monotonic()])
+    elif number == signal.SIGINT or time.monotonic() - STOPPED[1] > 1:
         os._exit(128 + number)
-    STOPPED.append(number)
 
 
 def pretend_to_train(total_timesteps, checkpoint):

@@ -155,13 +155,14 @@ def wait(*args):
     time.sleep(0.05)
 
 
-def send(*numbers):
-    return functools.partial(send_all, numbers)
+def send(*numbers, pause=0):
+    return functools.partial(send_all, numbers, pause)
 
 
-def send_all(numbers, *args):
+def send_all(numbers, pause, *args):
     for number in numbers:
         os.kill(os.getpid(), number)
+        time.sleep(pause)
 
 
 def disk_full(file_size, name=""):
@@ -408,14 +409,26 @@ def test_a_signal_ends_the_episode_and_the_run_resumes(algorithm, number, code, 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "numbers, code",
-    [((signal.SIGTERM, signal.SIGTERM), 143), ((signal.SIGTERM, signal.SIGINT), 130)],
+    "action, code",
+    [
+        (send(signal.SIGTERM, signal.SIGTERM, pause=1.1), 143),
+        (send(signal.SIGTERM, signal.SIGINT), 130),
+    ],
 )
 @one_script
-def test_a_second_signal_exits_at_once(algorithm, numbers, code, tmp_path):
-    result = run(algorithm, options(algorithm, tmp_path), (TRAINING_STEP, 30, send(*numbers)))
+def test_a_second_signal_exits_at_once(algorithm, action, code, tmp_path):
+    result = run(algorithm, options(algorithm, tmp_path), (TRAINING_STEP, 30, action))
     assert (result.code, result.err) == (code, "")
     assert not (folder(tmp_path) / "checkpoint.pt").exists()
+
+
+@pytest.mark.slow
+@one_script
+def test_one_request_that_arrives_twice_does_not_exit_at_once(algorithm, tmp_path):
+    action = send(signal.SIGTERM, signal.SIGTERM, signal.SIGHUP)
+    result = run(algorithm, options(algorithm, tmp_path), (TRAINING_STEP, 30, action))
+    assert (result.code, result.err) == (143, "")
+    assert (folder(tmp_path) / "checkpoint.pt").exists()
 
 
 @pytest.mark.slow

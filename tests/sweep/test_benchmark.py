@@ -293,6 +293,21 @@ def test_ctrl_c(engine, tmp_path):
     check_stopped(runs, out)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["local", "slurm"], indirect=True)
+def test_sigterm_to_all_processes(engine, tmp_path):
+    """As when a service stops. A run gets it twice, because benchmark.sh passes it on."""
+    executor, env = engine
+    grid = [*GRID, *FOREVER, "--runs-dir", tmp_path]
+    runs = folders(*grid)
+    sweep = start(*grid, *executor, env=env, prefix=["setsid"])
+    wait_for(lambda: sum(map(is_training, runs)) == 2, what="two runs at a time")
+    subprocess.run(["pkill", "-TERM", "--session", str(sweep.pid)], check=True)
+    out, err = sweep.communicate(timeout=PATIENCE)
+    assert sweep.returncode == 143, err
+    check_stopped(runs, out)
+
+
 def check_stopped(runs, shown):
     """Two of three runs were under way: they, and only they, have a checkpoint."""
     assert f"{runs[0].parent}: 3 runs: 0 done, 0 running, 0 failed, 3 to do" in shown
