@@ -26,7 +26,7 @@ from analysis.errors import take_over_terminal
 from analysis.folders import STOPPED, Log, is_locked, read_log
 from sweep.environment import cost
 from sweep.grid import PlannedRun, command_line, grid, result, runs_in
-from sweep.options import parse_args
+from sweep.options import from_caller, parse_args
 
 YOUNG = 120  # seconds: a run writes a line at least every ten, except in a test or in compiling
 RUNNING, PROBABLY = "running", "probably running"
@@ -196,11 +196,6 @@ def show_progress(args, runs, over, everything=False):
     named = [p for p in progresses if p.state == "failed" or (everything and p.reason)]
     table("not finished:" if everything else "failed:", named, args)
     return progresses
-
-
-def from_caller(args, path):
-    """Return a path that counts from the project's folder as the caller can paste it."""
-    return str(path) if args.caller == os.getcwd() else os.path.abspath(path)
 
 
 def check_disk(folder):

@@ -23,6 +23,7 @@ from noisy_wrappers import BASELINE, Configuration, rounded
 from sweep import halving
 from sweep.environment import ask_all, remember, remembered, run_seconds, time_left, wall_time
 from sweep.grid import PlannedRun, configuration_of, configurations, make_run, result
+from sweep.options import from_caller
 
 UNITS = {"return": "", SUCCESS: POINTS}  # of a difference, by the metric
 NO_SUCCESS = "it tells no `is_success` or `success`, as --metric success_rate needs"
@@ -223,7 +224,8 @@ def plan(found, args):
             lines.append(f"{choice.name}: is {which} better than no noise? {fresh}")
     lines += [*map(describe, found), total(found, args)]
     lines += filter(None, (detectable_gain(choice, args, len(found)) for choice in found))
-    return [*dict.fromkeys(lines), f"runs, logs and the verdict are stored in {args.runs_dir}"]
+    place = from_caller(args, args.runs_dir)
+    return [*dict.fromkeys(lines), f"runs, logs and the verdict are stored in {place}"]
 
 
 def total(found, args):

@@ -200,6 +200,11 @@ def from_project(caller, text):
     return path
 
 
+def from_caller(args, path):
+    """Return a path that counts from the project's folder as the caller can paste it."""
+    return str(path) if args.caller == os.getcwd() else os.path.abspath(path)
+
+
 def whole_number(text):
     """Read "1000000" or "1e6"."""
     try:

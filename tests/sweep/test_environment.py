@@ -295,6 +295,12 @@ def test_a_plan_says_what_it_will_decide(tmp_path):
     assert place == f"runs, logs and the verdict are stored in {tmp_path}"
 
 
+def test_a_plan_names_a_folder_that_the_caller_can_paste():
+    words = ["--algos", "ppo", "--envs", "toy_envs:Slow-v0", "--noises", f"{SCALE}@1"]
+    shown = view("dry-run", "choose", *words, caller=ROOT / "tests")
+    assert shown.err.endswith(f"stored in {ROOT / 'tests' / 'runs' / 'choose'}\n"), shown.err
+
+
 def test_any_dry_run_says_what_it_costs_and_finished_runs_tell_better(tmp_path):
     grid = ["baseline", "--algos", "ppo", "--envs", "toy_envs:Slow-v0", "--seeds", "1-3"]
     grid += ["--total-timesteps", "4000", "--runs-dir", tmp_path]
