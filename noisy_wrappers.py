@@ -239,8 +239,8 @@ class ObservationNoise(NoiseWrapper):
     ``keys`` restricts them to some of the top level, ``keys=("observation",)`` (of a Tuple:
     indices). Categories and all other entries stay as they are.
 
-    Every entry keeps its dtype and shape; integers are computed in float64, rounded and clipped to
-    their dtype. The space is widened to what noise can reach. The observation of ``reset()`` is
+    What is perturbed has the dtype of its space, and its shape; integers are computed in float64,
+    rounded and clipped to their dtype. The space is widened to what noise can reach. The observation of ``reset()`` is
     perturbed like any other.
     """
 
@@ -291,7 +291,8 @@ class ObservationNoise(NoiseWrapper):
             return observation, info
         given = self._numbers(observation)
         noisy = self._with_numbers(observation, self._perturb(given))
-        if not np.array_equal(self._numbers(noisy), given, equal_nan=True):
+        same = self._with_numbers(observation, given)  # an environment may return another dtype
+        if not np.array_equal(self._numbers(noisy), self._numbers(same), equal_nan=True):
             info = self.mark(info)
         return noisy, info
 
@@ -2103,8 +2104,8 @@ def stop_at_signals() -> Callable[[], int]:
             if number == signal.SIGINT or time.monotonic() - time_of_first > 1:
                 os._exit(128 + number)
             return
+        time_of_first = time.monotonic()  # first: another signal may arrive between the two lines
         received.append(number)
-        time_of_first = time.monotonic()
         told = b"stopping at the end of this episode; Ctrl-C again to stop without a checkpoint\n"
         with contextlib.suppress(OSError):  # nobody may be left to read it; print is not safe here
             os.write(1, told)

@@ -160,6 +160,16 @@ def test_noise_that_changes_nothing_is_not_applied(text):
     assert env.times_applied == 0 < env.opportunities
 
 
+def test_the_dtype_of_the_space_alone_is_no_noise():
+    """Where an environment declares float32 and returns float64, noise rounds to float32."""
+    env = constant_env(0.1)
+    env.observation_space = gym.spaces.Box(-1, 1, (3,), np.float32)
+    steps = rollout(build("RandomDropoutObservation(0.5)", env, 1.0), seed=0)
+    kept = [bool(np.all(observation)) for observation, *_ in steps]
+    assert 0 < sum(kept) < len(kept)
+    assert ["noise" not in info for *_, info in steps] == kept
+
+
 @pytest.mark.parametrize("text", ["RandomDropoutObservation(1)", "RandomNormalNoisyReward(1)"])
 def test_nan_that_stays_nan_is_not_changed(text):
     env = build(text, constant_env(np.nan), 1.0)
