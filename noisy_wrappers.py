@@ -240,8 +240,8 @@ class ObservationNoise(NoiseWrapper):
     indices). Categories and all other entries stay as they are.
 
     What is perturbed has the dtype of its space, and its shape; integers are computed in float64,
-    rounded and clipped to their dtype. The space is widened to what noise can reach. The observation of ``reset()`` is
-    perturbed like any other.
+    rounded and clipped to their dtype. The space is widened to what noise can reach. The
+    observation of ``reset()`` is perturbed like any other.
     """
 
     kind = "observation"
