@@ -78,10 +78,9 @@ class Args:
     learning_starts: int = 25_000  # environment steps with random actions before learning starts
     learning_rate: float = 3e-4  # learning rate of the policy and of the Q-functions
     policy_frequency: int = 2  # environment steps between two updates of the policy and the targets
-    # noise of 1.0 below is half the range of the actions
-    exploration_noise: float = 0.1  # standard deviation of the noise on the training actions
-    policy_noise: float = 0.2  # standard deviation of the noise on the target's actions
-    noise_clip: float = 0.5  # largest noise on the target's actions
+    exploration_noise: float = 0.1  # std of the noise on training actions; 1: half of their range
+    policy_noise: float = 0.2  # std of the noise on the target's actions; 1: half of their range
+    noise_clip: float = 0.5  # largest noise on the target's actions; 1: half of their range
 
 
 def make_env(env_id, **kwargs):

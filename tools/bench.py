@@ -7,10 +7,10 @@
     python tools/bench.py --against-sbx ../sbx/bin/python
 
 Every program is a process with one thread on one core (the last; `taskset` chooses another). It has
-its defaults, but neither tests its policy nor saves. Whenever it logs losses to TensorBoard (every
-100 steps; PPO: after every rollout) it reports the time and waits for its next turn. So each
-program starts once, reports three times to warm up, and then runs in blocks of --seconds, of which
---pairs are measured. A speed is the median of its blocks.
+its defaults, but SAC and TD3 learn from step 1,000 on, and none tests its policy or saves. Whenever
+it logs losses to TensorBoard (every 100 steps; PPO: after every rollout) it reports the time and
+waits for its next turn. So each program starts once, reports three times to warm up, and then runs
+in blocks of --seconds, of which --pairs are measured. A speed is the median of its blocks.
 
 "core %" is the share of the core that the process got; below 97 the machine was busy.
 With --clock cpu only time on the core counts, which depends less on other processes.

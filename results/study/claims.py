@@ -140,7 +140,7 @@ def robustness():
         text = found["difference [95 %]"].replace(" [", " points [")
         effect = float(text.split()[0]), float(found["Holm"])
         claim = f"PPO robust by {noise}, {strength}"
-        rows.append(row(claim, "robust", "conjecture", text, [effect], "30 + 30"))
+        rows.append(row(claim, "robust", "conjecture", text, [effect], "robustness: 30 + 30"))
     return rows
 
 
