@@ -14,6 +14,7 @@ https://arxiv.org/abs/2305.02882; IQM and probability of improvement are those o
 (2021), https://arxiv.org/abs/2108.13264.
 """
 
+import os
 import shutil
 import sys
 import textwrap
@@ -25,7 +26,7 @@ import tyro
 
 from analysis.errors import fail, take_over_terminal
 from analysis.figures import figures, write_figure
-from analysis.folders import is_run
+from analysis.folders import is_phase, is_run
 from analysis.formatting import WHOLE_WORDS, text_table, write_table
 from analysis.paper import read_paper
 from analysis.report import Results, write_report
@@ -57,7 +58,8 @@ class Args:
 def no_finished_run(runs_dir):
     """End with an error that says where there are finished runs, if that is below `runs_dir`."""
     paths = [*runs_dir.glob("*/*/result.json"), *runs_dir.glob("*/*/*/result.json")]
-    folders = sorted({str(path.parent.parent) for path in paths if is_run(path.parent)})
+    parents = {path.parent.parent for path in paths if is_run(path.parent)}
+    folders = sorted({str(folder.parent if is_phase(folder) else folder) for folder in parents})
     where = f"; there are some in {', '.join(folders)}: name it with --runs-dir" if folders else ""
     fail(f"no finished run in {runs_dir}{where}")
 
@@ -192,10 +194,15 @@ def main(args):
     Return the exit status: 1 where a run's files are damaged.
     """
     paths = {name: getattr(args, name) for name in ("runs_dir", "out", "compare")}
-    args = replace(args, **{name: path and path.expanduser() for name, path in paths.items()})
+    args = replace(
+        args, **{name: path and Path(os.path.expanduser(path)) for name, path in paths.items()}
+    )
     args = replace(args, metric=args.metric.replace("_", " "))
     if not args.runs_dir.is_dir():
         fail(f"no folder {args.runs_dir}")
+    if is_phase(args.runs_dir.resolve()):  # alone it would be corrected for too few comparisons
+        whole = f"--runs-dir {args.runs_dir.resolve().parent}"
+        fail(f"{args.runs_dir} is one phase of a choice: analyse all of it with {whole}")
     try:
         paper = read_paper(args.compare) if args.compare else None
         choice = read_choice(args.runs_dir, args.metric)

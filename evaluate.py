@@ -128,7 +128,7 @@ def find_runs(paths):
     if not paths:
         fail("name the runs to test, for example: python evaluate.py runs/*Hopper-v5*")
     named = {}
-    for path in map(Path.expanduser, paths):
+    for path in map(Path, map(os.path.expanduser, paths)):
         found = [path] if folders.is_run(path) else folders.runs_of(path)
         if not os.path.lexists(path) or (len(paths) == 1 and not found):
             fail(f"{path} is neither a run nor a folder of runs")
@@ -469,7 +469,7 @@ def main(args):
     if not any(here.is_relative_to(run.runs_dir) for run in runs):
         sys.path.append(str(here))
     if args.video:
-        args.video = args.video.expanduser()
+        args.video = Path(os.path.expanduser(args.video))
         if len({run.folder.name for run in runs}) < len(runs):
             fail("--video: two of these runs have the same name, and so would their videos")
         draw_without_display()

@@ -209,14 +209,14 @@ def ablation_figure(study, summary, noises, has_baseline):
     for ax, env in zip(axes, environments, strict=True):
         if has_baseline:
             baseline = finals.reindex([(env, BASELINE.noise, BASELINE.noise_rate)])
-            bars(ax, [-1], baseline, 0.6, color="white", label=labels[""])
+            bars(ax, [-1], baseline, 0.6, color="white")
             ax.axhline(baseline["mean"].iloc[0], color="black", linewidth=0.6, linestyle=":")
         ax.axhline(0, color="black", linewidth=0.6)
         for i, noise in enumerate(noises):
             rows = finals.reindex([(env, noise, rate) for rate in rates])
             place = np.arange(len(rates)) + width * (i - (len(noises) - 1) / 2)
             color = style.line_style(i + 1, 1 + len(noises))["color"]
-            bars(ax, place, rows, width, color=color, label=labels[noise])
+            bars(ax, place, rows, width, color=color)
         marks = ({-1: "none"} if has_baseline else {}) | dict(enumerate(rates))
         ax.set_xticks(list(marks), marks.values())
     add_legend()
@@ -226,7 +226,8 @@ def ablation_figure(study, summary, noises, has_baseline):
 def bars(ax, place, rows, width, **look):
     """Draw bars of the means with whiskers of one standard deviation."""
     whiskers = {"yerr": rows["std"].fillna(0), "capsize": 2, "error_kw": {"elinewidth": 0.8}}
-    ax.bar(place, rows["mean"], width, edgecolor="black", linewidth=0.6, **whiskers, **look)
+    look |= {"edgecolor": "black", "linewidth": 0.6, "label": "bars"}  # labelled: for the legend
+    ax.bar(place, rows["mean"], width, **whiskers, **look)
 
 
 def robustness_figures(table, metric="return"):

@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
+from analysis.errors import fail
 from noisy_wrappers import MAY_DIFFER_IN_A_TABLE, Configuration
 
 ALGORITHMS = ("SAC", "TD3", "PPO")
@@ -37,20 +38,35 @@ def is_run(folder):
         return True
     try:
         return '"args"' in (folder / "config.json").read_text("utf-8", "replace")
+    except PermissionError:
+        return "__" in folder.name  # as in the names of runs
     except OSError:
         return False
 
 
 def has_begun(folder):
-    """Tell whether a run has written more than its lock."""
-    return any(os.path.exists(folder / name) for name in ("config.json", "eval.csv"))
+    """Tell whether a run has written more than its lock; who cannot look will be told so."""
+    begun = any(os.path.exists(folder / name) for name in ("config.json", "eval.csv"))
+    return begun or (os.path.isdir(folder) and not os.access(folder, os.X_OK))
+
+
+def is_phase(folder):
+    """Tell whether a folder is one of the two of a choice."""
+    other = dict(zip(PHASES, PHASES[::-1], strict=True)).get(folder.name)
+    return other is not None and os.path.isdir(folder.parent / other)
 
 
 def runs_of(runs_dir):
-    """Return the run folders of a folder of runs, those of a choice's two phases included."""
+    """Return the run folders of a folder of runs, those of a choice's two phases included.
+
+    Folders whose names begin with a dot are left out. Exits if a folder cannot be read.
+    """
     folders = [runs_dir, *(runs_dir / phase for phase in PHASES)]
-    children = [child for folder in folders if os.path.isdir(folder) for child in folder.iterdir()]
-    return sorted(filter(is_run, children))
+    try:
+        found = [child for folder in folders if os.path.isdir(folder) for child in folder.iterdir()]
+    except OSError as error:
+        fail(f"{error.filename}: {error.strerror}")
+    return sorted(child for child in found if not child.name.startswith(".") and is_run(child))
 
 
 def logged(runs_dir):
@@ -156,8 +172,9 @@ def read_result(folder, config):
         return None
     result = read_json(folder / "result.json")
     mean = result.get("final_return_mean")
-    if type(mean) not in (int, float) or not math.isfinite(mean):
-        raise DamageError(f"result.json: final_return_mean is {shortened(mean)}")
+    with naming(folder / "result.json"):  # an integer may be too large
+        if type(mean) not in (int, float) or not math.isfinite(mean):
+            raise DamageError(f"result.json: final_return_mean is {shortened(mean)}")
     steps = result.get("total_timesteps", config["total"])
     if steps != config["total"]:
         said = f"total_timesteps is {shortened(steps)}, in config.json {config['total']}"
@@ -231,12 +248,13 @@ class Log(NamedTuple):
 def read_log(folder):
     """Read the end of the log that a sweep keeps of a run."""
     path = folder.parent / "logs" / f"{folder.name}.log"
-    if not os.path.isfile(path):
+    try:
+        with open(path, "rb") as file:
+            status = os.fstat(file.fileno())
+            file.seek(max(0, status.st_size - 8192))
+            lines = file.read().decode(errors="replace").splitlines()
+    except OSError:  # there is none, or it is somebody else's
         return Log(path, math.inf, 0, 0, None, "")
-    with open(path, "rb") as file:
-        status = os.fstat(file.fileno())
-        file.seek(max(0, status.st_size - 8192))
-        lines = file.read().decode(errors="replace").splitlines()
     end = END.fullmatch(lines[-1]) if lines else None
     steps = [found.groups() for found in map(PROGRESS.match, lines) if found]
     step, steps_per_second = map(int, steps[-1]) if steps else (0, 0)

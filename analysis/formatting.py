@@ -194,7 +194,8 @@ def write_table(out, table, latex=False):
     (out / f"{table.name}.md").write_text(f"{table.caption}\n\n{markdown}\n{note}", "utf-8")
     lines = tabulate(text.values, text.columns, tablefmt="latex_longtable", disable_numparse=True)
     caption, note = (re.sub(r"([%&_#$])", r"\\\1", text) for text in (table.caption, note))
-    lines = lines.replace("{}", f"{{{len(text.columns) * 'l'}}}", 1)  # if it has no rows
+    columns = len(text.columns) * "l"
+    lines = lines.replace("{longtable}{}", f"{{longtable}}{{{columns}}}", 1)  # if it has no rows
     lines = lines.replace("\n", f"\n\\caption{{{caption}}}\\\\\n", 1)
     lines = f"{lines}\n{note}"
     for sign, command in (("\u00b1", r"$\pm$"), ("\u2013", "--"), (" < ", " $<$ ")):

@@ -119,8 +119,11 @@ def read_runs(runs_dir):
     runs = pd.DataFrame(rows, columns=RUN_COLUMNS, dtype=object)
     leave_out_different(runs)
     set_older_versions_apart(runs)
-    twice = (runs["status"] == "finished") & runs.duplicated(["status", *KEYS, "seed"])
-    runs.loc[twice, ["status", "reason"]] = ["duplicate", "same configuration and seed as another"]
+    finished = runs[runs["status"] == "finished"]
+    counted = finished.groupby([*KEYS, "seed"])["run"].transform("first")
+    copies = counted[counted != finished["run"]]
+    runs.loc[copies.index, "status"] = "duplicate"
+    runs.loc[copies.index, "reason"] = "same configuration and seed as " + copies + ", which counts"
     return runs
 
 
@@ -197,7 +200,8 @@ def read_choice(runs_dir, metric="return"):
     if not any((path.parent / phase).exists() for phase in PHASES):
         raise ValueError(folders.flat_choice(path.parent))
     text = dict.fromkeys(("round", "noise", "noise_rate", "survives"), str)
-    choice = pd.read_csv(path, dtype=text, keep_default_na=False)
+    with folders.naming(path):
+        choice = pd.read_csv(path, dtype=text, keep_default_na=False)
     if list(choice.columns) != CHOICE_COLUMNS:
         raise ValueError(f"{path} does not have the columns {','.join(CHOICE_COLUMNS)}")
     pairs = zip(choice["noise"], choice["noise_rate"], strict=True)

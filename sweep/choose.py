@@ -330,6 +330,8 @@ def obstacle(choice, choices):
     text = f"{describe(choice)}."
     if failed:
         text += " These did not finish; run the same command again to retry them."
+    if failed and not choice.returns:  # then it is not the noise
+        return text + f"\n  If none ever finishes, leave {choice.name} out: see --algos and --envs"
     for noise in dict.fromkeys(noise for noise, _ in failed if noise != BASELINE):
         excluded = "+".join(f"{name}@{rate}" for name, rate in zip(*noise.texts, strict=True))
         text += f'\n  If it fails every time, leave it out: --exclude "{excluded}"'

@@ -217,10 +217,10 @@ def time_left(batches, jobs, elsewhere=False):
     if jobs:
         clock = 0
         for batch in batches:
-            ends = [0.0] * jobs
+            ends = [0.0] * min(jobs, len(batch))
             for seconds in batch:
                 heapq.heapreplace(ends, ends[0] + seconds)  # where the next place is free
-            clock += max(ends)
+            clock += max(ends, default=0)
         runs = "1 run" if jobs == 1 else f"{jobs} runs"
         text += f", {hours_of(clock)} hours on the clock with {runs} at a time"
     if elsewhere:

@@ -188,6 +188,9 @@ def result(run):
         read_result(run.folder, config)
     except DamageError as error:
         return False, f"{run.folder}/{error}; move its folder away to run it again"
+    if config["environment"] != run.kind[1]:  # names of folders have one sign for some others
+        where = config["environment"]
+        fail(f"{run.folder} holds a finished run in {where}; choose another --runs-dir")
     steps, made = config["total"], config["args"]
     if steps != run.total_timesteps:
         fail(f"{run.folder} holds a finished run of {steps} steps; choose another --runs-dir")

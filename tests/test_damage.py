@@ -1,8 +1,11 @@
 """Damaged and hostile folders of runs: each kind, fed to everything that reads folders of runs."""
 
 import json
+import os
 import re
 import shutil
+import subprocess
+import sys
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
@@ -51,6 +54,10 @@ DAMAGE = {  # of config.json and result.json, and what is said of it
     "no versions": (
         text("config.json", lambda text: json.dumps(json.loads(text) | {"versions": None})),
         "versions is None",
+    ),
+    "a return of 400 digits": (
+        text("result.json", lambda _: '{"final_return_mean": ' + 400 * "9" + "}"),
+        "result.json: ",
     ),
     "a seed of 1.7": (config(seed=1.7), "seed is 1.7"),
     "a seed that is true": (config(seed=True), "seed is True"),
@@ -182,3 +189,60 @@ def test_a_noise_of_a_test_that_does_not_exist_is_a_note(case, capsys):
         (case.bad[1] / "robustness.csv").write_text(f'{header}"{noise}",0.5,0,1.0,1\n')
         assert analyze.main(analyze.Args(case.runs, case.runs.parent / "out")) == 0
         assert f"{case.bad[1].name}: robustness.csv is left out: " in capsys.readouterr().out
+
+
+def test_of_two_equal_runs_one_counts_and_is_named(case, capsys):
+    """A hidden folder is none."""
+    for name in ("z copy", ".hidden__copy"):
+        shutil.copytree(case.bad[1], case.runs / name)
+    assert analyze.main(analyze.Args(case.runs, case.runs.parent / "out")) == 0
+    assert "Finished runs: 4." in capsys.readouterr().out
+    missing = (case.runs.parent / "out/missing.csv").read_text()
+    assert f'z copy,"same configuration and seed as {case.bad[1].name}, which counts"' in missing
+    assert "hidden" not in missing
+
+
+def test_one_phase_of_a_choice_is_not_analysed_alone(case, tmp_path, capsys):
+    """There fewer comparisons would be corrected for."""
+    shutil.copytree(case.choice / "search", case.choice / "confirmation")
+    with pytest.raises(SystemExit) as end:
+        analyze.main(analyze.Args(case.choice / "confirmation"))
+    assert end.value.code == 2
+    assert f"all of it with --runs-dir {case.choice}\n" in capsys.readouterr().err
+    shutil.rmtree(case.runs)
+    with pytest.raises(SystemExit):
+        analyze.main(analyze.Args(tmp_path))
+    assert f"there are some in {case.choice}: name it" in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_entered_hides_no_run(case):
+    """A process without root's rights must be told of it."""
+    case.bad[1].chmod(0)
+    words = [sys.executable, ROOT / "analyze.py", "--runs-dir", case.runs]
+    if not os.geteuid():
+        rights = "-dac_override,-dac_read_search"
+        words = ["setpriv", f"--bounding-set={rights}", f"--inh-caps={rights}", *words]
+    shown = subprocess.run(words, capture_output=True, text=True)
+    case.bad[1].chmod(0o755)
+    assert shown.returncode == 1, shown.stderr
+    assert "Finished runs: 3." in shown.stdout and "(1 corrupt" in shown.stdout
+    missing = (case.runs / "results/missing.csv").read_text()
+    assert case.bad[1].name in missing and "config.json: Permission denied" in missing
+
+
+def test_the_home_of_nobody_is_no_folder(capsys):
+    path = Path("~no.such.user")
+    for program in (
+        lambda: analyze.main(analyze.Args(path)),
+        lambda: evaluate.main(evaluate.Args((path,))),
+    ):
+        with pytest.raises(SystemExit) as end:
+            program()
+        assert end.value.code == 2 and f"{path}" in capsys.readouterr().err
+
+
+def test_an_empty_choice_file_is_named(case, capsys):
+    (case.choice / "choice.csv").touch()
+    with pytest.raises(SystemExit) as end:
+        analyze.main(analyze.Args(case.choice))
+    assert end.value.code == 2 and "error: choice.csv: " in capsys.readouterr().err

@@ -988,6 +988,15 @@ def test_ablation_bars_stand_side_by_side(tmp_path):
     assert legend == ["no noise (n = 2)", f"{SCALE} (n = 2)", f"{other} (n = 2)"]
 
 
+def test_ablation_bars_of_a_module_with_an_underscore_have_a_legend(tmp_path):
+    noises = ["_mine:Foo(1)", "_mine:Foo(2)"]
+    for noise, seed in product(noises, (1, 2)):
+        write_run(tmp_path, [10 * seed], seed=seed, noise=noise, rate=0.5)
+    figure = drawn_of(tmp_path)["parameters_SAC__mine_Foo"].draw()
+    legend = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert legend == [f"{noise} (n = 2)" for noise in noises]
+
+
 def test_ablation_bars_of_a_search_show_no_baseline(tmp_path):
     other = "RandomUniformScaleReward(0.8, 1.2)"
     for noise, seed in product((SCALE, other), (1, 2)):

@@ -510,6 +510,18 @@ def test_a_damaged_run_is_not_to_be_retried_or_excluded(tmp_path, capsys):
     assert line.endswith("runs to do: 1.")
 
 
+def test_where_nothing_finishes_no_noise_is_to_be_excluded(tmp_path, capsys):
+    args = arguments(f"--algos | ppo | --envs | Pendulum-v1 | {THREE}", tmp_path)
+    [choice] = choose.choices(args)
+    capsys.readouterr()
+    choose.report([choice], args)
+    out = capsys.readouterr().out
+    assert "leave PPO on Pendulum-v1 out: see --algos and --envs" in out and "--exclude" not in out
+    stub_run.train(choice.runs[choice.state.due[0]].command)
+    choose.report(choose.choices(args), args)
+    assert capsys.readouterr().out.count("--exclude") == 3
+
+
 def test_an_excluded_noise_is_no_other_choice(tmp_path):
     words = "--algos | ppo | --envs | Pendulum-v1"
     [choice] = choose.choices(arguments(words, tmp_path))

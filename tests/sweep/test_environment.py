@@ -258,6 +258,7 @@ def test_time_left():
     assert time_left([[400.0]], None, elsewhere=True) == (
         "about 0.1 core-hours are left; timed on this machine, others may be faster or slower"
     )
+    assert "1.0 hours on the clock" in time_left([[3600.0] * 5], 10**14)
     assert time_left([[3600.0 * 1330]], 1).startswith("about 1,330 core-hours are left, 1,330 h")
 
 

@@ -132,7 +132,7 @@ def test_a_folder_without_a_name_is_refused():
 def test_a_report_quotes_the_folder(tmp_path):
     grid = ["baseline", *GRID, "--total-timesteps", "1000", "--runs-dir", tmp_path / "a b"]
     [folder] = folders(*grid)
-    finish(folder)
+    finish(folder, env_id="Pendulum-v1")
     assert f"analyze.py --runs-dir '{tmp_path}/a b'\n" in view("report", *grid).out
 
 
@@ -252,10 +252,20 @@ def test_a_finished_run_of_another_length_is_not_taken_for_done(tmp_path):
     grid = ["baseline", *GRID]
     grid += ["--total-timesteps", "1000", "--runs-dir", tmp_path]
     [folder] = folders(*grid)
-    finish(folder, steps=20)
+    finish(folder, steps=20, env_id="Pendulum-v1")
     result = view("list", *grid)
     assert result.code == 2 and "holds a finished run of 20 steps" in result.err
     assert not (tmp_path / "logs").exists()
+
+
+def test_a_finished_run_in_another_environment_is_not_taken_for_done(tmp_path):
+    """The names of the two may give one name of a folder."""
+    grid = ["baseline", *GRID, "--total-timesteps", "1000", "--runs-dir", tmp_path]
+    [folder] = folders(*grid)
+    finish(folder, env_id="Pendulum/v1")
+    shown = view("list", *grid)
+    assert (shown.code, shown.out) == (2, "")
+    assert f"{folder} holds a finished run in Pendulum/v1; choose another" in shown.err
 
 
 def test_a_finished_run_with_other_options_is_not_taken_for_done(tmp_path):
@@ -286,7 +296,7 @@ def test_a_finished_run_with_other_options_is_not_taken_for_done(tmp_path):
 def test_misspelt_options_are_refused_where_nothing_is_to_do(tmp_path):
     grid = ["baseline", *GRID, "--total-timesteps", "1000", "--runs-dir", tmp_path]
     [folder] = folders(*grid)
-    finish(folder)
+    finish(folder, env_id="Pendulum-v1")
     assert "1 runs, 0 to do" in view("list", *grid).err
     for words, message in {
         "--gama 0.99": "sac_continuous_noisy.py has no option --gama; did you mean --gamma?",
