@@ -43,8 +43,8 @@ Options of choose
                            rates 0.05 and 1.0, 105 runs if all can act (see docs/sweeps.md). Both confirm
                            a true gain of 1.5 standard deviations in 9 of 10 cases
   --exclude "NOISE@RATE"   noises to leave out, for example because they always fail
-  --budget N               about how many runs the search may take (default: 3 for each noise); it
-                           takes about two for each noise even if N, at least one for each, is less
+  --budget N               about how many runs the search may take (default: 3 for each noise, at
+                           least 1); even with the least it takes about two for each noise
   --confirm N              fresh seeds for the final comparison (default: 25)
   --metric success_rate    choose by the rate of success (default: return), where the info of an
                            episode's last step has is_success or success

@@ -52,8 +52,7 @@ def has_begun(folder):
 
 def is_phase(folder):
     """Tell whether a folder is one of the two of a choice."""
-    other = dict(zip(PHASES, PHASES[::-1], strict=True)).get(folder.name)
-    return other is not None and os.path.isdir(folder.parent / other)
+    return folder.name in PHASES and all(os.path.isdir(folder.parent / name) for name in PHASES)
 
 
 def runs_of(runs_dir):
