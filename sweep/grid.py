@@ -188,7 +188,7 @@ def result(run):
         read_result(run.folder, config)
     except DamageError as error:
         return False, f"{run.folder}/{error}; move its folder away to run it again"
-    if config["environment"] != run.kind[1]:  # names of folders have one sign for some others
+    if config["environment"] != run.kind[1]:  # two may give one folder name
         where = config["environment"]
         fail(f"{run.folder} holds a finished run in {where}; choose another --runs-dir")
     steps, made = config["total"], config["args"]

@@ -13,7 +13,6 @@ import fnmatch
 import json
 import os
 import random
-import signal
 import subprocess
 import sys
 import time
@@ -21,11 +20,10 @@ from pathlib import Path
 from statistics import fmean
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
-from noisy_wrappers import run_name  # noqa: E402
+from noisy_wrappers import run_name, stop_at_signals  # noqa: E402
 
 EPISODES = 10  # the scripts' default
 STEPS, SECONDS = 4000, 0.04
-STOPPED = []  # the signals that have come
 
 
 def episodes_of(algorithm, env_id, noise, rates, seed):
@@ -43,12 +41,9 @@ def tests_of(*run):
     return [fmean(episodes) for episodes in episodes_of(*run)]
 
 
-def stop(number, frame):
-    """Ask for a checkpoint; a second signal, not at once, ends the run, as in the scripts."""
-    if not STOPPED:
-        STOPPED.extend([number, time.monotonic()])
-    elif number == signal.SIGINT or time.monotonic() - STOPPED[1] > 1:
-        os._exit(128 + number)
+def stop():
+    """Return the number of the signal that has come: none in the process of a test."""
+    return 0
 
 
 def pretend_to_train(total_timesteps, checkpoint):
@@ -60,14 +55,14 @@ def pretend_to_train(total_timesteps, checkpoint):
         step = min(step + STEPS, total_timesteps)
         time.sleep(SECONDS)
         print(f"step={step}/{total_timesteps} sps=100", flush=True)
-        if STOPPED:
+        if stop():
             time.sleep(0.2)  # for a second signal, which should not come
-        if STOPPED or step - saved >= total_timesteps / 10:
+        if stop() or step - saved >= total_timesteps / 10:
             checkpoint.with_suffix(".tmp").write_text(str(step))
             checkpoint.with_suffix(".tmp").rename(checkpoint)
             saved = step
-        if STOPPED:
-            sys.exit(128 + STOPPED[0])
+        if stop():
+            sys.exit(128 + stop())
     checkpoint.unlink(missing_ok=True)
 
 
@@ -117,6 +112,5 @@ def train(argv):
 
 
 if __name__ == "__main__":
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, stop)
+    stop = stop_at_signals()
     train(sys.argv[1:])

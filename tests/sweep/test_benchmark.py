@@ -282,29 +282,30 @@ def test_a_failing_and_a_killed_run(engine, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", [*ENGINES, SSH], indirect=True)
 def test_ctrl_c(engine, tmp_path):
-    executor, env = engine
-    grid = [*GRID, *FOREVER, "--runs-dir", tmp_path]
-    runs = folders(*grid)
-    sweep = start(*grid, *executor, env=env)
-    wait_for(lambda: sum(map(is_training, runs)) == 2, what="two runs at a time")
-    sweep.send_signal(signal.SIGINT)
-    out, err = sweep.communicate(timeout=PATIENCE)
-    assert sweep.returncode == 130, err
-    check_stopped(runs, out)
+    check_stop(engine, tmp_path, lambda sweep: sweep.send_signal(signal.SIGINT), 130)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["local", "slurm"], indirect=True)
 def test_sigterm_to_all_processes(engine, tmp_path):
     """As when a service stops. A run gets it twice, because benchmark.sh passes it on."""
+
+    def stop(sweep):
+        subprocess.run(["pkill", "-TERM", "--session", str(sweep.pid)], check=True)
+
+    check_stop(engine, tmp_path, stop, 143, prefix=["setsid"])
+
+
+def check_stop(engine, tmp_path, stop, exit_status, prefix=()):
+    """Start a sweep of three runs, two at a time, and stop it when both are training."""
     executor, env = engine
     grid = [*GRID, *FOREVER, "--runs-dir", tmp_path]
     runs = folders(*grid)
-    sweep = start(*grid, *executor, env=env, prefix=["setsid"])
+    sweep = start(*grid, *executor, env=env, prefix=prefix)
     wait_for(lambda: sum(map(is_training, runs)) == 2, what="two runs at a time")
-    subprocess.run(["pkill", "-TERM", "--session", str(sweep.pid)], check=True)
+    stop(sweep)
     out, err = sweep.communicate(timeout=PATIENCE)
-    assert sweep.returncode == 143, err
+    assert sweep.returncode == exit_status, err
     check_stopped(runs, out)
 
 
