@@ -78,12 +78,14 @@ def time_steps(env, time_limit, deadline, whole=False):
 
     Each step bears its share of a reset: an episode is as long as those that ended while it was
     timed, or as the time limit if none did. whole: an episode is played to its end, if that takes
-    no more than half of the time until the deadline.
+    no more than half of the time until the deadline. Time in which this
+    process waited for a core does not count.
     """
     env.action_space.seed(1)
     env.reset(seed=1)
     env.step(env.action_space.sample())  # not timed: the first calls may load or compile something
-    begin = now = time.perf_counter()
+    waited_before, begin = waited(), time.perf_counter()
+    now = begin
     half = (begin + deadline) / 2
     steps, resets, ends = [], [], []  # the seconds of each, and after which steps episodes ended
     ended = True
@@ -103,7 +105,17 @@ def time_steps(env, time_limit, deadline, whole=False):
         if ended := terminated or truncated:
             ends.append(len(steps))
     length = ends[-1] / len(ends) if ends else time_limit
-    return fmean(steps) + fmean(resets) / length, len(steps), math.ceil(length)
+    own_share = 1 - (waited() - waited_before) / (time.perf_counter() - begin)
+    seconds = (fmean(steps) + fmean(resets) / length) * own_share
+    return seconds, len(steps), math.ceil(length)
+
+
+def waited():
+    """Return how many seconds this process has waited for a core; 0 if the system does not say."""
+    try:
+        return int(Path("/proc/self/schedstat").read_text().split()[1]) / 1e9
+    except (OSError, IndexError, ValueError):
+        return 0
 
 
 def why_unfit(env, configuration, time_limit, deadline):

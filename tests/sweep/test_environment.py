@@ -63,6 +63,12 @@ def test_an_environment_that_sleeps():
     assert ask("toy_envs:Slow-v0", max_episode_steps=7).episode_steps == 7
 
 
+def test_time_in_which_others_have_the_core_does_not_count(monkeypatch):
+    assert (environment.waited() > 0) == Path("/proc/self/schedstat").exists()
+    monkeypatch.setattr(environment, "waited", lambda: 0.999 * time.perf_counter())
+    assert ask("toy_envs:Slow-v0").step_seconds < 0.005  # it sleeps longer
+
+
 def test_an_environment_that_is_too_slow_is_timed_by_fewer_steps(monkeypatch, tmp_path):
     monkeypatch.setattr(environment, "PATIENCE", 0.1)
     shown = choose("Slow", "--runs-dir", tmp_path)
