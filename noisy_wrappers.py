@@ -811,8 +811,8 @@ class RandomDynamics(NoiseWrapper):
     turn, drawn for the other episodes too. Fields have MuJoCo's own names, as ``dof_damping``;
     ``body_mass`` takes ``body_inertia`` along, with the same factors. What MuJoCo derives from
     these values is derived anew. All is undone at the next ``reset()``: other episodes are those of
-    the bare environment. ``info["dynamics"]`` of a chosen episode's reset has the factors,
-    {field: array}.
+    the bare environment. Rows that the environment's own ``reset()`` sets are left as it sets them.
+    ``info["dynamics"]`` of a chosen episode's reset has the factors, {field: array}.
 
     The model is found in environments of Gymnasium, Gymnasium-Robotics and dm_control (with
     shimmy). ``times_applied`` counts episodes. Tobin et al., "Domain Randomization", 2017; Peng et
@@ -871,11 +871,8 @@ class RandomDynamics(NoiseWrapper):
             if any(len(factors[name]) != len(getattr(now, name)) for name in self.fields):
                 factors = self._draw(now)
             self._scale(now, factors)
-        elif own := [name for name in scaled if (getattr(model, name) != scaled[name]).any()]:
-            raise ValueError(
-                f"fields: this environment's reset() sets {own[0]} itself, so that no factor of "
-                "RandomDynamics is left"
-            )
+        else:
+            self._keep_own(model, scaled, factors)
         return observation, {**self.mark(info), "dynamics": factors}
 
     def step(self, action: Any) -> Step:
@@ -923,6 +920,25 @@ class RandomDynamics(NoiseWrapper):
         mujoco.mj_setConst(*self._scratch)
         for name in ("meansize", "extent", "center"):  # of the picture, as the model's file says
             setattr(model.stat, name, statistics[name])
+
+    def _keep_own(
+        self, model: Any, scaled: dict[str, NDArray[Any]], factors: dict[str, NDArray[Any]]
+    ) -> None:
+        """Keep the rows that the environment's reset() has set, and make their factors 1."""
+        found = {field: getattr(model, field).copy() for field in scaled}
+        if all((found[field] == scaled[field]).all() for field in found):
+            return
+        self._restore()
+        for field, values in found.items():
+            rows = (values != scaled[field]).reshape(len(values), -1).any(axis=1)
+            array = getattr(model, field)
+            if not array[~rows].any():
+                raise SpaceError(
+                    f"fields: this environment's reset() sets all {field} itself, so that no "
+                    "factor of RandomDynamics is left: name other fields"
+                )
+            array[rows], factors[field][rows] = values[rows], 1
+        self._scale(model, factors)
 
     def _restore(self) -> None:
         if changed := getattr(self.unwrapped, "_unscaled_model", None):
@@ -1712,7 +1728,10 @@ class NotFiniteError(FloatingPointError):
 
 
 class SpaceError(ValueError):
-    """Observations or actions that are not vectors of numbers, or not what the API asks for."""
+    """Observations or actions that are not vectors of numbers, or not what the API asks for.
+
+    RandomDynamics raises it, too, where the environment leaves it nothing to scale.
+    """
 
 
 class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -1880,6 +1899,24 @@ def remarks(env_id: str, env: Env, step_limit: int) -> list[str]:
     if _layers(env, gym.wrappers.NormalizeObservation | gym.wrappers.NormalizeReward):
         found.append(f"{env_id} normalizes with statistics of its own, which tests do not share")
     return found
+
+
+def remark_on_bounds(env_id: str, space: gym.spaces.Box) -> str:
+    """Return a remark if N(0, 1), as PPO's first actions are, reaches little of an action's range.
+
+    That is: from -2 to 2, less than a tenth of the bounded range of any dimension.
+
+    >>> remark_on_bounds("Heater-v0", gym.spaces.Box(15, 30))  # doctest: +ELLIPSIS
+    "Heater-v0: PPO's first actions are about N(0, 1), clipped to bounds that are far from ..."
+    """
+    low, high = space.low.astype(float), space.high.astype(float)
+    reached = np.clip(2, low, high) - np.clip(-2, low, high)
+    if not (np.isfinite(high - low) & (reached < (high - low) / 10)).any():
+        return ""
+    return (
+        f"{env_id}: PPO's first actions are about N(0, 1), clipped to bounds that are far from "
+        "[-1, 1]; wrap it in gymnasium.wrappers.RescaleAction(env, -1, 1) where it is registered"
+    )
 
 
 def canonical_env_id(env_id: str) -> str:

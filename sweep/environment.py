@@ -42,6 +42,7 @@ class Environment(NamedTuple):
     observed: int  # numbers in an observation
     bounded: bool  # are its actions? SAC and TD3 need that
     tried: dict[str, str]  # noises: why each cannot act here, or ""; by Configuration.noise
+    remark: str = ""  # on the bounds of actions, for PPO
 
 
 # ------------------------------------------------------------------------------------- the question
@@ -70,6 +71,7 @@ def ask(env_id, configurations=(), max_episode_steps=None):
                 observed=math.prod(env.observation_space.shape),
                 bounded=bool(np.isfinite([env.action_space.low, env.action_space.high]).all()),
                 tried=tried,
+                remark=noisy.remark_on_bounds(env_id, env.action_space),
             )
 
 
@@ -137,7 +139,7 @@ def why_unfit(env, configuration, time_limit, deadline):
                 if terminated or truncated:
                     break
     except Exception as error:  # the environment's own, where noise has led it
-        return with_place(error, (gym.error.Error, noisy.NotFiniteError))
+        return with_place(error, (gym.error.Error, noisy.NotFiniteError, noisy.SpaceError))
     return ""
 
 
@@ -160,6 +162,8 @@ def ask_all(args, configurations):
         if answer.timed_steps < STEPS:
             speed += f" (only {answer.timed_steps} steps were timed: it is slow)"
         print(speed, file=sys.stderr, flush=True)
+        if answer.remark and "ppo" in args.algos:
+            print(answer.remark, file=sys.stderr, flush=True)
         answers[env_id] = answer
         for algorithm in args.algos:
             if algorithm != "ppo" and not answer.bounded:

@@ -429,6 +429,16 @@ def test_what_the_environment_compiles_is_no_reason_to_start_again(algorithm, tm
     assert "starting again" not in result.out
 
 
+# ACTIONS
+
+
+def test_bounds_that_ppo_does_not_reach(tmp_path, capsys):
+    run("PPO", tmp_path / "ppo", env_id="toy_envs:Heater-v0")
+    assert capsys.readouterr().out.count("bounds that are far from [-1, 1]; wrap it in gymn") == 1
+    run("TD3", tmp_path / "td3", env_id="toy_envs:Heater-v0")
+    assert "far from" not in capsys.readouterr().out
+
+
 # NO TIME LIMIT
 
 

@@ -16,7 +16,7 @@ import stub_run
 import toy_envs
 from views import finish, view
 
-from noisy_wrappers import BASELINE, Configuration
+from noisy_wrappers import BASELINE, Configuration, remark_on_bounds
 from sweep import environment
 from sweep.environment import Environment, ask, remember, remembered, run_seconds, time_left
 from sweep.grid import make_run
@@ -151,6 +151,16 @@ def test_what_cannot_be_trained_is_refused_in_a_line(env, algos, message, tmp_pa
         assert (shown.code, shown.out) == (2, "") and line.startswith("error: ")
         assert message in line and shown.err.count("error: ") == 1
         assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("env", "said"), [("Heater", 1), ("Unbounded", 0), ("Count", 0)])
+def test_bounds_that_ppo_does_not_reach_are_remarked(env, said, tmp_path):
+    for algos, count in ((["ppo"], said), (["td3", "ppo"], said), (["td3"], 0)):
+        shown = choose(env, "--runs-dir", tmp_path, algos=algos)
+        remark = f"toy_envs:{env}-v0: PPO's first actions are about N(0, 1), clipped"
+        assert shown.err.count(remark) == count
+    env = gym.wrappers.RescaleAction(gym.make("toy_envs:Heater-v0"), -1, 1)
+    assert not remark_on_bounds("Heater-v0", env.action_space)
 
 
 def test_everything_that_is_wrong_is_said_at_once():
