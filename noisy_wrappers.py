@@ -863,7 +863,7 @@ class RandomDynamics(NoiseWrapper):
         if not self._chosen:
             return self.env.reset(seed=seed, options=options)
         self._scale(model, factors)  # before the environment's own reset, which needs it
-        scaled = {field: getattr(model, field).copy() for field in self.fields}
+        scaled = {name: getattr(model, name).copy() for name in (*self.fields, "body_inertia")}
         observation, info = self.env.reset(seed=seed, options=options)
         now = self._model()
         if now is not model:  # the environment has built or taken another one
@@ -925,20 +925,19 @@ class RandomDynamics(NoiseWrapper):
         self, model: Any, scaled: dict[str, NDArray[Any]], factors: dict[str, NDArray[Any]]
     ) -> None:
         """Keep the rows that the environment's reset() has set, and make their factors 1."""
-        found = {field: getattr(model, field).copy() for field in scaled}
-        if all((found[field] == scaled[field]).all() for field in found):
-            return
-        self._restore()
-        for field, values in found.items():
-            rows = (values != scaled[field]).reshape(len(values), -1).any(axis=1)
+        _, nominal, _ = self.unwrapped._unscaled_model
+        for field in self.fields:
             array = getattr(model, field)
-            if not array[~rows].any():
+            own = (array != scaled[field]).reshape(len(array), -1).any(axis=1)
+            if not nominal[field][~own].any():
                 raise SpaceError(
                     f"fields: this environment's reset() sets all {field} itself, so that no "
                     "factor of RandomDynamics is left: name other fields"
                 )
-            array[rows], factors[field][rows] = values[rows], 1
-        self._scale(model, factors)
+            nominal[field][own], factors[field][own] = array[own], 1
+            if field == "body_mass":  # with which the inertia was scaled
+                own &= (model.body_inertia == scaled["body_inertia"]).all(axis=1)
+                model.body_inertia[own] = nominal["body_inertia"][own]
 
     def _restore(self) -> None:
         if changed := getattr(self.unwrapped, "_unscaled_model", None):

@@ -80,8 +80,8 @@ def time_steps(env, time_limit, deadline, whole=False):
 
     Each step bears its share of a reset: an episode is as long as those that ended while it was
     timed, or as the time limit if none did. whole: an episode is played to its end, if that takes
-    no more than half of the time until the deadline. Time in which this
-    process waited for a core does not count.
+    no more than half of the time until the deadline. Time in which this process waited for a core
+    does not count.
     """
     env.action_space.seed(1)
     env.reset(seed=1)
