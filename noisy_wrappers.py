@@ -811,12 +811,12 @@ class RandomDynamics(NoiseWrapper):
     turn, drawn for the other episodes too. Fields have MuJoCo's own names, as ``dof_damping``;
     ``body_mass`` takes ``body_inertia`` along, with the same factors. What MuJoCo derives from
     these values is derived anew. All is undone at the next ``reset()``: other episodes are those of
-    the bare environment. Rows that the environment's own ``reset()`` sets are left as it sets them.
-    ``info["dynamics"]`` of a chosen episode's reset has the factors, {field: array}.
+    the bare environment. ``info["dynamics"]`` of a chosen episode's reset has the factors,
+    {field: array}. ``reset()`` raises SpaceError if the environment's own sets one of the fields.
 
-    The model is found in environments of Gymnasium, Gymnasium-Robotics and dm_control (with
-    shimmy). ``times_applied`` counts episodes. Tobin et al., "Domain Randomization", 2017; Peng et
-    al., "Sim-to-Real Transfer with Dynamics Randomization", 2018.
+    The model is found in environments of Gymnasium, Gymnasium-Robotics, MyoSuite 3 and dm_control
+    (with shimmy). ``times_applied`` counts episodes. Tobin et al., "Domain Randomization", 2017;
+    Peng et al., "Sim-to-Real Transfer with Dynamics Randomization", 2018.
 
     >>> env = RandomDynamics(gym.make("InvertedPendulum-v5"), 1.0, 0.5, 1.5)
     >>> info = env.reset(seed=0)[1]
@@ -860,20 +860,24 @@ class RandomDynamics(NoiseWrapper):
         model = self._model()
         factors = self._draw(model)
         self._chosen = self.acts() and any((values != 1).any() for values in factors.values())
-        if not self._chosen:
-            return self.env.reset(seed=seed, options=options)
-        self._scale(model, factors)  # before the environment's own reset, which needs it
-        scaled = {name: getattr(model, name).copy() for name in (*self.fields, "body_inertia")}
+        if self._chosen:
+            self._scale(model, factors)  # before the environment's own reset, which needs it
+        before = {field: getattr(model, field).copy() for field in self.fields}
         observation, info = self.env.reset(seed=seed, options=options)
         now = self._model()
-        if now is not model:  # the environment has built or taken another one
+        if now is model:
+            for field, values in before.items():
+                if (getattr(model, field) != values).any():  # no factor would be left
+                    reason = f"this environment's reset() sets {field} itself: name other fields"
+                    raise SpaceError(f"fields: {reason}")
+        elif self._chosen:  # the environment has built or taken another one
             self._restore()
             if any(len(factors[name]) != len(getattr(now, name)) for name in self.fields):
                 factors = self._draw(now)
             self._scale(now, factors)
-        else:
-            self._keep_own(model, scaled, factors)
-        return observation, {**self.mark(info), "dynamics": factors}
+        if self._chosen:
+            info = {**self.mark(info), "dynamics": factors}
+        return observation, info
 
     def step(self, action: Any) -> Step:
         """Step the environment; every step of a chosen episode is a perturbed one."""
@@ -920,24 +924,6 @@ class RandomDynamics(NoiseWrapper):
         mujoco.mj_setConst(*self._scratch)
         for name in ("meansize", "extent", "center"):  # of the picture, as the model's file says
             setattr(model.stat, name, statistics[name])
-
-    def _keep_own(
-        self, model: Any, scaled: dict[str, NDArray[Any]], factors: dict[str, NDArray[Any]]
-    ) -> None:
-        """Keep the rows that the environment's reset() has set, and make their factors 1."""
-        _, nominal, _ = self.unwrapped._unscaled_model
-        for field in self.fields:
-            array = getattr(model, field)
-            own = (array != scaled[field]).reshape(len(array), -1).any(axis=1)
-            if not nominal[field][~own].any():
-                raise SpaceError(
-                    f"fields: this environment's reset() sets all {field} itself, so that no "
-                    "factor of RandomDynamics is left: name other fields"
-                )
-            nominal[field][own], factors[field][own] = array[own], 1
-            if field == "body_mass":  # with which the inertia was scaled
-                own &= (model.body_inertia == scaled["body_inertia"]).all(axis=1)
-                model.body_inertia[own] = nominal["body_inertia"][own]
 
     def _restore(self) -> None:
         if changed := getattr(self.unwrapped, "_unscaled_model", None):
@@ -1729,7 +1715,7 @@ class NotFiniteError(FloatingPointError):
 class SpaceError(ValueError):
     """Observations or actions that are not vectors of numbers, or not what the API asks for.
 
-    RandomDynamics raises it, too, where the environment leaves it nothing to scale.
+    RandomDynamics raises it, too, where the environment sets what is to be scaled.
     """
 
 
@@ -1901,20 +1887,21 @@ def remarks(env_id: str, env: Env, step_limit: int) -> list[str]:
 
 
 def remark_on_bounds(env_id: str, space: gym.spaces.Box) -> str:
-    """Return a remark if N(0, 1), as PPO's first actions are, reaches little of an action's range.
+    """Return a remark if N(0, 1), as PPO's first actions are, reaches little of the actions.
 
-    That is: from -2 to 2, less than a tenth of the bounded range of any dimension.
+    That is: from -2 to 2, less than a tenth of a dimension's range. Where a bound is infinite, or
+    as good as that, nothing is said.
 
     >>> remark_on_bounds("Heater-v0", gym.spaces.Box(15, 30))  # doctest: +ELLIPSIS
-    "Heater-v0: PPO's first actions are about N(0, 1), clipped to bounds that are far from ..."
+    "Heater-v0: PPO's first actions are about N(0, 1), which reaches little of these bounds; ..."
     """
     low, high = space.low.astype(float), space.high.astype(float)
     reached = np.clip(2, low, high) - np.clip(-2, low, high)
-    if not (np.isfinite(high - low) & (reached < (high - low) / 10)).any():
+    if max(abs(low).max(), abs(high).max()) > 1e6 or (reached >= (high - low) / 10).all():
         return ""
     return (
-        f"{env_id}: PPO's first actions are about N(0, 1), clipped to bounds that are far from "
-        "[-1, 1]; wrap it in gymnasium.wrappers.RescaleAction(env, -1, 1) where it is registered"
+        f"{env_id}: PPO's first actions are about N(0, 1), which reaches little of these bounds; wrap "
+        "the environment in gymnasium.wrappers.RescaleAction(env, -1, 1) where it is registered"
     )
 
 

@@ -248,13 +248,13 @@ def make_policy(agent, observation_stats, env):
 
 def learn(args, env, test_env, stop):
     """Train one agent; return False if stop(), asked whenever an episode ends, ended it early."""
-    if remark := noisy.remark_on_bounds(args.env_id, env.action_space):
-        say(remark)
     torch.set_num_threads(args.torch_threads)
     device = torch.device("cuda" if args.cuda else "cpu")
     run = Run(args, "PPO", use_matmul_precision(args.matmul_precision, device), env)
     if run.is_finished:
         return True
+    if remark := noisy.remark_on_bounds(args.env_id, env.action_space):
+        say(remark)
 
     # SETUP: torch.func differentiates the losses, so autograd need not follow the networks
     torch.manual_seed(args.seed)

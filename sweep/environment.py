@@ -86,7 +86,7 @@ def time_steps(env, time_limit, deadline, whole=False):
     env.action_space.seed(1)
     env.reset(seed=1)
     env.step(env.action_space.sample())  # not timed: the first calls may load or compile something
-    waited_before, begin = waited(), time.perf_counter()
+    begin, waited_before = time.perf_counter(), waited()
     now = begin
     half = (begin + deadline) / 2
     steps, resets, ends = [], [], []  # the seconds of each, and after which steps episodes ended
@@ -113,7 +113,7 @@ def time_steps(env, time_limit, deadline, whole=False):
 
 
 def waited():
-    """Return how many seconds this process has waited for a core; 0 if the system does not say."""
+    """Return how many seconds the main thread has waited for a core; 0 if that is not known."""
     try:
         return int(Path("/proc/self/schedstat").read_text().split()[1]) / 1e9
     except (OSError, IndexError, ValueError):

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import gymnasium as gym
+import numpy as np
 import pytest
 import stub_run
 import toy_envs
@@ -64,9 +65,13 @@ def test_an_environment_that_sleeps():
 
 
 def test_time_in_which_others_have_the_core_does_not_count(monkeypatch):
-    assert (environment.waited() > 0) == Path("/proc/self/schedstat").exists()
-    monkeypatch.setattr(environment, "waited", lambda: 0.999 * time.perf_counter())
-    assert ask("toy_envs:Slow-v0").step_seconds < 0.005  # it sleeps longer
+    with monkeypatch.context() as patch:
+        patch.setattr(environment, "waited", lambda: 0.999 * time.perf_counter())
+        assert ask("toy_envs:Slow-v0").step_seconds < 0.005  # it sleeps longer
+    for text, seconds in (("7 2500000000 9\n", 2.5), ("", 0)):
+        with monkeypatch.context() as patch:
+            patch.setattr(environment.Path, "read_text", lambda _, text=text: text)
+            assert environment.waited() == seconds
 
 
 def test_an_environment_that_is_too_slow_is_timed_by_fewer_steps(monkeypatch, tmp_path):
@@ -157,8 +162,19 @@ def test_what_cannot_be_trained_is_refused_in_a_line(env, algos, message, tmp_pa
 def test_bounds_that_ppo_does_not_reach_are_remarked(env, said, tmp_path):
     for algos, count in ((["ppo"], said), (["td3", "ppo"], said), (["td3"], 0)):
         shown = choose(env, "--runs-dir", tmp_path, algos=algos)
-        remark = f"toy_envs:{env}-v0: PPO's first actions are about N(0, 1), clipped"
+        remark = f"toy_envs:{env}-v0: PPO's first actions are about N(0, 1), which"
         assert shown.err.count(remark) == count
+
+
+def test_which_bounds_are_remarked():
+    def remark(low, high):
+        return remark_on_bounds("A-v0", gym.spaces.Box(np.array(low), np.array(high), dtype=float))
+
+    assert remark([-1.0, 15], [1, 30]) and remark([-21.0], [21]) and remark([0.0], [100])
+    assert not remark([-20.0], [20]) and not remark([0.0], [1]) and not remark([-1.0, 1], [1, 3])
+    assert not remark([-np.inf, 15], [np.inf, 30]) and not remark([15.0], [np.inf])
+    most = np.finfo(np.float32).max
+    assert not remark([-most], [most])
     env = gym.wrappers.RescaleAction(gym.make("toy_envs:Heater-v0"), -1, 1)
     assert not remark_on_bounds("Heater-v0", env.action_space)
 
