@@ -1900,8 +1900,8 @@ def remark_on_bounds(env_id: str, space: gym.spaces.Box) -> str:
     if max(abs(low).max(), abs(high).max()) > 1e6 or (reached >= (high - low) / 10).all():
         return ""
     return (
-        f"{env_id}: PPO's first actions are about N(0, 1), which reaches little of these bounds; wrap "
-        "the environment in gymnasium.wrappers.RescaleAction(env, -1, 1) where it is registered"
+        f"{env_id}: PPO's first actions are about N(0, 1), which reaches little of these bounds; "
+        "wrap it in gymnasium.wrappers.RescaleAction(env, -1, 1) where it is registered"
     )
 
 

@@ -434,7 +434,7 @@ def test_what_the_environment_compiles_is_no_reason_to_start_again(algorithm, tm
 
 def test_bounds_that_ppo_does_not_reach(tmp_path, capsys):
     run("PPO", tmp_path / "ppo", env_id="toy_envs:Heater-v0")
-    assert capsys.readouterr().out.count("which reaches little of these bounds; wrap the") == 1
+    assert capsys.readouterr().out.count("which reaches little of these bounds; wrap it") == 1
     run("TD3", tmp_path / "td3", env_id="toy_envs:Heater-v0")
     assert "reaches little" not in capsys.readouterr().out
 

@@ -173,7 +173,7 @@ def test_which_bounds_are_remarked():
     assert remark([-1.0, 15], [1, 30]) and remark([-21.0], [21]) and remark([0.0], [100])
     assert not remark([-20.0], [20]) and not remark([0.0], [1]) and not remark([-1.0, 1], [1, 3])
     assert not remark([-np.inf, 15], [np.inf, 30]) and not remark([15.0], [np.inf])
-    most = np.finfo(np.float32).max
+    most = float(np.finfo(np.float32).max)
     assert not remark([-most], [most])
     env = gym.wrappers.RescaleAction(gym.make("toy_envs:Heater-v0"), -1, 1)
     assert not remark_on_bounds("Heater-v0", env.action_space)
