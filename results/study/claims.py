@@ -161,22 +161,26 @@ def consistent_noises():
 def scaled_rewards(runs):
     """Return the rows of RandomUniformScaleReward(0.5, 1.5)."""
     rows, page = [], "SAC"
-    at = {"environment": "HalfCheetah-v2", "steps_millions": "0.2"}
-    paper = {
-        rate: float(published("paper/early_performance_sac.csv", **at, noise_rate=rate)["mean"])
-        for rate in ("0.00", "0.01", "0.05")
-    }
-    gains = {rate: 100 * (mean / paper["0.00"] - 1) for rate, mean in paper.items()}
+    paper = pd.read_csv(RESULTS / "paper/early_performance_sac.csv").query("steps_millions == 0.2")
+    paper = paper.pivot(index="environment", columns="noise_rate", values="mean")
+    gains = 100 * paper.sub(paper[0], axis=0).div(paper[0].abs(), axis=0)  # percent
     base = select(runs, "SAC", "HalfCheetah")
+    cheetah = gains.loc["HalfCheetah-v2"]
     for rate in ("0.01", "0.05"):
         f = compare(select(runs, "SAC", "HalfCheetah", pooled.SCALE, rate), base, mann_whitney_p)
         effect = f["difference"], min(1, 2 * f["p"])  # Bonferroni's correction for two rates
         claim = f"SAC, rewards scaled, p = {rate}: helps early"
-        rows.append(row(claim, page, gains[rate], percents(f), [effect], f"runs: {sizes(f)}"))
+        gain = cheetah[float(rate)]
+        rows.append(row(claim, page, gain, percents(f), [effect], f"runs: {sizes(f)}"))
     f = pooled.sac_early().iloc[0]
     claim, n = "The same, 0.01, with the long runs", f"long: {sizes(f)}"
     effect = f["difference"], f["p"]
-    rows.append(row(claim, page, gains["0.01"], percents(f), [effect], n, after=True))
+    rows.append(row(claim, page, cheetah[0.01], percents(f), [effect], n, after=True))
+    f = comparisons(read_returns("sac_200k")).set_index("environment")  # plans.md, set B
+    effects = list(f[["difference", "holm"]].drop("together").itertuples(index=False, name=None))
+    gain = gains.loc[["Hopper-v2", "Walker2d-v2", "Pusher-v2"], 0.01].mean()
+    claim, n = "The same, 0.01, Hopper, Walker2d, Pusher", "sac_200k: 15 + 15"
+    rows.append(row(claim, "B", gain, percents(f.loc["together"]), effects, n))
     found = read_returns("ablation")
     pairs = [
         [select(found, "PPO", e, *c) for c in ((pooled.SCALE, "0.05"), ())] for e in ENVIRONMENTS
