@@ -845,10 +845,12 @@ def test_missing_engine(executor, program, tmp_path):
 @pytest.mark.slow
 def test_a_slurm_that_does_not_answer_leaves_nothing_behind(tmp_path):
     need("sbatch", "scontrol")
-    env = ENV | {"SLURM_CONF": str(tmp_path / "nothing")}
+    config = tmp_path / "slurm.conf"
+    config.write_text("ClusterName=x\nSlurmctldHost=nowhere(127.0.0.1)\nSlurmctldPort=1\n")
+    env = ENV | {"SLURM_CONF": str(config)}
     result = run("demo", "--runs-dir", tmp_path / "runs", "--executor", "slurm", env=env)
     assert result.code == 2 and "error: Slurm does not answer" in result.err
-    assert not list(tmp_path.iterdir())
+    assert list(tmp_path.iterdir()) == [config]
 
 
 @pytest.mark.slow
