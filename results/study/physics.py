@@ -24,7 +24,8 @@ COLORS = ["black", "#0072B2", "#E69F00", "#009E73"]  # Okabe and Ito (2008)
 def read_tests():
     """Return mean returns: a row for each environment and seed, a column (training, test) for each.
 
-    A row is a whole seed: all trainings have finished, and evaluate.py has tested all policies.
+    A row is a whole seed: all trainings have finished, and evaluate.py has tested all policies. One
+    seed alone has no deviation: it is left out.
     """
     rows = []
     for path in sorted((returns.DATA / "physics").rglob("robustness.csv")):
@@ -42,7 +43,8 @@ def read_tests():
     table = pd.DataFrame(rows, columns=columns)
     table = table.pivot(index=columns[:2], columns=columns[2:4], values="return")
     every = pd.MultiIndex.from_product([TRAININGS, TESTS], names=columns[2:4])
-    return table.reindex(columns=every).dropna()
+    table = table.reindex(columns=every).dropna()
+    return table[table.groupby(level="environment").transform("size") > 1]
 
 
 def by_training(tests):
@@ -103,7 +105,7 @@ def questions(tests):
 
 
 def tables():
-    """Return {name: frame}, empty before there is a whole seed."""
+    """Return {name: frame}, empty before there are two whole seeds."""
     tests = read_tests()
     if tests.empty:
         return {}

@@ -169,6 +169,8 @@ def test_physics(data, tmp_path):
                 values = level + seed + clean, level + seed + changed
                 path = write_physics(data / "physics", env_id, training, seed, *values)
         (path / "robustness.csv").unlink()  # of the last training and seed: no whole seed
+    for training in gains:  # a whole seed alone
+        write_physics(data / "physics", "Walker2d-v5", training, 1, 0, 0)
     tests = physics.read_tests()
     assert list(tests.index) == [(e, s) for e in ("Hopper", "Pusher") for s in range(1, 5)]
 
