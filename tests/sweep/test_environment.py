@@ -111,6 +111,7 @@ def test_resets_count_in_proportion(monkeypatch):
     clock.seed = clock.sample = lambda *_: None
     monkeypatch.setattr(environment, "SECONDS", 0)
     monkeypatch.setattr(environment.time, "perf_counter", lambda: clock.now)
+    monkeypatch.setattr(environment, "waited", lambda: 0)
     seconds, steps, length = environment.time_steps(clock, 1000, 1e9)
     assert (steps, length) == (200, 12)
     assert seconds == pytest.approx(0.5 + 6 / 12)
