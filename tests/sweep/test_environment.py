@@ -57,7 +57,8 @@ def short(monkeypatch, tmp_path):
 # THE QUESTION
 
 
-def test_an_environment_that_sleeps():
+def test_an_environment_that_sleeps(monkeypatch):
+    monkeypatch.setattr(environment, "waited", lambda: 0)  # between the steps, too
     found = ask("toy_envs:Slow-v0")
     assert 0.005 < found.step_seconds < 1 and found.timed_steps == 200  # the machine may be busy
     assert (found.episode_steps, found.observed, found.bounded) == (100, 1, True)
