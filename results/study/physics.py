@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from results.study import returns
 from results.study.compare import average_change, holm, in_words, joint_p
 
+ENVIRONMENTS = ["HalfCheetah", "Hopper", "Pusher", "Walker2d"]
 DYNAMICS = "RandomDynamics(0.8, 1.2)"
 CHEAP = ["RandomNormalNoisyObservation(0.001)", "RandomUniformScaleObservation(0.8, 1.2)"]
 TRAININGS = ["", DYNAMICS, *CHEAP]
@@ -24,8 +25,8 @@ COLORS = ["black", "#0072B2", "#E69F00", "#009E73"]  # Okabe and Ito (2008)
 def read_tests():
     """Return mean returns: a row for each environment and seed, a column (training, test) for each.
 
-    A row is a whole seed: all trainings have finished, and evaluate.py has tested all policies. One
-    seed alone has no deviation: it is left out.
+    Only whole seeds: all trainings have finished in all environments, and evaluate.py has tested
+    all policies. One whole seed alone has no deviation: then there are no rows.
     """
     rows = []
     for path in sorted((returns.DATA / "physics").rglob("robustness.csv")):
@@ -39,12 +40,14 @@ def read_tests():
         episodes = episodes[episodes["noise_rate"].isin(["0.0", "1.0"])]
         means = episodes.groupby("noise")["episodic_return"].mean()
         rows += [(*run, test, means.get(noise)) for test, noise in NOISES.items()]
-    columns = ["environment", "seed", "training", "test", "return"]
-    table = pd.DataFrame(rows, columns=columns)
-    table = table.pivot(index=columns[:2], columns=columns[2:4], values="return")
-    every = pd.MultiIndex.from_product([TRAININGS, TESTS], names=columns[2:4])
-    table = table.reindex(columns=every).dropna()
-    return table[table.groupby(level="environment").transform("size") > 1]
+    columns = ["environment", "training", "test"]
+    table = pd.DataFrame(rows, columns=["environment", "seed", "training", "test", "return"])
+    table = table.pivot(index="seed", columns=columns, values="return")
+    every = pd.MultiIndex.from_product([ENVIRONMENTS, TRAININGS, TESTS], names=columns)
+    whole = table.reindex(columns=every).dropna()
+    if len(whole) == 1:
+        whole = whole[:0]
+    return whole.stack("environment").swaplevel().sort_index()
 
 
 def by_training(tests):
@@ -95,7 +98,7 @@ def questions(tests):
             for environment in tests.index.unique("environment")
         ]
         change, low, high, _ = average_change(by_environment)
-        row = {"question": question, "environments": len(by_environment), "seeds": len(tests)}
+        row = {"question": question, "seeds": tests.index.unique("seed").size}
         row |= {"change_percent": change, "low_percent": low, "high_percent": high}
         rows.append(row | {"p": joint_p(by_environment)})
     table = pd.DataFrame(rows)

@@ -48,7 +48,6 @@ COLUMNS = {
     },
     "physics_questions.csv": {
         "question": "{question}",
-        "environments": "{environments}",
         "seeds": "{seeds}",
         "change [95 %]": "{change_percent:+z.0f} % [{low_percent:z.0f}, {high_percent:z.0f}]",
         "p": "{p:.2g}",
