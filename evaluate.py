@@ -26,6 +26,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import warnings
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -327,16 +328,22 @@ def play_all(tasks, args):
             yield from zip(bar, map(*everything), strict=True)
             return
         context = multiprocessing.get_context("spawn")  # PyTorch does not survive a fork
-        ignore = (signal.SIGINT, signal.SIG_IGN)  # at Ctrl-C they finish what they play
-        with ProcessPoolExecutor(args.jobs, context, signal.signal, ignore) as pool:
+        with ProcessPoolExecutor(args.jobs, context, end_with_program) as pool:
             yield from zip(bar, pool.map(*everything), strict=True)
 
 
-def end_at_once(number, frame):
-    """End with the processes of --jobs, which would go on alone; what they played is stored."""
-    for process in multiprocessing.active_children():
-        process.kill()
-    os._exit(128 + number)
+def end_with_program():
+    """Let this process of --jobs finish what it plays at Ctrl-C, and end when the program ends.
+
+    Without this it would go on alone, and then wait for work forever. What it played is stored.
+    """
+
+    def wait():
+        multiprocessing.parent_process().join()
+        os._exit(1)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def read_stored(run):
@@ -518,7 +525,8 @@ def main(args):
 
 if __name__ == "__main__":
     take_over_terminal()
-    signal.signal(signal.SIGTERM, end_at_once)
+    # at once: an ordinary exit would wait for what the processes of --jobs play
+    signal.signal(signal.SIGTERM, lambda number, frame: os._exit(128 + number))
     try:
         sys.exit(main(tyro.cli(Args, description=__doc__)))
     except KeyboardInterrupt:

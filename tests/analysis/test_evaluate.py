@@ -242,7 +242,11 @@ def test_what_is_played_is_stored_by_the_process_that_plays(runs):
 
 
 @pytest.mark.slow
-def test_a_terminated_program_leaves_no_process_behind(runs):
+@pytest.mark.parametrize(
+    "number, code", [(signal.SIGTERM, 128 + signal.SIGTERM), (signal.SIGKILL, -signal.SIGKILL)]
+)
+def test_a_killed_program_leaves_no_process_behind(runs, number, code):
+    """Its processes end by themselves, also one that was just started and still imports."""
     options = ["--noises", OBSERVATION, ACTION, "--episodes", 20_000, "--jobs", 2]
     process = subprocess.Popen(**command(one(runs, "PPO"), *options), start_new_session=True)
 
@@ -253,8 +257,11 @@ def test_a_terminated_program_leaves_no_process_behind(runs):
     while processes() < 2:
         assert process.poll() is None
         time.sleep(0.1)
-    process.terminate()
-    assert process.wait(timeout=100) == 128 + signal.SIGTERM
+    process.send_signal(number)
+    assert process.wait(timeout=100) == code
+    deadline = time.time() + 60
+    while processes() and time.time() < deadline:
+        time.sleep(0.1)
     assert processes() == 0
 
 
