@@ -31,6 +31,7 @@ import importlib
 import importlib.machinery
 import importlib.metadata
 import inspect
+import json
 import math
 import numbers
 import operator
@@ -46,7 +47,7 @@ import traceback
 import warnings
 import zlib
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -58,7 +59,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
-__version__ = "0.3.0"
+__version__ = "0.4.0"
 
 Env = gym.Env[Any, Any]
 Info = dict[str, Any]
@@ -1417,6 +1418,72 @@ def safe_name(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9._=+-]", lambda match: "-" if match[0] == "/" else "--", text)
 
 
+# ------------------------------------------------------------------------------- a run's identity
+
+# The scripts' arguments that change nothing about what a run learns. A run may be resumed with
+# others, and a finished one counts as done whatever it had.
+MAY_DIFFER_IN_A_RUN = {
+    "runs_dir",
+    "overwrite",
+    "torch_threads",
+    "compile",
+    "checkpoint_frequency",
+    "keep_policies",
+}
+# Runs with other values of these may stand in one row of a table, too: a GPU rounds otherwise, and
+# tests do not touch training. But a run keeps to the ones that it began with.
+MAY_DIFFER_IN_A_TABLE = MAY_DIFFER_IN_A_RUN | {"cuda", "eval_frequency"}
+
+
+def different_arguments(
+    config: Mapping[str, Any],
+    other: Mapping[str, Any],
+    may_differ: Collection[str] = MAY_DIFFER_IN_A_RUN,
+) -> dict[str, tuple[Any, Any]]:
+    """Return the arguments in which two runs differ: {name: (value of config, value of other)}.
+
+    Both are contents of a config.json, with "args", and with "defaults" since version 0.4. Values
+    are compared as JSON, so a tuple equals its list. An argument that one of them lacks, because
+    the script has it since then, had the default that the other one names.
+
+    >>> old = {"args": {"seed": 1}}
+    >>> new = {"args": {"seed": 1, "width": 64}, "defaults": {"seed": 1, "width": 32}}
+    >>> different_arguments(old, new)
+    {'width': (32, 64)}
+    """
+    names = [*config["args"], *(name for name in other["args"] if name not in config["args"])]
+    differing = {}
+    for name in names:
+        if name in may_differ:
+            continue
+        value = _argument(config, other, name)
+        others = _argument(other, config, name)
+        if json.dumps(value, sort_keys=True) != json.dumps(others, sort_keys=True):
+            differing[name] = (value, others)
+    return differing
+
+
+def _argument(config: Mapping[str, Any], other: Mapping[str, Any], name: str) -> Any:
+    """Return a run's argument as JSON has it, or its default if only the other run has it."""
+    if name in config["args"]:
+        value = config["args"][name]
+    else:
+        value = other.get("defaults", other["args"]).get(name)
+    return json.loads(json.dumps(value, default=str))  # a path as its text, a tuple as a list
+
+
+def release(config: Mapping[str, Any]) -> str:
+    """Return the release that made a run, "0.4": runs of two releases differ in their numbers.
+
+    ``config`` is the content of its config.json, which names the version since 0.4.
+
+    >>> release({"versions": {"noisy_wrappers": "0.4.2"}}), release({"versions": {"numpy": "2.4"}})
+    ('0.4', '0.3')
+    """
+    version = config.get("versions", {}).get("noisy_wrappers", "0.3")
+    return ".".join(str(version).split(".")[:2])
+
+
 # ------------------------------------------------------------------------------ numbers for people
 
 
@@ -2272,11 +2339,3 @@ def _set_stream(generator: Any, stream: Any) -> None:
     else:
         torch = sys.modules["torch"]
         generator.set_state(torch.tensor(stream, dtype=torch.uint8))
-
-
-# The scripts' arguments that change nothing about what a run learns. A run may be resumed with
-# others, and a finished one counts as done whatever it had.
-MAY_DIFFER_IN_A_RUN = {"runs_dir", "overwrite", "torch_threads", "compile", "checkpoint_frequency"}
-# Runs with other values of these may stand in one row of a table, too: a GPU rounds otherwise, and
-# tests do not touch training. But a run keeps to the ones that it began with.
-MAY_DIFFER_IN_A_TABLE = MAY_DIFFER_IN_A_RUN | {"cuda", "eval_frequency"}
