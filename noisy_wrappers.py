@@ -2052,12 +2052,15 @@ def seed_globals(seed: int) -> None:
 
 @contextlib.contextmanager
 def kept_generators(env: Env | None = None) -> Iterator[None]:
-    """Restore after some lines the global generators, and those that an environment holds."""
+    """Restore after some lines the global generators, and those of an environment.
+
+    The latter are those that :class:`EnvState` keeps.
+    """
     generators: list[Any] = [random, np.random]
     if torch := sys.modules.get("torch"):
         generators.append(torch.default_generator)
     if env is not None:
-        generators += _held_generators(env).values()
+        generators += _generators(env).values()
     streams = [_stream(generator) for generator in generators]
     try:
         yield
@@ -2221,31 +2224,28 @@ def stop_at_signals() -> Callable[[], int]:
 class EnvState:
     """What an environment carries from one episode to the next, to resume training.
 
-    That is all random generators that it, its wrappers or an environment inside it hold; the random
-    streams and the counters of its noise wrappers, the returns that RecordEpisodeStatistics
-    remembers, and the global generators of ``random`` and NumPy, from which an environment may
-    draw. Further ``generators`` are kept with them. After loading, call :func:`set_progress`, or
-    assign a rate, again. An environment that carries anything else does not resume exactly.
+    These are the random generators that the environment, its wrappers and their spaces have as
+    attributes, with the number of children that they spawned; the streams, counters and estimates
+    of its noise wrappers; the returns that RecordEpisodeStatistics remembers; the global generators
+    of ``random`` and NumPy, from which an environment may draw; and further ``generators``. An
+    environment that carries anything else from one episode to the next, or holds a generator
+    elsewhere, does not resume exactly. After loading, call :func:`set_progress` again.
     """
 
     def __init__(self, env: Env, *generators: np.random.Generator):
         """Take an environment that has been reset with a seed."""
-        self.env = env
-        found = [env.unwrapped.np_random, env.action_space.np_random, *generators]
-        # an environment may have put a generator of another library there, or a module
-        of_numpy = np.random.Generator | np.random.RandomState
-        self.generators = [generator for generator in found if isinstance(generator, of_numpy)]
+        self.env, self.generators = env, generators
         recorded = env.has_wrapper_attr("return_queue")
         self.returns = env.get_wrapper_attr("return_queue") if recorded else deque()
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state in Python's own types, to be taken between two episodes."""
-        held = _held_generators(self.env)
+        attributes = _generators(self.env)
         return {
             "python": _stream(random),
             "numpy": _stream(np.random),
             "generators": [_stream(generator) for generator in self.generators],
-            "attributes": {place: _stream(generator) for place, generator in held.items()},
+            "attributes": {place: _stream(generator) for place, generator in attributes.items()},
             "noise": [_without_arrays(w.state_dict()) for w in noise_wrappers(self.env).values()],
             "returns": [float(value) for value in self.returns],
         }
@@ -2260,9 +2260,9 @@ class EnvState:
         _set_stream(np.random, state["numpy"])
         for generator, stream in zip(self.generators, state["generators"], strict=True):
             _set_stream(generator, stream)
-        held, streams = _held_generators(self.env), state.get("attributes", {})
-        for place in held.keys() & streams.keys():
-            _set_stream(held[place], streams[place])
+        for place, generator in _generators(self.env).items():
+            if place in state["attributes"]:  # others were made later than at the first reset
+                _set_stream(generator, state["attributes"][place])
         wrappers = noise_wrappers(self.env).values()
         for wrapper, part in zip(wrappers, state["noise"], strict=True):
             wrapper.load_state_dict(part)
@@ -2270,57 +2270,50 @@ class EnvState:
         self.returns.extend(state["returns"])
 
 
-def _held_generators(env: Env, place: str = "") -> dict[str, Any]:
-    """Return the generators that an environment, or one that it holds, holds, by their places."""
-    layers, found = _layers(env), {}
-    kinds = np.random.Generator | np.random.RandomState | random.Random
+def _generators(env: Env) -> dict[str, Any]:
+    """Return the generators among the attributes of an environment, its wrappers and their spaces.
+
+    They are named by their places, such as "0._np_random". Nothing else is looked into.
+    """
+    kinds: tuple[Any, ...] = (np.random.Generator, np.random.RandomState, random.Random)
     if torch := sys.modules.get("torch"):
-        kinds |= torch.Generator
-    for i, layer in enumerate(layers):
-        for name, value in _members(layer):
-            if isinstance(value, kinds) and not isinstance(value, random.SystemRandom):
-                found[f"{place}{i}.{name}"] = value
-            elif isinstance(value, gym.Env) and value not in layers and not place:
-                found |= _held_generators(value, f"{i}.{name}.")
+        kinds += (torch.Generator,)
+    holders: dict[str, Any] = {}
+    for i, layer in enumerate(_layers(env)):
+        holders[str(i)] = layer
+        attributes = {name: getattr(layer, name, None) for name in _SPACES} | vars(layer)
+        for name, value in attributes.items():
+            if issubclass(type(value), gym.Space):
+                holders |= _parts(f"{i}.{name}", value)
+    found = {}
+    for place, holder in holders.items():
+        for name, value in vars(holder).items():
+            # type(): isinstance() would ask a weak reference, perhaps a dead one, for its class
+            if issubclass(type(value), kinds) and not issubclass(type(value), random.SystemRandom):
+                found[f"{place}.{name}"] = value
     return found
 
 
-# Their objects are large, and hold no generator of an environment's own
-_LIBRARIES = {*sys.stdlib_module_names, "numpy", "torch", "mujoco", "gymnasium", "dm_control"}
+_SPACES = ("action_space", "observation_space")
 
 
-def _package_of(value: Any) -> str:
-    module = getattr(type(value), "__module__", "")  # which types of SWIG do not have
-    return str(module).partition(".")[0]
-
-
-def _members(holder: Any, depth: int = 3) -> Iterator[tuple[str, Any]]:
-    """Yield what an object holds, also in its containers, its spaces and objects of no library."""
-    containers, libraries = list | tuple | dict, _LIBRARIES - {_package_of(holder)}
-    parts: list[tuple[Any, Any]] = [*_attributes(holder).items()]
-    if isinstance(holder, containers):
-        parts += _items(holder)
-    for name, value in parts:
-        yield str(name), value
-        goes_on = isinstance(value, gym.Space) or _package_of(value) not in libraries
-        if isinstance(value, containers):
-            goes_on = len(value) <= 1000
-        if depth and goes_on and not isinstance(value, gym.Env):
-            for inner, part in _members(value, depth - 1):
-                yield f"{name}.{inner}", part
-
-
-def _attributes(holder: Any) -> dict[str, Any]:
-    """Return the attributes of an object, those in ``__slots__``, too."""
-    state: Any = object.__getstate__(holder)  # its dict, or a pair of that and of its slots
-    parts = state if isinstance(state, tuple) else (state,)
-    return {name: value for part in parts if part for name, value in part.items()}
+def _parts(place: str, space: gym.Space[Any]) -> dict[str, gym.Space[Any]]:
+    """Return a space and the spaces in it, by their places: each draws from its own generator."""
+    getattr(space, "np_random", None)  # which makes the generator if there is none yet
+    found = {place: space}
+    if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple | gym.spaces.OneOf):
+        for key, part in _items(space.spaces):
+            found |= _parts(f"{place}.{key}", part)
+    return found
 
 
 def _stream(generator: Any) -> Any:
     """Return the state of a generator, or of random or np.random, in Python's own types."""
     if isinstance(generator, np.random.Generator):
-        return _without_arrays(generator.bit_generator.state)
+        stream = {"state": generator.bit_generator.state}
+        if isinstance(seeds := generator.bit_generator.seed_seq, np.random.SeedSequence):
+            stream["seeds"] = seeds.state  # with the number of children that were spawned
+        return _without_arrays(stream)
     if generator is np.random or isinstance(generator, np.random.RandomState):  # dm_control's
         return _without_arrays(generator.get_state(legacy=False))
     if generator is random or isinstance(generator, random.Random):
@@ -2330,7 +2323,9 @@ def _stream(generator: Any) -> Any:
 
 def _set_stream(generator: Any, stream: Any) -> None:
     if isinstance(generator, np.random.Generator):
-        generator.bit_generator.state = stream
+        generator.bit_generator.state = stream["state"]
+        if "seeds" in stream:  # in place, because whoever spawns may hold it, too
+            generator.bit_generator.seed_seq.__init__(**stream["seeds"])
     elif generator is np.random or isinstance(generator, np.random.RandomState):
         generator.set_state(stream)
     elif generator is random or isinstance(generator, random.Random):
