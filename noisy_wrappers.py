@@ -791,29 +791,25 @@ class RandomEarlyTermination(NoiseWrapper):
         return observation, reward, terminated, truncated, info
 
 
-# Fields of MuJoCo's model that are usually randomized.
-_USUAL_FIELDS = ("body_mass", "body_inertia", "geom_friction", "jnt_stiffness", "dof_armature")
-_USUAL_FIELDS += ("dof_damping", "dof_frictionloss", "actuator_gear")
-# What mj_setConst computes from others (engine_setconst.c), in the model and in model.stat.
-_DERIVED_FIELDS = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "dof_length")
-_DERIVED_FIELDS += ("actuator_acc0", "actuator_length0", "actuator_biasprm", "tendon_invweight0")
-_DERIVED_FIELDS += ("tendon_length0", "tendon_lengthspring", "eq_data", "cam_pos0", "cam_poscom0")
-_DERIVED_FIELDS += ("cam_mat0", "light_pos0", "light_poscom0", "light_dir0", "flexedge_length0")
-_DERIVED_FIELDS += ("flexedge_invweight0", "flex_vertmetric", "flex_vert0")
-_STATISTICS = ("meaninertia", "meanmass", "meansize", "extent", "center")
-
-
 class RandomDynamics(NoiseWrapper):
     """Scales masses, frictions and the like of a MuJoCo model for an episode. Not in the paper.
 
     At ``reset()`` the episode is chosen with probability p. In a chosen one, each row of the named
     ``fields`` of the simulator's model (that of a body, a geom, a joint, an actuator) is its own
     value times e ~ U(low, high), ``noise.uniform(low, high, number of rows)`` for each field in
-    turn, drawn for the other episodes too. Fields have MuJoCo's own names, as ``dof_damping``;
-    ``body_mass`` takes ``body_inertia`` along, with the same factors. What MuJoCo derives from
-    these values is derived anew. All is undone at the next ``reset()``: other episodes are those of
-    the bare environment. ``info["dynamics"]`` of a chosen episode's reset has the factors,
-    {field: array}. ``reset()`` raises SpaceError if the environment's own sets one of the fields.
+    turn, drawn for the other episodes too. Fields have MuJoCo's own names, as ``dof_damping``.
+
+    What is scaled are quantities of physics. ``body_mass`` takes ``body_inertia`` along, and
+    ``actuator_gainprm`` the bias of position and velocity servos (``actuator_biasprm``), with the
+    same factors: a servo keeps its target and has another strength. Friction (``geom_friction``,
+    ``pair_friction``) has one factor for all rows, ``noise.uniform(low, high)``: MuJoCo takes the
+    larger one of two geoms, so a contact has its nominal friction times that factor.
+
+    What MuJoCo derives from these values is derived anew. All is undone at the next ``reset()``:
+    other episodes are those of the bare environment, which may randomize other fields itself.
+    ``info["dynamics"]`` of a chosen episode's reset has the factors, {field: array}. ``reset()``
+    raises SpaceError if the environment's own sets one of the fields. Several of these wrappers may
+    scale different fields of one environment, each with a range and a rate of its own.
 
     The model is found in environments of Gymnasium, Gymnasium-Robotics, MyoSuite 3 and dm_control
     (with shimmy). ``times_applied`` counts episodes. Tobin et al., "Domain Randomization", 2017;
@@ -836,63 +832,57 @@ class RandomDynamics(NoiseWrapper):
         *,
         fields: tuple[str, ...] = ("body_mass", "geom_friction"),
     ):
-        """Raise ValueError unless 0 <= low <= high and the environment's model has the fields."""
+        """Raise ValueError unless 0 <= low <= high and the environment's model has the fields.
+
+        Nor may another RandomDynamics scale one of them.
+        """
         self.low, self.high = _interval(low, high, least=0)
         self.fields = _fields(fields)
         super().__init__(env, noise_rate, low=self.low, high=self.high, fields=self.fields)
-        if _layers(env, RandomDynamics):
-            raise ValueError("this environment has RandomDynamics already: name all fields in one")
-        self._chosen = False  # the episode
-        self._scratch: Any = None  # a model, and data to compute with
+        self._factors: dict[str, NDArray[Any]] = {}  # of the episode; none if it is not chosen
+        self._outer: list[RandomDynamics] = []  # wrappers whose reset() waits for this one's
+        for inner in _layers(env, RandomDynamics):
+            for field in self.fields:
+                if _with_those_along([field]) & _with_those_along(inner.fields):
+                    problem = "another RandomDynamics of this environment scales"
+                    raise ValueError(f"fields: {problem} {field}, too")
         if not isinstance(env, _ProbeEnv):
             self._restore()  # what another wrapper has left of this environment
-            model = self._model()
-            for field in self.fields:
-                if not getattr(model, field).any():
-                    raise ValueError(
-                        f"fields: this environment's model has no {field}, or zeros only, which no "
-                        "factor changes"
-                    )
+            _check_fields(self._model(), self.fields)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Restore the model, perhaps change it anew, and reset the environment."""
-        self._restore()
         self._begin(seed)
-        model = self._model()
-        factors = self._draw(model)
-        self._chosen = self.acts() and any((values != 1).any() for values in factors.values())
-        if self._chosen:
-            self._scale(model, factors)  # before the environment's own reset, which needs it
-        before = {field: getattr(model, field).copy() for field in self.fields}
-        observation, info = self.env.reset(seed=seed, options=options)
-        now = self._model()
-        if now is model:
-            for field, values in before.items():
-                if (getattr(model, field) != values).any():  # no factor would be left
-                    reason = f"this environment's reset() sets {field} itself: name other fields"
-                    raise SpaceError(f"fields: {reason}")
-        elif self._chosen:  # the environment has built or taken another one
-            self._restore()
-            if any(len(factors[name]) != len(getattr(now, name)) for name in self.fields):
-                factors = self._draw(now)
-            self._scale(now, factors)
-        if self._chosen:
-            info = {**self.mark(info), "dynamics": factors}
+        drawn = self._draw(self._model())
+        chosen = self.acts() and any((factors != 1).any() for factors in drawn.values())
+        self._factors = drawn if chosen else {}
+        inner = _layers(self.env, RandomDynamics)
+        if inner:  # the innermost changes the model for all of them, at once
+            inner[-1]._outer.append(self)
+            observation, info = self.env.reset(seed=seed, options=options)
+        else:
+            observation, info = self._reset_scaled(seed, options)
+        if self._factors:
+            info = self.mark(info)
+            others = info["dynamics"] if any(wrapper._factors for wrapper in inner) else {}
+            info["dynamics"] = {**others, **self._factors}
         return observation, info
 
     def step(self, action: Any) -> Step:
         """Step the environment; every step of a chosen episode is a perturbed one."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        if self._chosen:
+        if self._factors:
             info = self.mark(info)
         return observation, reward, terminated, truncated, info
 
     def _draw(self, model: Any) -> dict[str, NDArray[Any]]:
         """Return factors for all rows of the fields."""
-        return {
-            field: self.noise.uniform(self.low, self.high, len(getattr(model, field)))
-            for field in self.fields
-        }
+        factors = {}
+        for field in self.fields:
+            rows = len(getattr(model, field))
+            drawn = self.noise.uniform(self.low, self.high, 1 if field in _FRICTIONS else rows)
+            factors[field] = np.broadcast_to(drawn, rows).copy()
+        return factors
 
     def _model(self) -> Any:
         """Return the environment's mujoco.MjModel."""
@@ -905,35 +895,171 @@ class RandomDynamics(NoiseWrapper):
                 return model
         raise ValueError(f"RandomDynamics needs an environment with a MuJoCo model, not {base}")
 
-    def _scale(self, model: Any, factors: dict[str, NDArray[Any]]) -> None:
-        """Multiply the rows of the fields, and let MuJoCo derive its constants from them."""
-        import mujoco
+    def _reset_scaled(self, seed: int | None, options: Info | None) -> tuple[Any, Info]:
+        """Scale the model by the factors of this wrapper and the outer ones, and reset."""
+        wrappers, self._outer = [*self._outer, self], []
+        self._restore()
+        model = self._model()
+        self._scale(model, wrappers)  # before the environment's own reset, which needs it
+        named = [field for wrapper in wrappers for field in wrapper.fields]
+        along = [_SCALED_ALONG[field] for field in named if field in _SCALED_ALONG]
+        before = {field: getattr(model, field).copy() for field in named + along}
+        observation, info = self.env.reset(seed=seed, options=options)
+        now = self._model()
+        if now is model:
+            set_by_reset = {f for f in before if (getattr(model, f) != before[f]).any()}
+            for field in named:
+                if field in set_by_reset:  # no factor would be left
+                    reason = f"this environment's reset() sets {field} itself: name other fields"
+                    raise SpaceError(f"fields: {reason}")
+        if now is not model or set_by_reset:  # another model, or the inertia of a mass
+            self._restore()
+            for wrapper in wrappers:
+                if any(len(f) != len(getattr(now, name)) for name, f in wrapper._factors.items()):
+                    wrapper._factors = wrapper._draw(now)
+            self._scale(now, wrappers)
+        return observation, info
 
-        scaled = dict(factors)
-        if "body_mass" in factors:
-            scaled["body_inertia"] = factors["body_mass"]
-        arrays = {name: getattr(model, name, None) for name in (*scaled, *_DERIVED_FIELDS)}
-        nominal = {name: array.copy() for name, array in arrays.items() if array is not None}
-        statistics = {name: np.copy(getattr(model.stat, name)) for name in _STATISTICS}
-        # the environment has them, because another wrapper of it may have to restore them
-        self.unwrapped._unscaled_model = model, nominal, statistics
-        for name, values in scaled.items():
-            arrays[name][:] = (nominal[name].T * values).T
-        # In data of its own, made once: the environment's are left as they are until its reset.
-        if self._scratch is None or self._scratch[0] is not model:
-            self._scratch = model, mujoco.MjData(model)
-        mujoco.mj_setConst(*self._scratch)
-        for name in ("meansize", "extent", "center"):  # of the picture, as the model's file says
-            setattr(model.stat, name, statistics[name])
+    def _scale(self, model: Any, wrappers: "list[RandomDynamics]") -> None:
+        factors = {name: f for wrapper in wrappers for name, f in wrapper._factors.items()}
+        if not factors:
+            return
+        base = self.unwrapped  # which has it, because another wrapper of it may have to undo it
+        if getattr(base, "_scaled_model", None) is None or base._scaled_model.model is not model:
+            base._scaled_model = _ScaledModel(model)
+        base._scaled_model.scale(factors)
 
     def _restore(self) -> None:
-        if changed := getattr(self.unwrapped, "_unscaled_model", None):
-            model, nominal, statistics = changed
-            for name, values in nominal.items():
-                getattr(model, name)[:] = values
-            for name, value in statistics.items():
-                setattr(model.stat, name, value)
-            self.unwrapped._unscaled_model = None
+        if scaled := getattr(self.unwrapped, "_scaled_model", None):
+            scaled.undo()
+
+
+# Fields of MuJoCo's model that are usually randomized.
+_USUAL_FIELDS = ("body_mass", "body_inertia", "geom_friction", "jnt_stiffness", "dof_armature")
+_USUAL_FIELDS += ("dof_damping", "dof_frictionloss", "actuator_gainprm", "actuator_forcerange")
+_USUAL_FIELDS += ("actuator_gear",)
+_FRICTIONS = ("geom_friction", "pair_friction")
+_SCALED_ALONG = {"body_mass": "body_inertia", "actuator_gainprm": "actuator_biasprm"}
+# Which of an actuator's ten parameters are its strength, by its type: of the gain a fixed one, an
+# affine one, a muscle; of the bias none, an affine one (of a servo), a muscle.
+_PARAMETER = np.arange(10)
+_STRENGTH_IN_GAIN = {0: _PARAMETER < 3, 1: _PARAMETER < 3, 2: np.isin(_PARAMETER, (2, 3))}
+_STRENGTH_IN_BIAS = {0: _PARAMETER < 0, 1: np.isin(_PARAMETER, (1, 2)), 2: _STRENGTH_IN_GAIN[2]}
+# What mj_setConst computes from others (engine_setconst.c), in the model and in model.stat.
+_DERIVED_FIELDS = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "dof_length")
+_DERIVED_FIELDS += ("actuator_acc0", "actuator_length0", "tendon_invweight0", "tendon_length0")
+_DERIVED_FIELDS += ("tendon_lengthspring", "eq_data", "cam_pos0", "cam_poscom0", "cam_mat0")
+_DERIVED_FIELDS += ("light_pos0", "light_poscom0", "light_dir0", "flexedge_length0")
+_DERIVED_FIELDS += ("flexedge_invweight0", "flex_vertmetric", "flex_vert0")
+_DERIVED_STATISTICS = ("meaninertia", "meanmass")  # others are of the picture
+
+
+class _ScaledModel:
+    """A MuJoCo model whose fields are scaled for an episode, and what undoes that.
+
+    What MuJoCo derives from the fields is derived in a copy, because mj_setConst also writes what
+    does not depend on them, and the environment may have set that itself. Where the copy shows that
+    a value depends on the factors, it is taken over.
+    """
+
+    def __init__(self, model: Any):
+        """Take a model as it is."""
+        import mujoco
+
+        self.model = model
+        self.data = mujoco.MjData(model)  # to compute with; that of the environment is left alone
+        self.scaled: dict[str, Any] = {}  # {field: (values before, values as written)}
+        self.derived: dict[str, Any] = {}
+
+    def scale(self, factors: dict[str, NDArray[Any]]) -> None:
+        """Multiply the rows of the fields by their factors, {field: factors}."""
+        trial = copy.copy(self.model)
+        nominal = self._derive(trial)
+        for name, of_elements in _factors_of_elements(self.model, factors).items():
+            self._write(self.scaled, name, _values(self.model, name) * of_elements)
+            _set_values(trial, name, _values(self.model, name))
+        for name, value in self._derive(trial).items():
+            depends = value != nominal[name]
+            if np.any(depends):
+                kept = _values(self.model, name)
+                self._write(self.derived, name, np.where(depends, value, kept))
+
+    def undo(self) -> None:
+        """Restore what was written here; what the environment has written since then stays."""
+        written = {name: new for name, (_, new) in self.derived.items()}
+        now = {name: _values(self.model, name) for name in written}
+        derived_anew = any(np.any(now[name] != written[name]) for name in written)
+        scaled = self._derive(copy.copy(self.model)) if derived_anew else {}
+        for name, (before, new) in {**self.scaled, **self.derived}.items():
+            values = _values(self.model, name)
+            _set_values(self.model, name, np.where(values == new, before, values))
+        if derived_anew:  # by the environment's own mj_setConst, while the fields were scaled
+            nominal = self._derive(copy.copy(self.model))
+            for name in written:
+                values = np.where(
+                    now[name] == scaled[name], nominal[name], _values(self.model, name)
+                )
+                _set_values(self.model, name, values)
+        self.scaled, self.derived = {}, {}
+
+    def _write(self, changes: dict[str, Any], name: str, values: NDArray[Any]) -> None:
+        changes[name] = (_values(self.model, name), values)
+        _set_values(self.model, name, values)
+
+    def _derive(self, trial: Any) -> dict[str, NDArray[Any]]:
+        """Return what MuJoCo derives from the values of a copy of the model, which it changes."""
+        import mujoco
+
+        mujoco.mj_setConst(trial, self.data)
+        names = [name for name in _DERIVED_FIELDS if hasattr(trial, name)]
+        return {name: _values(trial, name) for name in (*names, *_DERIVED_STATISTICS)}
+
+
+def _values(model: Any, name: str) -> NDArray[Any]:
+    """Return a copy of a field of MuJoCo's model, or of one of its statistics."""
+    return np.array(getattr(model.stat if name in _DERIVED_STATISTICS else model, name))
+
+
+def _set_values(model: Any, name: str, values: NDArray[Any]) -> None:
+    if name in _DERIVED_STATISTICS:
+        setattr(model.stat, name, float(values))
+    else:
+        getattr(model, name)[:] = values
+
+
+def _with_those_along(fields: Iterable[str]) -> set[str]:
+    return {*fields, *(_SCALED_ALONG[field] for field in fields if field in _SCALED_ALONG)}
+
+
+def _factors_of_elements(model: Any, factors: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Return the factors of all elements of the fields, and of those that are scaled along."""
+    found = {}
+    for field, of_rows in factors.items():
+        for name in _with_those_along([field]):
+            found[name] = (np.ones_like(getattr(model, name)).T * of_rows).T
+    if "actuator_gainprm" in factors:
+        for i, type_of_gain in enumerate(model.actuator_gaintype.tolist()):
+            strength = _STRENGTH_IN_GAIN[type_of_gain]
+            found["actuator_gainprm"][i] = np.where(strength, factors["actuator_gainprm"][i], 1)
+        for i, type_of_bias in enumerate(model.actuator_biastype.tolist()):
+            strength = _STRENGTH_IN_BIAS[type_of_bias]
+            found["actuator_biasprm"][i] = np.where(strength, factors["actuator_gainprm"][i], 1)
+    return found
+
+
+def _check_fields(model: Any, fields: tuple[str, ...]) -> None:
+    """Raise ValueError unless scaling the fields changes a model as it should."""
+    for field in fields:
+        if not getattr(model, field).any():
+            zeros = f"fields: this environment's model has no {field}, or zeros only"
+            raise ValueError(f"{zeros}, which no factor changes")
+    if "actuator_gainprm" in fields:
+        types = {*model.actuator_gaintype.tolist(), *model.actuator_biastype.tolist()}
+        if not types <= _STRENGTH_IN_GAIN.keys():
+            raise ValueError(
+                "fields: actuator_gainprm is the strength of motors, servos and muscles, and this "
+                "environment's model has actuators of other kinds"
+            )
 
 
 # -------------------------------------------------------------------- noises in words, and combined
@@ -1672,8 +1798,9 @@ def _fields(fields: Any) -> tuple[str, ...]:
                 f"fields: {field!r} cannot be scaled for each body, geom, contact pair, joint, "
                 f"degree of freedom, actuator or tendon of MuJoCo's model; usual are {usual}"
             )
-    if {"body_mass", "body_inertia"} <= set(found):
-        raise ValueError("fields: body_mass takes body_inertia along, so name one of them")
+    for field, along in _SCALED_ALONG.items():
+        if along in found and (field in found or along == "actuator_biasprm"):
+            raise ValueError(f"fields: {field} takes {along} along, so name {field} alone")
     return tuple(dict.fromkeys(found))
 
 
