@@ -1909,11 +1909,26 @@ def canonical_arguments(args: Mapping[str, Any]) -> dict[str, Any]:
     check_numbers(args)
     if args["exp_name"] in ("", ".", ".."):
         raise ValueError(f"--exp-name must be a name, not {args['exp_name']!r}")
-    canonical: dict[str, Any] = {"env_id": canonical_env_id(args["env_id"])}
-    for noise, rate in (("noise", "noise_rate"), ("test_noise", "test_noise_rate")):
-        configuration = Configuration.read(args[noise], args[rate])
-        canonical[noise], canonical[rate] = configuration.texts
-    return canonical
+    parse_env_kwargs(args["env_kwargs"])
+    noises, rates = Configuration.read(args["noise"], args["noise_rate"]).texts
+    tests = Configuration.read(args["test_noise"], args["test_noise_rate"]).for_tests()
+    canonical = {"env_id": canonical_env_id(args["env_id"]), "noise": noises, "noise_rate": rates}
+    return canonical | {"test_noise": tests.texts[0], "test_noise_rate": tests.texts[1]}
+
+
+def run_folder(args: Mapping[str, Any]) -> Path:
+    """Return the folder of a run with these arguments of a script: :func:`run_name` in runs_dir."""
+    name = run_name(
+        args["env_id"],
+        args["exp_name"],
+        args["noise"],
+        args["noise_rate"],
+        args["seed"],
+        env_kwargs=args["env_kwargs"],
+        test_noise=args["test_noise"],
+        test_noise_rate=args["test_noise_rate"],
+    )
+    return Path(args["runs_dir"], name)
 
 
 def describe_run(
@@ -2476,12 +2491,6 @@ def make_flat(env: Env, step_limit: int | None = None) -> Env:
         return env
     env.close()
     raise SpaceError(problem)
-
-
-def is_bounded(space: gym.spaces.Box) -> bool:
-    """Return whether all bounds are finite; the largest float32, which overflows, is not."""
-    largest = np.finfo(np.float32).max
-    return bool((np.abs(space.low) < largest).all() and (np.abs(space.high) < largest).all())
 
 
 def into_space(action: NDArray[Any], space: gym.spaces.Box) -> NDArray[Any]:

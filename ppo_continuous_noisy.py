@@ -50,6 +50,7 @@ class Args:
     env_id: str = "HalfCheetah-v5"  # RUN: Gymnasium environment, Name-v0, or module:Name-v0
     seed: int = 1  # seed of everything that is random
     total_timesteps: int = 1_000_000  # environment steps, rounded down to whole rollouts
+    env_kwargs: tuple[str, ...] = ()  # arguments of the environment, each as name:value
     max_episode_steps: int | None = None  # time limit of an episode; None: the environment's own
     exp_name: str = Path(__file__).stem  # name of the experiment, part of the run folder's name
     runs_dir: str = "runs"  # folder in which the run's own folder is made
@@ -504,13 +505,14 @@ def train(args, stop=lambda: 0):
     if with_amx or args.cuda or precision == "bf16":  # "medium" is bf16 with AMX, TF32 on a GPU
         precision = "highest"
     torch.set_float32_matmul_precision(precision)
-    limit = {"max_episode_steps": args.max_episode_steps}
+    kwargs = noisy.parse_env_kwargs(args.env_kwargs)
+    kwargs["max_episode_steps"] = args.max_episode_steps
     with contextlib.ExitStack() as environments:  # which are closed in the end
         with fail_on((gym.error.Error, noisy.SpaceError), f"--env-id {args.env_id}"):
             noisy.seed_globals(TEST_SEED)  # a constructor may draw: all runs have the same tests
-            test_env = environments.enter_context(make_env(args.env_id, **limit))
+            test_env = environments.enter_context(make_env(args.env_id, **kwargs))
             noisy.seed_globals(args.seed)
-            env = environments.enter_context(make_env(args.env_id, **limit))
+            env = environments.enter_context(make_env(args.env_id, **kwargs))
         with fail_on(ValueError, f"--noise or --test-noise in {args.env_id}"):
             env = noisy.make_noisy(env, args.noise, args.noise_rate)
             test_env = noisy.make_noisy(test_env, args.test_noise, args.test_noise_rate)
@@ -526,8 +528,7 @@ class Run:
     def __init__(self, args, env):
         """Open the folder; exit if another process uses it, or if it holds a different run."""
         self.args, self.env = args, env
-        name = noisy.run_name(args.env_id, args.exp_name, args.noise, args.noise_rate, args.seed)
-        self.folder = Path(args.runs_dir, name)
+        self.folder = noisy.run_folder(asdict(args))
         if self.folder.is_symlink():
             fail(f"{self.folder} is a link: remove it, or choose another --exp-name or --runs-dir")
         self.folder.mkdir(parents=True, exist_ok=True)
