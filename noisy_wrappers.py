@@ -2493,6 +2493,32 @@ def make_flat(env: Env, step_limit: int | None = None) -> Env:
     raise SpaceError(problem)
 
 
+def make_environments(
+    make_env: Callable[..., Env], args: Mapping[str, Any], test_seed: int
+) -> tuple[Env, Env]:
+    """Make a run's two environments by a script's ``make_env`` and arguments: training, test.
+
+    The one has the noise of the training, the other that of the tests, usually none. What their
+    constructors draw from the global generators depends on the run's seed, or on ``test_seed``.
+
+    Raises:
+        SpaceError: as :func:`make_flat`, or a noise cannot act in this environment.
+    """
+    kwargs = parse_env_kwargs(args["env_kwargs"])
+    kwargs["max_episode_steps"] = args["max_episode_steps"]
+    seed_globals(test_seed)
+    test_env = make_env(args["env_id"], **kwargs)
+    seed_globals(args["seed"])
+    env = make_env(args["env_id"], **kwargs)
+    try:
+        noisy_env = make_noisy(env, args["noise"], args["noise_rate"])
+        return noisy_env, make_noisy(test_env, args["test_noise"], args["test_noise_rate"])
+    except ValueError as error:
+        env.close()
+        test_env.close()
+        raise SpaceError(str(error)) from error
+
+
 def into_space(action: NDArray[Any], space: gym.spaces.Box) -> NDArray[Any]:
     """Return an action in its space's dtype and, to the last bit, within its bounds.
 

@@ -505,17 +505,9 @@ def train(args, stop=lambda: 0):
     if with_amx or args.cuda or precision == "bf16":  # "medium" is bf16 with AMX, TF32 on a GPU
         precision = "highest"
     torch.set_float32_matmul_precision(precision)
-    kwargs = noisy.parse_env_kwargs(args.env_kwargs)
-    kwargs["max_episode_steps"] = args.max_episode_steps
-    with contextlib.ExitStack() as environments:  # which are closed in the end
-        with fail_on((gym.error.Error, noisy.SpaceError), f"--env-id {args.env_id}"):
-            noisy.seed_globals(TEST_SEED)  # a constructor may draw: all runs have the same tests
-            test_env = environments.enter_context(make_env(args.env_id, **kwargs))
-            noisy.seed_globals(args.seed)
-            env = environments.enter_context(make_env(args.env_id, **kwargs))
-        with fail_on(ValueError, f"--noise or --test-noise in {args.env_id}"):
-            env = noisy.make_noisy(env, args.noise, args.noise_rate)
-            test_env = noisy.make_noisy(test_env, args.test_noise, args.test_noise_rate)
+    with fail_on((gym.error.Error, noisy.SpaceError), f"--env-id {args.env_id}"):
+        env, test_env = noisy.make_environments(make_env, asdict(args), TEST_SEED)
+    with env, test_env:  # which closes them
         return learn(args, env, test_env, stop)
 
 
@@ -549,6 +541,7 @@ class Run:
             say("the script has changed since the run began; if it matters, use --exp-name")
         noises = " + ".join(map("{} at {}".format, args.noise, args.noise_rate)) or "no noise"
         begun = f"{self.config['algorithm']} on {args.env_id}, {noises}, seed {args.seed}"
+        begun += " (compiles first, which takes a while)" if args.compile else ""
         say(f"{self.folder} is finished" if self.is_finished else f"{begun}: {self.folder}")
 
     def resume(self, state):
