@@ -21,8 +21,8 @@ import td3_continuous_noisy as td3
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = {"SAC": sac, "TD3": td3, "PPO": ppo}
-OFF_POLICY = {"total_timesteps": 60, "learning_starts": 20, "batch_size": 8, "buffer_size": 50}
-ON_POLICY = {"total_timesteps": 60, "num_steps": 12, "num_minibatches": 3, "update_epochs": 2}
+OFF_POLICY = {"total_timesteps": 60, "learning_starts": 40, "batch_size": 8, "buffer_size": 50}
+ON_POLICY = {"total_timesteps": 60, "num_steps": 12, "num_minibatches": 3, "update_epochs": 1}
 SMALL = {"SAC": OFF_POLICY, "TD3": OFF_POLICY, "PPO": ON_POLICY}
 
 each_script = pytest.mark.parametrize("algorithm", SCRIPTS)

@@ -51,7 +51,8 @@ HOPPER |= {"test_noise": ("RandomObservationBias(0.1)",), "test_noise_rate": (1.
 HOPPER |= {"total_timesteps": 260, "eval_frequency": 70, "eval_episodes": 2}
 HOPPER |= {"checkpoint_frequency": 40}
 ROLLOUTS = {"num_steps": 60, "num_minibatches": 4, "update_epochs": 2}
-OFF_POLICY = {"learning_starts": 110, "batch_size": 16, "buffer_size": 150}  # it overflows
+OFF_POLICY = {"total_timesteps": 200, "learning_starts": 110}
+OFF_POLICY |= {"batch_size": 16, "buffer_size": 120}  # which overflows
 EARLY, EXPLORING, LATE = 2, 5, 10  # ends of an episode: near steps 25, 75 and 150
 TRAINING_STEP = "gymnasium.wrappers.RecordEpisodeStatistics.step"
 
@@ -220,7 +221,7 @@ def test_stopped_at_random_moments_it_ends_as_if_left_alone(algorithm, alone, tm
     for n in range(6):
         action, code = [(die, -signal.SIGKILL), (send(signal.SIGTERM), 143)][n % 2]
         result = command(
-            algorithm, tmp_path, (TRAINING_STEP, rng.randint(1, 75), action), **hopper(algorithm)
+            algorithm, tmp_path, (TRAINING_STEP, rng.randint(1, 60), action), **hopper(algorithm)
         )
         if result.code == 0:  # it was at its end before
             break

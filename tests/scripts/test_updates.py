@@ -34,7 +34,7 @@ from noisy_wrappers import (
 ENV = "toy_envs:Tiny-v0"
 SMALL = {"env_id": ENV, "seed": 3, "eval_episodes": 1, "eval_frequency": 7, "compile": False}
 SMALL |= {"matmul_precision": "highest", "gamma": 0.9}
-OFF_POLICY = SMALL | {"total_timesteps": 70, "learning_starts": 30, "buffer_size": 40}
+OFF_POLICY = SMALL | {"total_timesteps": 55, "learning_starts": 30, "buffer_size": 40}
 OFF_POLICY |= {"batch_size": 12, "tau": 0.1}
 ON_POLICY = SMALL | {"total_timesteps": 100, "num_steps": 32, "num_minibatches": 4}
 ON_POLICY |= {"update_epochs": 3, "learning_rate": 1e-3}
@@ -261,7 +261,7 @@ def assert_equal_networks(state, *networks):
 @pytest.mark.parametrize(
     "case",
     [
-        {},
+        pytest.param({}, marks=pytest.mark.slow),
         {"autotune": False, "alpha": 0.4},
         {"policy_frequency": 3, "target_network_frequency": 2, "q_lr": 3e-3, **NOISE},
     ],
@@ -288,7 +288,7 @@ def test_sac_trains_as_a_plain_implementation(case, tmp_path):
 @pytest.mark.parametrize(
     "case",
     [
-        {},
+        pytest.param({}, marks=pytest.mark.slow),
         {"policy_frequency": 3, "policy_noise": 1.0, "noise_clip": 0.7, "exploration_noise": 0.8},
         {"policy_frequency": 1, "learning_rate": 1e-3, **NOISE},
     ],
