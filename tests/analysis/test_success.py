@@ -51,9 +51,7 @@ def test_the_verdict_is_in_percentage_points(runs_dir, capsys):
     out = runs_dir / "out"
     analyze.main(analyze.Args(runs_dir, out, metric="success_rate"))
     said = capsys.readouterr().out
-    found = (
-        rf"{ENV} with {re.escape(SCALE)} at rate 1.00 is better than no noise: \+40 \[\d+, \d+\]"
-    )
+    found = rf"{ENV} with {re.escape(SCALE)} at rate 1.00 is better than no noise: \+40 \[.*\]"
     assert re.search(f"{found} percentage points of success, p = 0.048", said)
     assert not re.search(r"\(\+\d+ %\)", said)
     for name in ("best.csv", "noises.csv", "summary_SAC.csv"):

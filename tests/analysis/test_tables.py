@@ -99,7 +99,10 @@ def test_rates_with_too_few_of_all_seeds_have_no_verdict(tmp_path, capsys):
     rates = tables["statistics"].query("noise == @SCALE")
     assert rates[["p", "verdict"]].isna().all(axis=None) and rates["difference_low"].notna().all()
     assert tables["noises"]["verdict"].tolist() == ["better"]  # 10 against 20
-    assert "with 5/20 seeds with and without noise rows of a single rate" in capsys.readouterr().out
+    assert (
+        "with 5/20 seeds with and without noise single rates have no verdict"
+        in capsys.readouterr().out
+    )
 
 
 def test_a_runs_value_is_the_mean_of_its_tests_in_the_last_15_percent(tmp_path):
