@@ -48,14 +48,13 @@ from tqdm import tqdm
 import noisy_wrappers as noisy
 from analysis import folders
 from analysis.errors import fail, in_words, take_over_terminal, with_place
-from analysis.folders import PHASES, DamageError
+from analysis.folders import NOT_SETTINGS, PHASES, DamageError
 from analysis.formatting import rounded, slug
 from analysis.runs import (
     ROBUSTNESS_COLUMNS,
     study_name,
     study_of,
     usual_config,
-    what_differs,
     where_tested,
 )
 from analysis.statistics import mean_std
@@ -218,11 +217,12 @@ def load(player, render_mode=None):
     noisy.seed_globals(Args.seed)  # as every episode does: the constructor may draw, too
     own = {} if player.elsewhere else kwargs
     with script.make_env(player.environment, **steps, **own, **drawn) as env:
-        if player.elsewhere:
+        if run.release != "0.3":
+            check_spaces(player, noisy.Spaces(run.config), env)
+        elif player.elsewhere:  # config.json does not tell the spaces of the training
             with script.make_env(run.environment, **steps, **kwargs) as trained_in:
                 check_spaces(player, trained_in, env)
         try:
-            # a run of 0.3 does not tell the spaces of its training
             policy = script.load_policy(player.folder, env if run.release == "0.3" else None)
         except Exception as error:  # a damaged file may raise anything
             text = f"policy.pt is not a policy for {player.environment}: {in_words(error)}"
@@ -231,13 +231,16 @@ def load(player, render_mode=None):
 
 
 def check_spaces(player, trained_in, env):
-    """Raise ValueError unless both environments have the same spaces."""
-    for name in ("observation_space", "action_space"):
-        here, there = getattr(trained_in, name), getattr(env, name)
-        if here != there:
+    """Raise ValueError unless a policy fits an environment; noise may have widened observations."""
+    spaces = [
+        ("observation space", trained_in.observation_space, env.observation_space),
+        ("action space", trained_in.action_space, env.action_space),
+    ]
+    for name, trained, here in spaces:
+        if trained.shape != here.shape or (name == "action space" and trained != here):
             raise ValueError(
-                f"--env-id {player.elsewhere}: its {name} is {there}, that of "
-                f"{player.run.environment} is {here}; a policy needs the same"
+                f"policy.pt is not a policy for {player.environment}: its {name} is {here}, that "
+                f"of the training was {trained}"
             )
 
 
@@ -307,7 +310,10 @@ def tell(bad):
 
 
 def play(player, condition, args):
-    """Play episodes, and store them; or draw one. Return an array: see noisy_wrappers.play."""
+    """Play episodes, and store them; or draw one. Return [(return, length, success), ...].
+
+    Success is 1 or 0, or NaN where the environment does not tell it.
+    """
     with load(player, args.drawing) as (env, policy):
         with warnings.catch_warnings(action="ignore"):  # check_players has told them
             noisy_env = condition.wrap(env)
@@ -315,26 +321,32 @@ def play(player, condition, args):
             place = f"__{slug(player.elsewhere)}" if player.elsewhere else ""
             name = f"{player.folder.name}__{condition.slug or 'clean'}{place}.mp4"
             return record(noisy_env, policy, args.seed, args.video / name)
-        results = noisy.play(noisy_env, policy, 1 if args.render else args.episodes, args.seed)
+        results = played(noisy_env, policy, 1 if args.render else args.episodes, args.seed)
     if args.stores(player):
         store(player, player.key(condition), results)
     return results
 
 
 def record(env, policy, seed, path):
-    """Play an episode into a video; return what noisy_wrappers.play does."""
+    """Play an episode into a video; return what `play` does."""
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".") as temporary:
         UNFINISHED_VIDEOS.add(temporary)
         folder = Path(temporary, "video")  # a new one: RecordVideo warns of one that exists
         video = RecordVideo(env, str(folder))  # of the first episode
         try:
-            results = noisy.play(video, policy, 1, seed)
+            results = played(video, policy, 1, seed)
         finally:
             if video.recording:
                 video.stop_recording()
         (folder / "rl-video-episode-0.mp4").replace(path)
     UNFINISHED_VIDEOS.discard(temporary)
     return results
+
+
+def played(env, policy, episodes, seed):
+    """Return what `play` does of some episodes."""
+    results = noisy.play(env, policy, episodes, seed).tolist()
+    return [(value, int(length), success) for value, length, success in results]
 
 
 def exit_now(status):
@@ -401,11 +413,10 @@ def read_stored(player):
 def store(player, key, results):
     """Add a condition to robustness.csv, beside what other processes have stored meanwhile."""
     path = player.folder / "robustness.csv"
-    played = [(value, int(length), success) for value, length, success in results.tolist()]
     try:
         with folders.rewritten(path) as file:
             stored = read_stored(player)
-            stored[key] = max(stored.get(key, []), played, key=len)
+            stored[key] = max(stored.get(key, []), results, key=len)
             rows = [
                 (*condition, i, *result, environment or None)
                 for (*condition, environment), played in stored.items()
@@ -426,8 +437,9 @@ def names_of(players):
     usual = {key: usual_config(configs) for key, configs in studies.items()}
     for player in players:
         key = study_of(player.run)
-        own = what_differs(player.run.config, usual[key])
-        yield f"{study_name(*key)}, {own}" if own else study_name(*key)
+        differing = noisy.different_arguments(player.run.config, usual[key], NOT_SETTINGS)
+        own = [f"{name}={value}" for name, (value, _) in sorted(differing.items())]
+        yield ", ".join([study_name(*key), *own])
 
 
 def print_table(players, conditions, stored, episodes):
@@ -554,7 +566,7 @@ def main(args):
                 print(f"error: {text}", file=sys.stderr)
         elif args.drawing:
             [(drawn, steps, _)] = results
-            print(f"{player.folder.name}, {name}: return {rounded(drawn)}, {steps:.0f} steps")
+            print(f"{player.folder.name}, {name}: return {rounded(drawn)}, {steps} steps")
     if not args.drawing:
         tell(failed)
         if players := [player for player in players if player.folder not in failed]:
