@@ -89,12 +89,6 @@ def ours(samples):
     return np.array([bootstrap_iqm(sample[:, None])[1:] for sample in samples]).T
 
 
-def scipys(samples, method):
-    settings = {"n_resamples": 999, "method": method, "axis": -1, "rng": np.random.default_rng(0)}
-    done = stats.bootstrap((samples,), lambda x, axis: stats.trim_mean(x, 0.25, axis), **settings)
-    return done.confidence_interval
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("n", "usual", "mixtures"), [(3, 94, 75), (5, 96, 85), (10, 95, 89)])
 def test_coverage_of_the_iqm_is_what_the_page_says(n, usual, mixtures):
@@ -102,13 +96,6 @@ def test_coverage_of_the_iqm_is_what_the_page_says(n, usual, mixtures):
     assert int(covered(n, ours, MIXTURES)) == mixtures
     page = " ".join(DOCS.read_text().split())
     assert f"| {n} | {usual} % | {mixtures} % |" in page
-
-
-@pytest.mark.slow
-def test_coverage_of_the_alternatives_at_five_seeds_is_lower():
-    for method in ("percentile", "basic", "BCa"):
-        assert covered(5, lambda samples, method=method: scipys(samples, method)) < 93
-    assert covered(5, ours) > 93
 
 
 @pytest.mark.slow
@@ -185,11 +172,9 @@ def test_the_change_of_an_iqm_is_relative_to_the_baselines_iqm():
 
 def test_no_change_of_positive_returns_is_below_minus_100_percent():
     """Over environments, too, where the baseline's own IQM of changes is not zero."""
-    rng = np.random.default_rng(0)
-    y = rng.lognormal(5, 1, (5, 3))
-    x = 0.01 * y
-    value, low, _ = bootstrap_iqm(x, y)
-    assert np.isnan(value) or (value >= -100 and low >= -100)
+    y = np.array([[145.0, 95], [196, 192], [69, 86], [87, 85], [141, 108]])
+    value, low, _ = bootstrap_iqm(0.01 * y[:3], y)
+    assert value == low == -100
     found = bootstrap_iqm(np.array([[1.0], [2], [90]]), np.array([[100.0], [110], [120]]))
     assert found[0] > found[1] == -100
 
