@@ -131,6 +131,7 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.opportunities = 0
         self.times_applied = 0
         self._counted = True  # since the last opportunity, in times_applied
+        self.relative, self._spread = False, None
         self._position = len(_layers(env, NoiseWrapper))
         self._seed(None)
 
@@ -184,13 +185,16 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             self._seed(seed)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the random streams and the counters, to be taken between two episodes."""
-        return {
+        """Return the streams, the counters and the estimates, to be taken between two episodes."""
+        state = {
             "gate": self._gate.bit_generator.state,
             "noise": self.noise.bit_generator.state,
             "opportunities": self.opportunities,
             "times_applied": self.times_applied,
         }
+        if self._spread is not None:
+            state["spread"] = _without_arrays(vars(self._spread))
+        return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a :meth:`state_dict`; the next call must be ``reset()``."""
@@ -198,12 +202,19 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.noise.bit_generator.state = state["noise"]
         self.opportunities = state["opportunities"]
         self.times_applied = state["times_applied"]
+        if self._spread is not None:
+            self._spread = _Spread(**state["spread"])
 
     def _seed(self, seed: int | None) -> None:
         name = zlib.crc32(type(self).__name__.encode())
         entropy = None if seed is None else [seed, name, self._position]
         seeds = np.random.SeedSequence(entropy).spawn(2)
         self._gate, self.noise = map(np.random.default_rng, seeds)
+
+    def _be_relative(self, relative: bool) -> None:
+        """Measure the spread of what is received, if the noise is in units of that."""
+        self.relative = _flag("relative", relative)
+        self._spread = _Spread() if relative else None
 
     def acts(self) -> bool:
         """Decide with probability p whether the noise acts now: on this step, or in this episode.
@@ -220,13 +231,39 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         That is a new dict: the environment may reuse its own. The first mark after an opportunity
         counts in ``times_applied``.
         """
-        self.times_applied += not self._counted
-        self._counted = True
-        name = type(self).__name__
+        if not self._counted:
+            self._counted = True
+            self.times_applied += 1
         below = info.get("noise")
         if not isinstance(below, tuple):  # nothing, or the environment's own
             below = ()
-        return {**info, "noise": (*below, name)}
+        return {**info, "noise": (*below, type(self).__name__)}
+
+
+class _Spread:
+    """The standard deviation of each dimension of what a wrapper received (Welford's algorithm).
+
+    It is 0 until 100 samples are in, so noise that is relative to it begins then. A sample that is
+    not finite does not count.
+    """
+
+    def __init__(self, count: int = 0, mean: Any = 0.0, squares: Any = 0.0):
+        """Begin, or continue from the variables of another one, in which arrays may be lists."""
+        self.count = count
+        self.mean = np.asarray(mean) if isinstance(mean, list) else mean
+        self.squares = np.asarray(squares) if isinstance(squares, list) else squares
+
+    def add(self, sample: Any) -> None:
+        """Take in an array or a number."""
+        if math.isfinite(np.sum(sample)):
+            self.count += 1
+            difference = sample - self.mean
+            self.mean = self.mean + difference / self.count
+            self.squares = self.squares + difference * (sample - self.mean)
+
+    @property
+    def deviation(self) -> Any:
+        return (self.squares / (self.count - 1)) ** 0.5 if self.count >= 100 else 0.0
 
 
 # ---------------------------------------------------------------------------- noise on observations
@@ -243,6 +280,9 @@ class ObservationNoise(NoiseWrapper):
     What is perturbed has the dtype of its space, and its shape; integers are computed in float64,
     rounded and clipped to their dtype. The space is widened to what noise can reach. The
     observation of ``reset()`` is perturbed like any other.
+
+    With ``relative`` the noise is in standard deviations of each number, which are estimated of all
+    observations that this wrapper has received; the first 99 stay clean.
     """
 
     kind = "observation"
@@ -252,6 +292,9 @@ class ObservationNoise(NoiseWrapper):
         self.keys = _keys(keys)
         super().__init__(env, noise_rate, **parameters, keys=self.keys)
         self._boxes = {} if isinstance(env, _ProbeEnv) else self._find_boxes(env)
+        self._shape: tuple[int, ...] = (sum(math.prod(b.shape) for b in self._boxes.values()),)
+        if () in self._boxes:
+            self._shape = self._boxes[()].shape  # of what is perturbed
 
     def _find_boxes(self, env: Env) -> dict[EntryPath, gym.spaces.Box]:
         """Return the entries to perturb: {path in the observation: their space}."""
@@ -279,7 +322,8 @@ class ObservationNoise(NoiseWrapper):
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and perturb the first observation with probability p."""
-        return self._observe(*super().reset(seed=seed, options=options))
+        observation, info = super().reset(seed=seed, options=options)
+        return self._observe(observation, info)
 
     def step(self, action: Any) -> Step:
         """Step the environment and perturb the observation with probability p."""
@@ -288,14 +332,32 @@ class ObservationNoise(NoiseWrapper):
         return observation, reward, terminated, truncated, info
 
     def _observe(self, observation: Any, info: Info) -> tuple[Any, Info]:
+        """Return what is seen of an observation, and the info."""
+        if self._spread is not None:
+            self._spread.add(self._numbers(observation))
         if not self.acts():
             return observation, info
-        given = self._numbers(observation)
-        noisy = self._with_numbers(observation, self._perturb(given))
-        same = self._with_numbers(observation, given)  # an environment may return another dtype
-        if not np.array_equal(self._numbers(noisy), self._numbers(same), equal_nan=True):
-            info = self.mark(info)
-        return noisy, info
+        return self._perturbed(observation, self._numbers(observation), info)
+
+    def _perturbed(self, observation: Any, given: NDArray[Any], info: Info) -> tuple[Any, Info]:
+        """Return an observation with noise, in which ``given`` are the numbers, and the info."""
+        numbers = np.asarray(self._perturb(given))
+        if numbers.shape != given.shape:
+            wanted = f"an array of shape {given.shape}, not {numbers.shape}"
+            raise ValueError(f"{type(self).__name__}._perturb must return {wanted}")
+        parts: dict[EntryPath, NDArray[Any]] = {}
+        start, changed = 0, False
+        for path, box in self._boxes.items():
+            part, clean = numbers, given
+            if path:  # a part of the vector
+                end = start + math.prod(box.shape)
+                part = numbers[start:end].reshape(box.shape)
+                clean = given[start:end].reshape(box.shape)
+                start = end
+            parts[path] = _cast(part, box.dtype)
+            # an environment may return another dtype than that of its space: that is no noise
+            changed = changed or _differ(parts[path], _cast(clean, box.dtype))
+        return _replaced(observation, parts), self.mark(info) if changed else info
 
     def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
         """Return the numbers of an observation with noise, a new array.
@@ -304,27 +366,27 @@ class ObservationNoise(NoiseWrapper):
         """
         raise NotImplementedError
 
+    def _in_units(self, noise: NDArray[Any]) -> NDArray[Any]:
+        """Return additive noise in units of the observation."""
+        return noise if self._spread is None else noise * self._spread.deviation
+
     def _numbers(self, observation: Any) -> NDArray[Any]:
         """Return a copy of the entries to perturb, which must not be written to."""
         if () in self._boxes:
             numbers = np.array(observation, np.float64)
         else:
             parts = [functools.reduce(operator.getitem, path, observation) for path in self._boxes]
-            numbers = np.concatenate([np.asarray(part, np.float64).ravel() for part in parts])
+            numbers = np.concatenate(parts, axis=None, dtype=np.float64)
         numbers.flags.writeable = False
         return numbers
 
-    def _with_numbers(self, observation: Any, numbers: NDArray[Any]) -> Any:
-        """Return a new observation with these numbers in place of :meth:`_numbers`."""
-        if () in self._boxes:
-            return _cast(numbers, self._boxes[()].dtype)
-        ends = np.cumsum([math.prod(box.shape) for box in self._boxes.values()])
-        parts = {}
-        for (path, box), part in zip(
-            self._boxes.items(), np.split(numbers, ends[:-1]), strict=True
-        ):
-            parts[path] = _cast(part.reshape(box.shape), box.dtype)
-        return _replaced(observation, parts)
+    def _check_scales(self, scale: float | tuple[float, ...], given: Any) -> None:
+        """Raise ValueError unless a tuple of scales, given by the user, fits the observation."""
+        if isinstance(scale, tuple) and self._boxes and self._shape != (len(scale),):
+            raise ValueError(
+                f"scale has {len(scale)} numbers and the observation has shape {self._shape}: "
+                f"give one number for all dimensions or one for each, got {given!r}"
+            )
 
     def _widen(self, ends_of: Callable[[NDArray[Any]], Sequence[Any]]) -> None:
         """Extend the observation space to what ``ends_of`` says noise makes of its bounds."""
@@ -346,7 +408,8 @@ class RandomNormalNoisyObservation(ObservationNoise):
 
     ``scale`` is the paper's sigma, in units of the observation: one number for all dimensions, or a
     tuple with one for each of a one-dimensional observation. e = ``noise.normal(loc, scale,
-    o.shape)``. noisyenv 0.1.1 takes loc before scale.
+    o.shape)``; with ``relative`` times the standard deviation of each dimension. noisyenv 0.1.1
+    takes loc before scale.
 
     >>> env = RandomNormalNoisyObservation(gym.make("CartPole-v1"), 1.0, 0.1)
     >>> observation, info = env.reset(seed=0)
@@ -363,46 +426,58 @@ class RandomNormalNoisyObservation(ObservationNoise):
         scale: float | tuple[float, ...],
         *,
         loc: float = 0.0,
+        relative: bool = False,
         keys: Keys = None,
     ):
         """Raise ValueError unless scale >= 0, both are finite and a tuple fits the observation."""
         self.scale = _scale_or_scales(scale)
         self.loc = _number("loc", loc)
-        super().__init__(env, noise_rate, scale=self.scale, loc=self.loc, keys=keys)
-        if isinstance(self.scale, tuple) and self._boxes:
-            shape = (sum(math.prod(box.shape) for box in self._boxes.values()),)
-            if () in self._boxes:
-                shape = self._boxes[()].shape
-            if shape != (len(self.scale),):
-                raise ValueError(
-                    f"scale has {len(self.scale)} numbers and the observation has shape {shape}: "
-                    f"give one number for all dimensions or one for each, got {scale!r}"
-                )
+        super().__init__(
+            env, noise_rate, scale=self.scale, loc=self.loc, relative=relative, keys=keys
+        )
+        self._be_relative(relative)
+        self._check_scales(self.scale, scale)
         self._widen(lambda bound: (-np.inf, np.inf))
 
     def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
-        return observation + self.noise.normal(self.loc, self.scale, observation.shape)
+        noise = self.noise.normal(self.loc, self.scale, observation.shape)
+        return observation + self._in_units(noise)
 
 
 class RandomUniformNoisyObservation(ObservationNoise):
     """Adds uniform noise to the observation: o + e with each e_i ~ U(low, high) (section 3.1).
 
     ``low`` and ``high`` are the paper's alpha and beta, in units of the observation;
-    e = ``noise.uniform(low, high, o.shape)``.
+    e = ``noise.uniform(low, high, o.shape)``; with ``relative`` times the standard deviation of
+    each dimension.
 
     >>> env = RandomUniformNoisyObservation(gym.make("CartPole-v1"), 1.0, -0.1, 0.1)
     >>> env.reset(seed=0)[0]
     array([ 0.01826801, -0.01052575, -0.1353507 , -0.00589376], dtype=float32)
     """
 
-    def __init__(self, env: Env, noise_rate: Rate, low: float, high: float, *, keys: Keys = None):
+    def __init__(
+        self,
+        env: Env,
+        noise_rate: Rate,
+        low: float,
+        high: float,
+        *,
+        relative: bool = False,
+        keys: Keys = None,
+    ):
         """Raise ValueError unless low <= high and both are finite."""
         self.low, self.high = _interval(low, high)
-        super().__init__(env, noise_rate, low=self.low, high=self.high, keys=keys)
-        self._widen(lambda bound: (bound + self.low, bound + self.high))
+        super().__init__(
+            env, noise_rate, low=self.low, high=self.high, relative=relative, keys=keys
+        )
+        self._be_relative(relative)
+        unknown = (-np.inf, np.inf)  # the standard deviations
+        self._widen(lambda bound: unknown if relative else (bound + self.low, bound + self.high))
 
     def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
-        return observation + self.noise.uniform(self.low, self.high, observation.shape)
+        noise = self.noise.uniform(self.low, self.high, observation.shape)
+        return observation + self._in_units(noise)
 
 
 class RandomUniformScaleObservation(ObservationNoise):
@@ -446,7 +521,9 @@ class RandomMixupObservation(ObservationNoise):
     ``factor`` is the paper's lambda. o_(t-1) is what this wrapper received at the last step, noise
     of inner wrappers included and its own excluded; ``recursive=True`` blends with what it
     returned instead. The first observation of an episode has no predecessor: it passes untouched
-    and is no opportunity. No noise is drawn besides the gate's.
+    and is no opportunity. No noise is drawn besides the gate's. With factor = 0 the agent sees the
+    observation of the step before; with ``recursive`` it keeps seeing the last one that arrived, as
+    where a sensor's packet is lost.
 
     noisyenv 0.1.1 remembers what it returned, as ``recursive=True`` does, so with p = 1 and
     factor = 0 the agent sees one observation forever; and it blends the first observation of an
@@ -479,12 +556,14 @@ class RandomMixupObservation(ObservationNoise):
         self._previous = None
 
     def _observe(self, observation: Any, info: Info) -> tuple[Any, Info]:
-        returned = observation
-        if self._previous is not None:
-            returned, info = super()._observe(observation, info)
-        # A copy: the environment may write its next observation into the same array.
-        self._previous = self._numbers(returned if self.recursive else observation)
-        return returned, info
+        received = self._numbers(observation)  # a copy: the environment may reuse its array
+        remembered = received
+        if self._previous is not None and self.acts():
+            observation, info = self._perturbed(observation, received, info)
+            if self.recursive:
+                remembered = self._numbers(observation)
+        self._previous = remembered
+        return observation, info
 
     def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
         assert self._previous is not None
@@ -492,7 +571,7 @@ class RandomMixupObservation(ObservationNoise):
             return (observation if self.factor else self._previous).copy()
         mixture = self.factor * observation + (1 - self.factor) * self._previous
         low, high = np.minimum(observation, self._previous), np.maximum(observation, self._previous)
-        return np.clip(mixture, low, high)  # rounding must not leave the observation space
+        return np.minimum(np.maximum(mixture, low), high)  # rounding must not leave the space
 
 
 class RandomDropoutObservation(ObservationNoise):
@@ -517,6 +596,98 @@ class RandomDropoutObservation(ObservationNoise):
         return np.where(self.noise.random(observation.shape) < self.keep_prob, observation, 0.0)
 
 
+class RandomObservationBias(ObservationNoise):
+    """Adds the same e ~ N(0, scale^2 I) to all observations of an episode. Not in the paper.
+
+    At ``reset()`` the episode is chosen with probability p, and e is drawn, ``noise.normal(0,
+    scale, o.shape)``; it is drawn for the others too, so that a higher rate leaves the chosen
+    episodes as they are. ``scale`` is in units of the observation, one number or a tuple with one
+    for each dimension; with ``relative``, in its standard deviations before this episode.
+    ``times_applied`` counts episodes. It is how a sensor fails that is calibrated badly.
+
+    >>> env, bare = gym.make("CartPole-v1"), gym.make("CartPole-v1")
+    >>> env = RandomObservationBias(env, 1.0, 0.1)
+    >>> (env.reset(seed=0)[0] - bare.reset(seed=0)[0]).round(4)
+    array([ 0.0398, -0.0424, -0.0879,  0.1642], dtype=float32)
+    >>> (env.step(0)[0] - bare.step(0)[0]).round(4)
+    array([ 0.0398, -0.0424, -0.0879,  0.1642], dtype=float32)
+    """
+
+    def __init__(
+        self,
+        env: Env,
+        noise_rate: Rate,
+        scale: float | tuple[float, ...],
+        *,
+        relative: bool = False,
+        keys: Keys = None,
+    ):
+        """Raise ValueError unless scale >= 0 is finite and a tuple fits the observation."""
+        self.scale = _scale_or_scales(scale)
+        super().__init__(env, noise_rate, scale=self.scale, relative=relative, keys=keys)
+        self._be_relative(relative)
+        self._check_scales(self.scale, scale)
+        self._widen(lambda bound: (-np.inf, np.inf))
+        self._bias: NDArray[Any] | None = None  # of the episode, if it is chosen
+
+    def _begin(self, seed: int | None) -> None:
+        super()._begin(seed)
+        bias = self._in_units(self.noise.normal(0, self.scale, self._shape))
+        self._bias = bias if self.acts() else None
+
+    def _observe(self, observation: Any, info: Info) -> tuple[Any, Info]:
+        received = self._numbers(observation)
+        if self._spread is not None:
+            self._spread.add(received)
+        if self._bias is None:
+            return observation, info
+        return self._perturbed(observation, received, info)
+
+    def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
+        return observation + self._bias
+
+
+class RandomObservationDelay(ObservationNoise):
+    """Shows the observations of an episode k steps late, k uniform on low, ..., high. Our own.
+
+    At ``reset()`` the episode is chosen with probability p, and k is drawn,
+    ``noise.integers(low, high, endpoint=True)``; it is drawn for the others too, so that a higher
+    rate leaves the chosen episodes as they are. In a chosen episode the agent sees what was there k
+    steps before, and until then what ``reset()`` gave: with k = 2 it sees o0 o0 o0 o1 o2. ``high``
+    is ``low`` by default. ``times_applied`` counts the episodes in which it changed something.
+
+    >>> env = RandomObservationDelay(gym.make("CartPole-v1"), 1.0, 1)
+    >>> seen = [env.reset(seed=0)[0], env.step(0)[0], env.step(0)[0]]
+    >>> bool((seen[0] == seen[1]).all()), bool((seen[1] == seen[2]).any())
+    (True, False)
+    """
+
+    def __init__(
+        self, env: Env, noise_rate: Rate, low: int, high: int | None = None, *, keys: Keys = None
+    ):
+        """Raise ValueError unless 0 <= low <= high are integers."""
+        self.low, self.high = _whole_interval(low, high, least=0)
+        unlike = None if self.high == self.low else self.high
+        super().__init__(env, noise_rate, low=self.low, high=unlike, keys=keys)
+        self._delay = 0
+        self._received: deque[NDArray[Any]] = deque()  # what is seen now, and what waits
+
+    def _begin(self, seed: int | None) -> None:
+        super()._begin(seed)
+        delay = int(self.noise.integers(self.low, self.high, endpoint=True))
+        self._delay = delay if self.acts() else 0
+        self._received = deque(maxlen=min(self._delay + 1, sys.maxsize))
+
+    def _observe(self, observation: Any, info: Info) -> tuple[Any, Info]:
+        if not self._delay:
+            return observation, info
+        self._received.append(self._numbers(observation))
+        return self._perturbed(observation, self._received[-1], info)
+
+    def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
+        return self._received[0].copy()
+
+
 # --------------------------------------------------------------------------------- noise on rewards
 
 
@@ -537,6 +708,8 @@ class RewardNoise(NoiseWrapper):
     def step(self, action: Any) -> Step:
         """Step the environment and perturb the reward with probability p."""
         observation, reward, terminated, truncated, info = self.env.step(action)
+        if self._spread is not None:
+            self._spread.add(float(_number_in(reward)))
         if self.acts():
             given: Any = _number_in(reward)
             reward = self._perturb(given)
@@ -548,12 +721,17 @@ class RewardNoise(NoiseWrapper):
         """Return a reward with noise."""
         raise NotImplementedError
 
+    def _in_units(self, noise: float) -> float:
+        """Return additive noise in units of the reward."""
+        return noise if self._spread is None else noise * self._spread.deviation
+
 
 class RandomNormalNoisyReward(RewardNoise):
     """Adds Gaussian noise to the reward: r + e with e ~ N(loc, scale^2) (section 3.2).
 
-    ``scale`` is the paper's sigma, in units of the reward; e = ``noise.normal(loc, scale)``.
-    noisyenv 0.1.1 takes loc before scale.
+    ``scale`` is the paper's sigma, in units of the reward; e = ``noise.normal(loc, scale)``. With
+    ``relative`` it is in standard deviations of the rewards that this wrapper has received; the
+    first 99 stay clean. noisyenv 0.1.1 takes loc before scale.
 
     >>> env = RandomNormalNoisyReward(gym.make("CartPole-v1"), 1.0, 0.1)
     >>> _ = env.reset(seed=0)
@@ -561,21 +739,31 @@ class RandomNormalNoisyReward(RewardNoise):
     1.1210431182607201
     """
 
-    def __init__(self, env: Env, noise_rate: Rate, scale: float, *, loc: float = 0.0):
+    def __init__(
+        self,
+        env: Env,
+        noise_rate: Rate,
+        scale: float,
+        *,
+        loc: float = 0.0,
+        relative: bool = False,
+    ):
         """Raise ValueError unless scale >= 0 and both are finite."""
         self.scale = _number("scale", scale, low=0)
         self.loc = _number("loc", loc)
-        super().__init__(env, noise_rate, scale=self.scale, loc=self.loc)
+        super().__init__(env, noise_rate, scale=self.scale, loc=self.loc, relative=relative)
+        self._be_relative(relative)
 
     def _perturb(self, reward: float) -> float:
-        return reward + self.noise.normal(self.loc, self.scale)
+        return reward + self._in_units(self.noise.normal(self.loc, self.scale))
 
 
 class RandomUniformNoisyReward(RewardNoise):
     """Adds uniform noise to the reward: r + e with e ~ U(low, high) (section 3.2).
 
     ``low`` and ``high`` are the paper's alpha and beta, in units of the reward;
-    e = ``noise.uniform(low, high)``.
+    e = ``noise.uniform(low, high)``. With ``relative`` they are in standard deviations of the
+    rewards that this wrapper has received; the first 99 stay clean.
 
     >>> env = RandomUniformNoisyReward(gym.make("CartPole-v1"), 1.0, -0.1, 0.1)
     >>> _ = env.reset(seed=0)
@@ -583,13 +771,16 @@ class RandomUniformNoisyReward(RewardNoise):
     0.9380732431402061
     """
 
-    def __init__(self, env: Env, noise_rate: Rate, low: float, high: float):
+    def __init__(
+        self, env: Env, noise_rate: Rate, low: float, high: float, *, relative: bool = False
+    ):
         """Raise ValueError unless low <= high and both are finite."""
         self.low, self.high = _interval(low, high)
-        super().__init__(env, noise_rate, low=self.low, high=self.high)
+        super().__init__(env, noise_rate, low=self.low, high=self.high, relative=relative)
+        self._be_relative(relative)
 
     def _perturb(self, reward: float) -> float:
-        return reward + self.noise.uniform(self.low, self.high)
+        return reward + self._in_units(self.noise.uniform(self.low, self.high))
 
 
 class RandomUniformScaleReward(RewardNoise):
@@ -621,7 +812,8 @@ class RandomNormalNoisyAction(NoiseWrapper):
 
     The environment receives a + e clipped to its action space, in the space's dtype; the caller's
     action is left as it is. ``scale`` and ``loc`` are in units of the action, the same in every
-    dimension; e = ``noise.normal(loc, scale, a.shape)``. Action noise is part of the dynamics.
+    dimension; e = ``noise.normal(loc, scale, a.shape)``. With ``relative`` they are in halves of
+    each dimension's range. Action noise is part of the dynamics.
 
     >>> env = RandomNormalNoisyAction(gym.make("Pendulum-v1"), 1.0, 0.5)
     >>> _ = env.reset(seed=0)
@@ -634,27 +826,49 @@ class RandomNormalNoisyAction(NoiseWrapper):
 
     kind = "action"
 
-    def __init__(self, env: Env, noise_rate: Rate, scale: float, *, loc: float = 0.0):
-        """Raise ValueError unless scale >= 0, both are finite and actions are a Box of floats."""
+    def __init__(
+        self,
+        env: Env,
+        noise_rate: Rate,
+        scale: float,
+        *,
+        loc: float = 0.0,
+        relative: bool = False,
+    ):
+        """Raise ValueError unless scale >= 0, both are finite and actions are a Box of floats.
+
+        Its bounds must be finite where noise is relative to them.
+        """
         self.scale = _number("scale", scale, low=0)
         self.loc = _number("loc", loc)
-        super().__init__(env, noise_rate, scale=self.scale, loc=self.loc)
+        super().__init__(env, noise_rate, scale=self.scale, loc=self.loc, relative=relative)
+        self.relative = _flag("relative", relative)
         self._space = env.action_space
         if not _is_box(self._space, "f"):
             raise ValueError(
                 f"RandomNormalNoisyAction needs a Box action space of floats, got {self._space}"
             )
+        if relative and not is_bounded(self._space):
+            raise ValueError(f"relative=True needs bounded actions, got {self._space}")
+        self._low, self._high = (
+            bound.astype(np.float64) for bound in (self._space.low, self._space.high)
+        )
+        self._unit = (self._high - self._low) / 2 if relative else None
 
     def step(self, action: Any) -> Step:
         """Perturb the action with probability p and step the environment."""
         if not self.acts():
             return self.env.step(action)
-        space = self._space
-        noise = self.noise.normal(self.loc, self.scale, space.shape)
-        unclipped = np.asarray(action, np.float64) + noise
-        noisy = np.asarray(np.clip(unclipped, space.low, space.high), space.dtype)
+        dtype = self._space.dtype
+        noise = self.noise.normal(self.loc, self.scale, self._space.shape)
+        if self._unit is not None:
+            noise *= self._unit
+        noisy = np.minimum(
+            np.maximum(np.asarray(action, np.float64) + noise, self._low), self._high
+        )
+        noisy = np.asarray(noisy, dtype)
         observation, reward, terminated, truncated, info = self.env.step(noisy)
-        if (noisy != np.asarray(action, space.dtype)).any():
+        if np.count_nonzero(noisy != np.asarray(action, dtype)):
             info = self.mark(info)
         return observation, reward, terminated, truncated, info
 
@@ -1080,6 +1294,8 @@ WRAPPERS: dict[str, type[NoiseWrapper]] = {
         RandomNormalNoisyAction,
         RandomActionDelay,
         RandomDynamics,
+        RandomObservationBias,
+        RandomObservationDelay,
     )
 }
 
@@ -1107,7 +1323,7 @@ def signatures() -> list[str]:
     """Return the wrappers with their parameters, as a noise is written.
 
     >>> signatures()[0]
-    'RandomNormalNoisyObservation(scale, *, loc=0.0, keys=None)'
+    'RandomNormalNoisyObservation(scale, *, loc=0.0, relative=False, keys=None)'
     """
     found = []
     for name, wrapper in WRAPPERS.items():
@@ -1268,6 +1484,22 @@ class Configuration:
             return cls()
         rates = [re.split(":| to ", rate) for rate in str(noise_rate).split(" + ")]
         return cls(tuple(split_noises(noise)), tuple((float(r[0]), float(r[-1])) for r in rates))
+
+    def for_tests(self) -> Self:
+        """Return it, or raise ValueError if no policy can be tested under it.
+
+        Noise that is relative to observations or rewards would depend on the policy and on earlier
+        tests, and a rate that changes needs a training.
+        """
+        for noise, rate in zip(*self.texts, strict=True):
+            if isinstance(rate, str):
+                raise ValueError(f"a test has no beginning and no end: {noise} at {rate}")
+            _, name, _, arguments = _read_call(noise)
+            measured = name in WRAPPERS and WRAPPERS[name].kind in ("observation", "reward")
+            if measured and arguments.get("relative"):
+                reason = "relative=True would depend on the policy and on earlier tests"
+                raise ValueError(f"{noise} is no noise for a test: {reason}")
+        return self
 
     @property
     def texts(self) -> tuple[list[str], list[Rate]]:
@@ -1677,9 +1909,13 @@ def _replaced(nested: Any, entries: dict[EntryPath, Any]) -> Any:
     """Return a nested observation, or its space, with other entries in containers of its own."""
     if () in entries:
         return entries[()]
-    parts = dict(_items(nested))
-    for key in {path[0] for path in entries}:
-        inner = {path[1:]: entry for path, entry in entries.items() if path[0] == key}
+    parts, deeper = dict(_items(nested)), {}
+    for path, entry in entries.items():
+        if len(path) == 1:
+            parts[path[0]] = entry
+        else:
+            deeper.setdefault(path[0], {})[path[1:]] = entry
+    for key, inner in deeper.items():
         parts[key] = _replaced(parts[key], inner)
     if isinstance(nested, gym.spaces.Dict):
         return gym.spaces.Dict(list(parts.items()))
@@ -1697,6 +1933,30 @@ def _has_categories(env: Env) -> bool:
     """Return whether observations contain categories, which flattening makes numbers of."""
     kinds = gym.spaces.Discrete | gym.spaces.MultiDiscrete | gym.spaces.MultiBinary
     return any(isinstance(part, kinds) for _, part in _entries(env.observation_space))
+
+
+def _differ(one: NDArray[Any], other: NDArray[Any]) -> bool:
+    """Return whether two arrays differ; NaN in both is no difference."""
+    unequal = one != other
+    if not np.count_nonzero(unequal):
+        return False
+    first = unequal.argmax()  # usually there is no NaN, so one look is enough
+    if one.item(first) == one.item(first):
+        return True
+    return bool(np.any(unequal & ~(np.isnan(one) & np.isnan(other))))
+
+
+def is_bounded(space: gym.Space[Any]) -> bool:
+    """Return whether all bounds of a Box are finite; the largest float stands for infinity.
+
+    >>> largest = np.finfo(np.float32).max
+    >>> is_bounded(gym.spaces.Box(-1, 1, (2,))), is_bounded(gym.spaces.Box(-largest, 1, (2,)))
+    (True, False)
+    """
+    if not isinstance(space, gym.spaces.Box):
+        return False
+    bounds = np.abs(np.concatenate([space.low, space.high], axis=None, dtype=np.float64))
+    return bool((bounds < np.finfo(np.float32).max).all())
 
 
 def _cast(values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
@@ -1921,9 +2181,9 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     become floats and the two ends bools; they may be arrays of one element, but not strings.
     Observations, also in dictionaries and tuples, are copied, because an environment may write the
     next one into the same array, and actions, because it may write into those; so are infos, which
-    may be None. An observation that has not the shape of its space, a step of four values and a
-    reset without seed and options raise SpaceError. The spaces are looked up once, because an
-    environment may make new ones, with new generators, at every access.
+    may be None. An observation that has not the shape of its space raises SpaceError. The spaces
+    are looked up once, because an environment may make new ones, with new generators, at every
+    access.
 
     >>> env = FiniteNumbers(gym.make("Pendulum-v1", disable_env_checker=True))
     >>> _ = env.reset(seed=0)
@@ -1947,26 +2207,14 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         base, kinds = self.unwrapped, np.random.Generator | None
         if seed is not None and isinstance(getattr(base, "_np_random", 0), kinds):
             base._np_random, _ = np_random(seed)  # some, as Meta-World's, ignore the seed
-        try:
-            observation, info = self.env.reset(seed=seed, options=options)
-        except (SystemExit, TypeError, ValueError) as error:
-            self._explain(error, "reset(seed=..., options=...) must return (observation, info)")
-            raise
+        observation, info = self.env.reset(seed=seed, options=options)
         return self._checked(observation), dict(info or {})
 
     def step(self, action: Any) -> Step:
         """Step the environment and check the observation and the reward."""
         self._steps += 1
-        try:
-            observation, reward, terminated, truncated, info = self.env.step(copy.copy(action))
-        except (SystemExit, TypeError, ValueError) as error:
-            values = "(observation, reward, terminated, truncated, info)"
-            self._explain(error, f"step() must return {values}")
-            raise
-        number = math.nan
-        if not isinstance(reward, str):
-            with contextlib.suppress(TypeError, ValueError):  # of None, or of several numbers
-                number = float(_number_in(reward))
+        observation, reward, terminated, truncated, info = self.env.step(copy.copy(action))
+        number = reward if type(reward) is float else _as_float(reward)
         if not math.isfinite(number):
             self._blame("returned the reward", reward, action)
         observation, info = self._checked(observation, action), dict(info or {})
@@ -1989,24 +2237,14 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
                     f"{self._where()} returned an observation{_subscript(path)} of shape "
                     f"{part.shape}, and its observation_space has shape {box.shape}"
                 )
-            if not np.isfinite(part).all():
+            # a finite sum has finite parts; looking at each takes longer
+            if (
+                not math.isfinite(np.add.reduce(part, axis=None, dtype=np.float64))
+                and not np.isfinite(part).all()
+            ):
                 self._blame(f"returned the observation{_subscript(path)}", part, action)
             parts[path] = part
         return _replaced(observation, parts) if parts else observation
-
-    def _explain(self, error: BaseException, wanted: str) -> None:
-        """Raise SpaceError if a wrapper, not the environment's code, failed to call or unpack.
-
-        An exit becomes a RuntimeError, because a run would seem to have ended well.
-        """
-        if isinstance(error, SystemExit):
-            text = f"{self._where()} called sys.exit({error.code!r})"
-            raise RuntimeError(text).with_traceback(error.__traceback__) from None
-        *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-        place = frame.f_globals.get("__name__", "")
-        is_old = re.search("unpack|unexpected keyword", str(error))
-        if is_old and place.startswith(("gymnasium.core", "gymnasium.wrappers.", __name__)):
-            raise SpaceError(f"{self._where()}'s {wanted}: {error}") from error
 
     def _blame(self, what: str, value: Any, action: Any) -> None:
         """Stop at a value that is not finite, or rather at an action that was not, either."""
@@ -2016,6 +2254,16 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def _where(self) -> str:
         return f"step {self._steps} of an episode: the environment"
+
+
+def _as_float(reward: Any) -> float:
+    """Return a reward as a float, or NaN if it is not one number."""
+    if isinstance(reward, str):
+        return math.nan
+    try:
+        return float(_number_in(reward))
+    except (TypeError, ValueError):  # None, or several numbers
+        return math.nan
 
 
 def make_flat(env: Env, step_limit: int | None = None) -> Env:
