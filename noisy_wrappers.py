@@ -32,6 +32,7 @@ import importlib.machinery
 import importlib.metadata
 import inspect
 import json
+import keyword
 import math
 import numbers
 import operator
@@ -1738,26 +1739,75 @@ def _call_each(env: Any, method: str, *args: Any, **kwargs: Any) -> Sequence[Any
 
 
 def run_name(
-    env_id: str, exp_name: str, noises: Sequence[str], rates: Sequence[Rate], seed: int
+    env_id: str,
+    exp_name: str,
+    noises: Sequence[str],
+    rates: Sequence[Rate],
+    seed: int,
+    *,
+    env_kwargs: Sequence[str] = (),
+    test_noise: Sequence[str] = (),
+    test_noise_rate: Sequence[Rate] = (),
 ) -> str:
     """Return the name of a run's folder, the same for all spellings of one configuration.
 
-    What tells the runs of a sweep apart comes first: TensorBoard's list shows 31 characters. Where
-    the name would be too long for a file system, the noises are cut and end in a hash.
+    What tells the runs of a sweep apart comes first: TensorBoard's list shows 31 characters. The
+    arguments of the environment follow its name, as in ``parse_env_kwargs``, and the noise of its
+    tests stands last. A part that is too long for a file system is cut and ends in a hash.
 
     >>> run_name("Hopper-v5", "sac", ["RandomUniformScaleReward(.5, 1.5)"], [0.05], seed=1)
     'p0.05_s1_UniformScaleReward_0.5_1.5__Hopper-v5__sac'
     >>> run_name("Hopper-v5", "sac", ["RandomEarlyTermination(50)"], ["1:0"], seed=1)
     'p1.0to0.0_s1_EarlyTermination_50__Hopper-v5__sac'
-    >>> run_name("ALE/Pong-v5", "ppo", [], [], seed=1)
-    'baseline_s1__ALE-Pong-v5__ppo'
+    >>> heavy = {"test_noise": ["RandomDynamics(1.3, 1.3)"], "test_noise_rate": [1.0]}
+    >>> run_name("ALE/Pong-v5", "ppo", [], [], 1, env_kwargs=["mode:1"], **heavy)
+    'baseline_s1__ALE-Pong-v5_mode=1__ppo__tests_p1.0_Dynamics_1.3_1.3'
     """
     rate, *names = (Configuration.read(noises, rates).slug or "baseline").split("_", 1)
     first = "_".join([rate, f"s{seed}", *names])
-    end = f"__{safe_name(env_id)}__{safe_name(exp_name)}"
+    environment = safe_name(env_id)
+    for name, value in sorted(parse_env_kwargs(env_kwargs).items()):
+        is_text = isinstance(value, str) and parse_env_kwargs([f"{name}:{value}"])[name] == value
+        written = value if is_text else repr(value)  # the text '2' is not the number 2
+        plain = safe_name(written)
+        environment += f"_{name}={plain}" if plain == written else f"_{name}={_hashed(written)}"
+    end = f"__{environment}__{safe_name(exp_name)}"
+    if test := Configuration.read(test_noise, test_noise_rate).slug:
+        end += f"__tests_{test}"
     if len(first + end) > 240:  # a file's name has at most 255 bytes
-        first = f"{first[:100]}_{hashlib.sha256(first.encode()).hexdigest()[:16]}"
+        first = f"{first[:100]}_{_hashed(first, 16)}"
+    if len(first + end) > 240:
+        end = f"{end[: 223 - len(first)]}_{_hashed(end, 16)}"
     return first + end
+
+
+def _hashed(text: str, length: int = 8) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:length]
+
+
+def parse_env_kwargs(texts: Sequence[str]) -> dict[str, Any]:
+    """Read arguments of an environment, "name:value", as a script's ``--env-kwargs`` has them.
+
+    A value is a literal of Python, or else text.
+
+    >>> parse_env_kwargs(["mass:2.0", "reward_type:dense", "sizes:(1, 2)", "file:a:b"])
+    {'mass': 2.0, 'reward_type': 'dense', 'sizes': (1, 2), 'file': 'a:b'}
+
+    Raises:
+        ValueError: no colon, a name that cannot be one, or one that is given twice.
+    """
+    found: dict[str, Any] = {}
+    for text in _listed("env_kwargs", texts, '["mass:2.0"]'):
+        name, colon, value = str(text).partition(":")
+        if not colon or not name.isidentifier() or keyword.iskeyword(name):
+            raise ValueError(f"env_kwargs: {text!r} is not name:value, such as mass:2.0")
+        if name in found:
+            raise ValueError(f"env_kwargs: {name} is given twice")
+        try:
+            found[name] = ast.literal_eval(value.strip())
+        except (MemoryError, RecursionError, SyntaxError, TypeError, ValueError):
+            found[name] = value
+    return found
 
 
 def _words(noise: str) -> str:
@@ -1767,7 +1817,7 @@ def _words(noise: str) -> str:
     name, _, arguments = noise.partition("(")
     odd = "'" in re.sub(r"'[A-Za-z_][A-Za-z0-9_.]*'", "", noise)  # a key that is no plain name
     if odd or (":" in name and re.search(r"""[(\[{'"]""", arguments)):  # own, not numbers only
-        words += "_" + hashlib.sha256(noise.encode()).hexdigest()[:8]
+        words += f"_{_hashed(noise)}"
     return words
 
 
@@ -2284,7 +2334,11 @@ def make_flat(env: Env, step_limit: int | None = None) -> Env:
     Raises:
         SpaceError: actions are not a vector of floats, or observations cannot become a vector; the
             environment has been closed.
+        TypeError: not a gymnasium.Env, for example one of the older gym.
     """
+    if not isinstance(env, gym.Env):
+        kind = type(env)
+        raise TypeError(f"needs a gymnasium.Env, not a {kind.__module__}.{kind.__qualname__}")
     name = env.spec.id if env.spec else str(env)
     if step_limit and env.spec and env.spec.max_episode_steps is None:
         env = gym.wrappers.TimeLimit(env, step_limit)

@@ -106,6 +106,13 @@ def test_make_flat_refuses_what_networks_cannot_take(observations, actions, word
     assert str(actions if "actions" in word or "dim" in word else observations) in str(error.value)
 
 
+def test_an_environment_that_is_none_of_gymnasiums():
+    for env in ([], lambda: None, type("Env", (), {"__module__": "gym.core"})()):
+        with pytest.raises(TypeError, match="needs a gymnasium.Env, not a ") as error:
+            make_flat(env)
+        assert "\n" not in str(error.value)
+
+
 class OneOfJax:
     """An array of one element, which float() does not take, as JAX's."""
 
