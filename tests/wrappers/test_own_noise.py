@@ -5,7 +5,6 @@ import json
 import re
 import subprocess
 import sys
-import textwrap
 from pathlib import Path
 
 import gymnasium as gym
@@ -18,7 +17,6 @@ from test_action_noise import actions_env
 from noisy_wrappers import (
     Configuration,
     EnvState,
-    NoiseWrapper,
     make_noisy,
     parse_noise,
     run_name,
@@ -27,12 +25,8 @@ from noisy_wrappers import (
 
 ROOT = Path(__file__).parents[2]
 TEXT = "my_noises:StickyAction(3)"
-[EXAMPLE] = re.findall(
-    r"(?:    >>> class StickyAction|    \.\.\.).*?(?=\n\n)", NoiseWrapper.__doc__, re.S
-)
-MODULE = "from noisy_wrappers import NoiseWrapper\n\n\n" + textwrap.dedent(
-    re.sub(r"^    (>>>|\.\.\.) ?", "", EXAMPLE, flags=re.M)
-)
+PAGE = (ROOT / "docs" / "wrappers.md").read_text()
+[MODULE] = [code for code in re.findall(r"```python\n(.*?)```", PAGE, re.S) if "StickyAct" in code]
 
 
 @pytest.fixture
