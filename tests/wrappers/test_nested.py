@@ -157,13 +157,9 @@ def test_check_env(space):
 @pytest.mark.parametrize(
     ("env", "keys", "reason"),
     [
-        (
-            lambda: sampled(GOALS)[0],
-            ("goal",),
-            "the keys .'achieved_goal', 'desired",
-        ),
-        (lambda: sampled(GOALS)[0], (0,), "have the keys"),
-        (lambda: GenericEnv(), ("observation",), r"have the keys \[\]"),
+        (make_goals, ("goal",), "the keys .'achieved_goal', 'desired"),
+        (make_goals, (0,), "have the keys"),
+        (GenericEnv, ("observation",), r"have the keys \[\]"),
         (
             lambda: sampled(Dict(x=Box(-1, 1), y=Discrete(2)))[0],
             ("y",),
