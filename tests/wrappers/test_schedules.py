@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from cases import (
-    NOISES,
+    BASES,
     STEP_NOISES,
     WIDE,
     A,
@@ -68,7 +68,7 @@ def test_a_rate_is_constant_within_an_episode(text):
             assert ("noise" in env.step(0)[4]) == acts
 
 
-@pytest.mark.parametrize("text", NOISES)
+@pytest.mark.parametrize("text", BASES)
 def test_a_schedule_draws_what_its_rates_draw(text):
     """One uniform per opportunity whatever the rate: an episode is that of a constant rate."""
     fractions = [0.0, 0.5, 0.5, 1.0]
@@ -90,7 +90,7 @@ def test_a_schedule_draws_what_its_rates_draw(text):
     assert scheduled[1] != episodes(0.9, assigned=False)[1]
 
 
-@pytest.mark.parametrize("text", NOISES)
+@pytest.mark.parametrize("text", BASES)
 def test_progress_leaves_a_constant_rate_alone(text):
     constant = build(text, episodes_env([12]), 0.1)
     expected = rollout(constant, seed=1)
@@ -192,7 +192,7 @@ def test_bad_progress(fraction):
     assert env.training_progress == 0
 
 
-@pytest.mark.parametrize("text", NOISES)
+@pytest.mark.parametrize("text", BASES)
 def test_spec_and_copies_of_a_schedule(text):
     env_id, action = registered(text)
     env = build(text, gym.make(env_id), "1:0.25")

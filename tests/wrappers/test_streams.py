@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from cases import (
-    NOISES,
+    BASES,
     STEP_NOISES,
     WIDE,
     GenericEnv,
@@ -24,7 +24,7 @@ def pattern(steps):
     return ["noise" in info for *_, info in steps]
 
 
-@pytest.mark.parametrize("text", NOISES)
+@pytest.mark.parametrize("text", BASES)
 def test_same_seed_same_noise(text):
     env = build(text, gym.wrappers.TimeLimit(GenericEnv(), 12), 0.5)
     first = rollout(env, seed=1)
@@ -33,14 +33,14 @@ def test_same_seed_same_noise(text):
     assert pattern(first) != pattern(rollout(env, seed=2))
 
 
-@pytest.mark.parametrize("text", NOISES)
+@pytest.mark.parametrize("text", BASES)
 def test_reset_without_seed_keeps_the_stream(text):
     env = build(text, episodes_env([12]), 0.5)
     runs = [pattern(rollout(env, seed)) for seed in (1, None, None)]
     assert runs[0] != runs[1] != runs[2] != runs[0]
 
 
-@pytest.mark.parametrize("text", NOISES)
+@pytest.mark.parametrize("text", BASES)
 def test_never_seeded_draws_entropy(text):
     first, second = (rollout(build(text, episodes_env([12]), 0.5), steps=500) for _ in range(2))
     assert pattern(first) != pattern(second)
@@ -60,7 +60,7 @@ def test_equal_wrappers_in_a_stack_draw_different_noise():
     assert all(a != b for a, b in both)
 
 
-@pytest.mark.parametrize("text", NOISES)
+@pytest.mark.parametrize("text", BASES)
 def test_initial_states_are_those_of_the_bare_environment(text):
     def initial_states(env):
         states = []
@@ -78,7 +78,7 @@ def test_initial_states_are_those_of_the_bare_environment(text):
     assert initial_states(build(text, gym.make("InvertedPendulum-v5"), 0.3)) == bare
 
 
-@pytest.mark.parametrize("text", NOISES)
+@pytest.mark.parametrize("text", BASES)
 def test_global_generator_is_untouched(text):
     before = np.random.get_state()[1].tobytes()
     rollout(build(text, GenericEnv(), 1.0), seed=0)
