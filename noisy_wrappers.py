@@ -381,7 +381,7 @@ class ObservationNoise(NoiseWrapper):
             numbers = np.array(observation, np.float64)
         else:
             parts = [functools.reduce(operator.getitem, path, observation) for path in self._boxes]
-            numbers = np.concatenate(parts, axis=None, dtype=np.float64)
+            numbers = np.concatenate(parts, axis=None, dtype=np.float64, casting="unsafe")
         numbers.flags.writeable = False
         return numbers
 
