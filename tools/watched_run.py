@@ -147,11 +147,10 @@ def watch_actions(learn, seen):
 
 def is_saved(network, seen):
     """Tell whether policy.pt has a network as it is now."""
-    state = network.state_dict()
-    for part in seen.script.read_state(seen.folder / "policy.pt").values():
-        if isinstance(part, dict) and part.keys() == state.keys():
-            return all(torch.equal(part[name], value) for name, value in state.items())
-    return False
+    state, saved = network.state_dict(), seen.script.read_state(seen.folder / "policy.pt")
+    parts = [part for part in saved.values() if isinstance(part, dict)]
+    alike = [part for part in parts if part.keys() == state.keys()]
+    return any(all(map(torch.equal, part.values(), state.values())) for part in alike)
 
 
 def actions_in_loss(update, seen):
@@ -160,7 +159,11 @@ def actions_in_loss(update, seen):
     Nothing is returned where it asked no other network about actions, as in PPO, or where the
     observations are not as the environment gave them.
     """
-    inputs = [x for group in update.inputs for x in (group if isinstance(group, list) else [group])]
+    inputs = [
+        x
+        for group in update.inputs
+        for x in (group if isinstance(group, list | tuple) else [group])
+    ]
     batches = [x for x in inputs if torch.is_tensor(x) and x.ndim == 2]
     raw = [x for x in batches if any(row.tobytes() in seen.observations for row in x.numpy())]
     own, asked = set(update.network.modules()), []
