@@ -25,6 +25,7 @@ from analysis.formatting import rounded
 
 def acts(trial):
     """The policy that acts is the one that learns."""
+    assert trial.run  # PPO has a check of its own, which needs random numbers
     with mock.patch.multiple(torch, randn=torch.zeros, randn_like=torch.zeros_like):
         run = trial.train("mean_actions")  # in training, too
     gap, policy = max(run.gaps), run.script.load_policy(run.folder)

@@ -145,7 +145,7 @@ def test_n_step_returns_are_those_of_the_episodes(tmp_path):
             expected[first + t] = value, first + t + k, float(is_last), gamma**k
     observations, _, *others = buffer.sample(500, rng, n, gamma)
     for observation, *drawn in zip(observations, *others, strict=True):
-        wanted = torch.tensor(expected[int(observation)])
+        wanted = torch.tensor(expected[int(observation)], dtype=torch.float32)
         torch.testing.assert_close(torch.stack([x.reshape(()) for x in drawn]), wanted)
     assert len(observations.unique()) > 5
 
