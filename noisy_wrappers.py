@@ -2177,6 +2177,7 @@ def describe_run(
         "args": as_json(args),
         "defaults": as_json(defaults),
         "observation_space": _describe_space(env.observation_space),
+        "observation_keys": _describe_keys(env),
         "action_space": _describe_space(env.action_space),
         "git_commit": git.stdout.strip() or None,
         "versions": versions,
@@ -2222,6 +2223,16 @@ def _describe_space(space: gym.spaces.Box) -> dict[str, Any]:
         numbers = [number if math.isfinite(number) else str(number) for number in bound.tolist()]
         bounds[name] = numbers[0] if len(set(numbers)) == 1 else numbers
     return {"shape": list(space.shape), **bounds, "dtype": str(space.dtype)}
+
+
+def _describe_keys(env: Env) -> list[list[Any]]:
+    """Return the [name, size] of each entry of a flattened dictionary; nothing for a vector."""
+    return [
+        [".".join(map(str, path)), gym.spaces.flatdim(part)]
+        for layer in _layers(env, FiniteNumbers)  # which has the observations of before
+        for path, part in _entries(layer.observation_space)
+        if path
+    ]
 
 
 class Spaces:
