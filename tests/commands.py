@@ -20,7 +20,7 @@ from types import SimpleNamespace
 from tqdm import tqdm
 
 ROOT = Path(__file__).parents[1]
-LIMIT = 120  # seconds that a command may take
+LIMIT = 600  # seconds that a command may take, also on a busy machine
 FORK = multiprocessing.get_context("forkserver")
 FORK.set_forkserver_preload(
     ["pytest", "tyro", "tqdm", "gymnasium.envs.mujoco", "torch.utils.tensorboard"]
