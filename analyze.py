@@ -26,10 +26,10 @@ import pandas as pd
 import tyro
 
 from analysis.choice import read_choice
-from analysis.comparisons import compare_all
+from analysis.comparisons import as_chosen, compare_all
 from analysis.errors import fail, take_over_terminal
 from analysis.figures import figures, write_figure
-from analysis.folders import RETURN, SUCCESS, is_phase, is_run
+from analysis.folders import CONFIRMATION, RETURN, SUCCESS, is_phase, is_run
 from analysis.formatting import WHOLE_WORDS, text_table, write_table
 from analysis.report import Results, write_report
 from analysis.robustness import analyse_robustness, read_robustness
@@ -172,7 +172,7 @@ def analyse(args, entries, choice):
         if len(missing.frame):
             print_left_out(missing, terminal_width())
         no_finished_run(args.runs_dir)
-    compared = compare_all(studies, args.smallest_gain)
+    compared = as_chosen(compare_all(studies, args.smallest_gain), choice)
     tests, unreadable = read_robustness(finished(entries), metric)
     robustness_tables, robustness = analyse_robustness(tests, metric)
     tables = make_tables(studies, compared) | robustness_tables
@@ -190,6 +190,11 @@ def analyse(args, entries, choice):
     tables["missing"] = missing
     if choice is not None:
         tables["choice"] = table_of("choice", choice)
+    if any(study.phase == CONFIRMATION for study in studies):
+        notes.append(
+            "verdicts on confirmations are those of ./benchmark.sh choose, which looks several "
+            "times, at levels of its own; one that it has not judged yet has none"
+        )
     unit = POINTS if metric == SUCCESS else ""
     of_noises = pd.concat([compared.noises_together, compared.noises])
     said = [

@@ -4,7 +4,7 @@ A noise is compared with its rates together, which asks whether it helps at all,
 rates alone, which is secondary: with a correction of its own.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby, product
 
 import numpy as np
@@ -165,6 +165,40 @@ def judged_beside(noises, rates, family, metric, smallest_gain=None):
     found = noises.set_index(keys)[VERDICT]
     only = rates[~several].drop(columns=VERDICT).join(found, on=keys)
     return pd.concat([many, only[many.columns]]).sort_index() if len(many) else only[rates.columns]
+
+
+def as_chosen(compared, choice):
+    """Return Comparisons in which confirmations have the verdicts of `./benchmark.sh choose`.
+
+    It looks at them several times, at levels that were fixed beforehand, so a plain p would be one
+    look more. One that it has not judged yet has no verdict. choice: of read_choice, or None.
+    """
+    helped = {}
+    for row in () if choice is None else choice.itertuples():
+        if row.phase == CONFIRMATION and row.noise:
+            helped[row.algorithm, row.environment, row.noise, row.noise_rate] = (
+                row.survives == "yes"
+            )
+
+    def verdict(row):
+        if row["phase"] != CONFIRMATION or row["verdict"] not in (
+            *verdicts.CLEAR,
+            verdicts.UNCLEAR,
+        ):
+            return row["verdict"]
+        key = row["algorithm"], row["environment"], row["noise"], row["noise_rate"]
+        if key not in helped:
+            return np.nan
+        if helped[key]:
+            return verdicts.BETTER
+        return verdicts.UNCLEAR if row["verdict"] == verdicts.BETTER else row["verdict"]
+
+    judged = {}
+    for name in ("noises", "rates"):
+        rows = getattr(compared, name)
+        found = [verdict(row) for row in rows.to_dict("records")]
+        judged[name] = rows.assign(verdict=pd.Series(found, index=rows.index, dtype=object))
+    return replace(compared, **judged)
 
 
 def results(studies, compared):

@@ -94,14 +94,6 @@ def test_results_go_beside_the_runs(tmp_path):
     assert not (tmp_path / "runs/best.csv").exists()
 
 
-def test_runs_one_folder_deeper_are_pointed_to(tmp_path, capsys):
-    write_run(tmp_path / "runs/demo", [1])
-    with pytest.raises(SystemExit):
-        main(analyze.Args(runs_dir=tmp_path / "runs"))
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and str(tmp_path / "runs/demo") in error
-
-
 def test_the_smallest_gain_is_positive(tmp_path, capsys):
     write_run(tmp_path / "runs", [1])
     for gain in (0.0, -3.0, float("nan")):

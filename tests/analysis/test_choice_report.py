@@ -115,3 +115,22 @@ def test_a_damaged_choice_is_one_line(tmp_path, capsys):
     printed = capsys.readouterr().err
     assert error.value.code == 2 and printed.count("\n") == 1 and "choice.csv" in printed
     assert not (tmp_path / "results").exists()
+
+
+@pytest.mark.parametrize(
+    ("gain", "survives", "verdict"),
+    [(30.0, "yes", "better"), (30.0, "no", "no clear difference"), (-30.0, "no", "worse")]
+    + [(2.0, "yes", "better"), (30.0, None, "")],
+)
+def test_a_confirmation_has_the_verdict_of_the_choice(gain, survives, verdict, tmp_path):
+    """Which looks several times: a plain p would be one look more."""
+    write_choice(tmp_path / "runs", gain=gain)
+    path = tmp_path / "runs/choice.csv"
+    lines = path.read_text().splitlines()
+    last = lines.pop().rpartition(",")[0]
+    if survives:
+        lines.append(f"{last},{survives}")
+    path.write_text("\n".join(lines) + "\n")
+    tables = run(tmp_path)
+    [said] = tables["noises"]["verdict"]
+    assert said == verdict or (pd.isna(said) and not verdict)

@@ -60,14 +60,6 @@ def test_names_are_escaped_in_markdown(tmp_path):
     assert len(re.findall(r"(?<!\\)\|", row)) == header.count("|")
 
 
-def test_names_are_escaped_in_latex(tmp_path):
-    write_run(tmp_path / "runs", [1.0, 2.0], exp_name="a~b^c")
-    run(tmp_path)
-    table = (tmp_path / "results/summary_SAC.tex").read_text("utf-8")
-    assert r"\begin{longtable}{lllllllllllll}" in table
-    assert r"a\textasciitilde{}b\^{}c" in table
-
-
 @pytest.mark.slow
 def test_files_are_utf_8_whatever_the_locale(tmp_path):
     """And the terminal gets a replacement for what it cannot show."""

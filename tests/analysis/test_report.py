@@ -162,14 +162,6 @@ def test_an_empty_section_is_left_out(tmp_path):
     assert "None." not in page
 
 
-def test_a_single_run_has_no_empty_section(tmp_path):
-    write_run(tmp_path / "runs", [10.0])
-    run(tmp_path, drawn=True)
-    page = (tmp_path / "results/report.html").read_text()
-    sections = re.findall(r'<section id="(\w+)">', page)
-    assert sections == ["verdict", "early_performance", "summary", "how"]
-
-
 def test_the_counts_at_the_top_are_those_of_the_list(tmp_path):
     for env in ("Hopper-v5", "Pusher-v5"):
         write_pairs(tmp_path / "runs", range(100, 105), range(130, 135), env=env)
