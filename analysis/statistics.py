@@ -25,6 +25,19 @@ MOST_PARTITIONS = 20_000  # where there are more, a test draws RANDOM_PARTITIONS
 RANDOM_PARTITIONS = 99_999
 
 
+LAST_PART = 0.15  # of a run's steps: its tests there are what it counts with
+
+
+def final_value(steps, values):
+    """Return what a run counts with: the mean of its tests in the last 15 % of its steps.
+
+    The last test always counts. steps (tests,): in ascending order; values (tests,): their returns
+    or rates of success.
+    """
+    last = steps[-1]
+    return float(np.mean(values[last - steps < LAST_PART * last]))
+
+
 def columns(scores):
     """Split a sample into one array per environment, without the missing runs."""
     scores = np.atleast_2d(np.asarray(scores, float).T)
