@@ -290,8 +290,11 @@ class Comparison(NamedTuple):
     seeds_needed: float  # on each side, to find the observed difference with 80 % power
 
 
-def compare(x, y):
-    """Compare the means of two samples x and y of the same environments."""
+def compare(x, y, level=LEVEL):
+    """Compare the means of two samples x and y of the same environments.
+
+    level: one minus the coverage of the interval.
+    """
     xs, ys = columns(x), columns(y)
     pairs = list(zip(xs, ys, strict=True))
     differences = np.array([exact(a.mean() - b.mean(), a, b) for a, b in pairs])
@@ -303,7 +306,7 @@ def compare(x, y):
     difference = low = high = std = detectable = needed = nan
     n, m = min(map(len, xs)), min(map(len, ys))
     if len(pairs) == 1:
-        difference, error, low, high = contrast([xs[0], ys[0]], [1, -1])
+        difference, error, low, high = contrast([xs[0], ys[0]], [1, -1], level)
         if min(n, m) < SEEDS_FOR_INTERVAL:
             low = high = nan
         std, needed = stds[0], seeds_needed(round(abs(effect), 3))
@@ -323,8 +326,8 @@ def steps_to_reach(curves, steps, target):
     return steps[reached[0]] if len(reached) else np.nan
 
 
-def contrast(samples, weights):
-    """Weighted sum of the means of independent samples, with its standard error and 95 % interval.
+def contrast(samples, weights, level=LEVEL):
+    """Weighted sum of the means of independent samples, with its standard error and interval.
 
     Student's t with Satterthwaite's degrees of freedom: each sample has a variance of its own.
     samples: arrays (n_i), weights: numbers -> estimate, standard error, low, high; NaN where a
@@ -336,19 +339,19 @@ def contrast(samples, weights):
     if sizes.min() < 2:
         return estimate, nan, nan, nan
     variances = np.array([mean_std(sample)[1] ** 2 for sample in samples])
-    error, half = satterthwaite(np.square(weights) * variances / sizes, sizes)
+    error, half = satterthwaite(np.square(weights) * variances / sizes, sizes, level)
     return estimate, error, estimate - half, estimate + half
 
 
-def satterthwaite(variances, sizes):
-    """Return the standard error of a sum of independent means, and half of its 95 % interval.
+def satterthwaite(variances, sizes, level=LEVEL):
+    """Return the standard error of a sum of independent means, and half of its interval.
 
     variances (k, ...): of the k means; sizes (k, ...): how many values each is the mean of.
     """
     total = np.sum(variances, axis=0)
     squares = np.sum(np.square(variances) / (sizes - 1), axis=0)
     freedom = np.divide(total**2, squares, out=np.ones_like(total), where=squares > 0)
-    return np.sqrt(total), np.sqrt(total) * scipy.special.stdtrit(freedom, 0.975)
+    return np.sqrt(total), np.sqrt(total) * scipy.special.stdtrit(freedom, 1 - level / 2)
 
 
 def holm(p):
