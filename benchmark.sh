@@ -91,7 +91,7 @@ cd "$(dirname -- "$(readlink -f -- "${BASH_SOURCE[0]}")")" # it may be called th
 case ${1:-} in # how the executors call this script: run-one SWEEP FOLDER COMMAND
   run-one) # on a machine whose connection may break: the run must outlive its reader
     trap : TERM INT USR1
-    run_one "$3" "$4" | { trap '' TERM INT USR1 && { cat || cat >/dev/null; }; } || exit 1
+    run_one "$2" "$3" "$4" | { trap '' TERM INT USR1 && { cat || cat >/dev/null; }; } || exit 1
     exit ;;
   slurm-task) slurm_task "$2" "$3" ;;
   "" | -h | --help) usage || true; exit ;;
@@ -132,7 +132,7 @@ path=''
 while IFS= read -rd : folder; do
   case $folder in '' | /*) ;; *) folder=$caller/$folder ;; esac
   path+=${path:+:}$folder
-done <<<"${PYTHONPATH:+$PYTHONPATH:}"
+done < <(printf %s "${PYTHONPATH:+$PYTHONPATH:}") # a here-string would need room in /tmp
 # A module of the user's lies there, too. It is not looked for where none is named: a file of this
 # folder, such as types.py, may have the name of a module of Python's.
 own='(^| )[^ ]*[A-Za-z_][A-Za-z0-9_.]*:'
@@ -158,7 +158,8 @@ list_todo() {
   todo=$(show "${dry_run:-list}") || status=$?
   [ "$status" -lt 131 ] || fail "Python was ended by signal $((status - 128)), as by an environment"
   [ "$status" -eq 0 ] || exit "$status"
-  todo=$(LC_ALL=C grep -vxFf <(printf '%s\n' "$tried") <<<"$todo" || true)
+  todo=$(printf '%s\n' "$todo" | LC_ALL=C grep -vxFf <(printf '%s\n' "$tried")) ||
+    [ $? -eq 1 ] || fail "cannot take the runs that were tried from the list"
 }
 tried=''
 list_todo
@@ -171,25 +172,31 @@ if [ -n "$dry_run" ]; then printf %s "$todo" | cut -f2 || true; exit; fi
 
 case $executor in
   parallel)
-    parallel --version 2>/dev/null | grep -q "GNU parallel" ||
+    parallel --plain --version 2>/dev/null | grep -q "GNU parallel" ||
       fail "--executor parallel needs GNU parallel (Debian: apt-get install parallel)"
     export PARALLEL_SSH=${PARALLEL_SSH:-ssh -o BatchMode=yes}
-    parallel_options=(--will-cite --workdir "${remote_dir:-$PWD}" --sshlogin "${sshlogin:-:}")
+    # --plain: nothing of the user's settings, such as --halt, changes what a sweep does
+    parallel_options=(--plain --will-cite --workdir "${remote_dir:-$PWD}" --sshlogin "${sshlogin:-:}")
     [ -z "$sshlogin" ] || parallel "${parallel_options[@]}" --nonall --tag \
       "$(quoted "$PYTHON")" -c "'import mujoco, torch, tyro, noisy_wrappers'" "&&" test -x benchmark.sh >&2 ||
       fail "a machine of --sshlogin cannot run the project in ${remote_dir:-$PWD} with $PYTHON" ;;
   slurm)
     command -v sbatch >/dev/null || fail "--executor slurm needs sbatch, on a Slurm cluster"
-    words=$(xargs -rn1 printf '%s\n' <<<"$slurm_args" 2>/dev/null) ||
+    words=$(printf '%s\n' "$slurm_args" | xargs -rn1 printf '%s\n' 2>/dev/null) ||
       fail "--slurm-args has a quote that does not end: $slurm_args"
-    [ -z "$words" ] || mapfile -t slurm_options <<<"$words" ;;
+    [ -z "$words" ] || mapfile -t slurm_options < <(printf '%s\n' "$words") ;;
 esac
 command -v flock >/dev/null || fail "benchmark.sh needs flock (Debian: apt-get install util-linux)"
 command -v ps >/dev/null || fail "benchmark.sh needs ps (Debian: apt-get install procps)"
 
 sweep=$HOSTNAME-$$-$(date +%Y%m%d%H%M%S)
 logs=${first%/*}/logs list=${first%/*}/logs/lines-$sweep.tsv
-trap 'rm -f "$list"' EXIT
+folders=() # of the logs
+trap 'rm -f "$list"; forget_refusals' EXIT
+forget_refusals() { # of scripts that were refused: the same command may try them again
+  local folder
+  for folder in ${folders[@]+"${folders[@]}"}; do rm -f "$folder/.refused-$sweep-"*; done
+}
 
 # Were this command killed, the executor would start run after run: the guard stops it then
 guard() { # a killed command may stay as a zombie: it is dead when the guard has another parent
@@ -214,9 +221,9 @@ stop() { # EXIT_STATUS
 # The executor and its guard have process groups of their own, so that one signal to the executor's
 # reaches every run once.
 run_todo() {
-  local folders reason guard watch # the folders of the logs
+  local reason guard watch
   [ "$executor" != slurm ] || ask_slurm
-  mapfile -t folders < <(cut -f1 <<<"$todo" | LC_ALL=C sed 's,/[^/]*$,/logs,' | LC_ALL=C sort -u)
+  mapfile -t folders < <(printf '%s\n' "$todo" | cut -f1 | LC_ALL=C sed 's,/[^/]*$,/logs,' | LC_ALL=C sort -u)
   reason=$( (mkdir -p "${folders[@]}" && printf '%s\n' "$todo" >"$list") 2>&1) ||
     fail "--runs-dir: cannot write to $logs: ${reason##*: }"
   locks_work "$list" || fail "--runs-dir: $(no_locks "$logs")"
@@ -244,6 +251,7 @@ run_todo() {
   kill "$watch" 2>/dev/null && { [ ! -t 2 ] || echo >&2; } || true
   group='' ids=()
   tried+=$'\n'$todo
+  export SWEEP_WAITED=1 # results of other machines may be seen a little later
 }
 
 trap 'stop 130' INT

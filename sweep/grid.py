@@ -5,17 +5,17 @@ options.py reads the arguments, __main__.py shows how far the runs have come.
 
 import csv
 import itertools
+import math
 import os
 import re
 import shlex
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from analysis.errors import fail
-from analysis.folders import DamageError, logged, read_config, read_result, runs_of
-from noisy_wrappers import BASELINE, MAY_DIFFER_IN_A_RUN, Configuration, run_name
+from noisy_wrappers import BASELINE, Configuration, run_name
+from sweep.scripts import PROJECT, Script, number
 
-PROJECT = Path(__file__).resolve().parent.parent
 SEEDS = {"sac": range(1, 6), "td3": range(1, 6), "ppo": range(1, 11)}  # the paper's
 ENVS = ["HalfCheetah-v5", "Hopper-v5", "Humanoid-v5", "Pusher-v5", "Walker2d-v5"]
 RATES = [0.01, 0.05, 0.1, 0.2, 0.5, 1.0]
@@ -55,6 +55,9 @@ ABLATION = [(f"RandomUniformScaleReward({2 - b:.1f}, {b})", 0.05) for b in (1.1,
 ABLATION += [
     (f"RandomUniformNoisyObservation(-{b}, {b})", 1.0) for b in (0.0001, 0.001, 0.01, 0.1, 1.0)
 ]
+# Times as many seeds without noise as with it, at most: with more, the test of a difference claims
+# too much where noise changes the spread (docs/sweeps.md)
+MOST_BASELINES = 5
 PRESETS = {  # what a preset sets: its noises with their rates, and grid options
     "demo": {
         "pairs": [("RandomNormalNoisyObservation(1.0)", 1.0)],  # harms with any five seeds
@@ -84,13 +87,16 @@ class PlannedRun(NamedTuple):
     seed: int
     total_timesteps: int
     command: list[str]  # the script and its arguments
-    options: dict[str, object]  # the script's own arguments, as options.script_options reads them
+    script: Script | None = None  # None: of a folder whose script nobody knows
+    args: dict[str, Any] | None = None  # what the command sets, as scripts.read_words; None: any
     damage: str = ""  # what is already known to be wrong with its files
 
-
-def script_of(algorithm):
-    """Return the file of an algorithm's training script."""
-    return f"{algorithm}_continuous_noisy.py"
+    def number(self, name, otherwise=None):
+        """Return a number among its script's arguments, as far as the source tells them."""
+        if name in self.args:
+            return number(self.args[name], otherwise)
+        value = self.script.defaults.get(name)
+        return value if isinstance(value, int | float) else otherwise
 
 
 def best_of_the_paper(algorithm, env_id):
@@ -136,84 +142,60 @@ def configuration_of(pairs, common=None):
 def make_run(args, algorithm, env_id, configuration, seed, phase=""):
     """Return one run of the grid, or of a phase of a choice: that is a folder of its own."""
     runs_dir = f"{args.runs_dir}/{phase}" if phase else args.runs_dir
-    script, steps = script_of(algorithm), args.total_timesteps
+    script, steps = args.scripts[algorithm], args.total_timesteps
     noises, rates = configuration.texts
-    command = [script, "--env-id", env_id, "--seed", str(seed)]
+    command = [script.path, "--env-id", env_id, "--seed", str(seed)]
     if noises:
         command += ["--noise", *noises, "--noise-rate", *map(str, rates)]
-    command += ["--total-timesteps", str(steps), "--runs-dir", runs_dir, *args.extra]
-    folder = Path(runs_dir, run_name(env_id, script.removesuffix(".py"), noises, rates, seed))
-    return PlannedRun(folder, (algorithm, env_id), seed, steps, command, args.options[algorithm])
+    command += ["--total-timesteps", str(steps), "--runs-dir", runs_dir, *args.extra[algorithm]]
+    own = {"env_id": env_id, "seed": str(seed), "total_timesteps": str(steps)}
+    own |= args.given_words[algorithm] | {"exp_name": args.exp_names[algorithm]}
+    folder = Path(runs_dir, run_name(env_id, own["exp_name"], noises, rates, seed))
+    return PlannedRun(folder, (algorithm, env_id), seed, steps, command, script, own)
 
 
 def grid(args):
     """Return the runs, each once."""
     runs = {}
     for algorithm, env_id in itertools.product(args.algos, args.envs):
-        noisy = configurations(args, algorithm, env_id)
-        seeds = sorted(itertools.chain(*(args.seeds or [SEEDS[algorithm]])))
-        for seed, configuration in itertools.product(seeds, [BASELINE, *noisy]):
+        noisy = dict.fromkeys(configurations(args, algorithm, env_id))
+        noisy.pop(BASELINE, None)  # at rate 0 a noise is none
+        seeds = sorted(set(itertools.chain(*(args.seeds or [SEEDS.get(algorithm, range(1, 6))]))))
+        pairs = [(seed, BASELINE) for seed in baseline_seeds(args, seeds, len(noisy))]
+        pairs += itertools.product(seeds, noisy)
+        for seed, configuration in sorted(pairs, key=lambda pair: pair[0]):
             run = make_run(args, algorithm, env_id, configuration, seed)
             runs.setdefault(run.folder, run)
     return list(runs.values())
 
 
-def runs_in(folder):
-    """Return the runs that a folder or its logs tell of, for a status that names no grid."""
-    folders = {*runs_of(Path(folder)), *logged(Path(folder))}
-    if not folders:
-        fail(f"no runs in {folder}; name their folder with --runs-dir")
-    runs = []
-    for path in sorted(folders):
-        kind, steps, damage = ("", ""), 0, ""  # unknown: it has failed before it began
-        if os.path.exists(path / "config.json"):
-            try:
-                config = read_config(path)
-                kind, steps = (config["exp_name"], config["environment"]), config["total"]
-            except DamageError as error:
-                damage = f"{path}/{error}"
-        runs.append(PlannedRun(path, kind, 0, steps, [], {}, damage))
-    return runs
+def baseline_seeds(args, seeds, configurations):
+    """Return the seeds of the runs without noise, with which every configuration is compared.
 
-
-def result(run):
-    """Return whether a run is finished, and what is wrong with its files, or "".
-
-    Exits if the folder holds a finished run of another length or with other options.
+    Without --baseline-seeds, `custom` takes the square root of the number of configurations times
+    as many as each of them has (Dunnett, 1955), but no more than MOST_BASELINES times as many.
     """
-    if run.damage or not os.path.exists(run.folder / "result.json"):
-        return False, run.damage
-    try:
-        config = read_config(run.folder)
-        read_result(run.folder, config)
-    except DamageError as error:
-        return False, f"{run.folder}/{error}; move its folder away to run it again"
-    if config["environment"] != run.kind[1]:  # two may give one folder name
-        where = config["environment"]
-        fail(f"{run.folder} holds a finished run in {where}; choose another --runs-dir")
-    steps, made = config["total"], config["args"]
-    if steps != run.total_timesteps:
-        fail(f"{run.folder} holds a finished run of {steps} steps; choose another --runs-dir")
-    differences = [
-        f"--{name.replace('_', '-')} {made[name]}, not {wanted}"
-        for name, wanted in run.options.items()
-        if name not in MAY_DIFFER_IN_A_RUN
-        and (name != "eval_frequency" or wanted is not None)  # without one, a run keeps its own
-        and made.get(name, wanted) != wanted  # an older version did not have all options
-    ]
-    if differences:
-        fail(
-            f"{run.folder} holds a finished run with {' and '.join(differences)}; choose another "
-            "--runs-dir, or the same options after the --"
-        )
-    return True, ""
+    if args.baseline_seeds:
+        return sorted(set(itertools.chain(*args.baseline_seeds)))
+    if args.preset != "custom":
+        return seeds
+    ratio = min(max(1.0, math.sqrt(configurations)), MOST_BASELINES)
+    number = math.ceil(round(len(seeds) * ratio, 9))
+    return [*seeds, *range(seeds[-1] + 1, seeds[-1] + 1 + number - len(seeds))]
 
 
 def command_line(run):
     """Return a run's command, complete: it can be pasted into a shell in the project's folder."""
     words = [os.environ.get("PYTHON", "python"), *run.command]
-    noises = any(re.match(r"[\w.]+:[^\W\d]", word) for word in run.command)  # module:Name(...)
-    own = ":" in run.kind[1] or noises
-    if own and "PYTHONPATH" in os.environ:  # where a module of the user's lies
-        words = ["env", f"PYTHONPATH={os.environ['PYTHONPATH']}", *words]
+    path = [folder for folder in [os.environ.get("PYTHONPATH")] if folder and has_module(run)]
+    if os.path.dirname(run.script.path):  # it lies elsewhere, and noisy_wrappers here
+        path.insert(0, str(PROJECT) if os.path.isabs(run.script.path) else ".")
+    if path:
+        words = ["env", f"PYTHONPATH={':'.join(path)}", *words]
     return shlex.join(words)
+
+
+def has_module(run):
+    """Tell whether a command may name a module of the user's, as module:Name does."""
+    own_noise = any(re.match(r"[\w.]+:[^\W\d]", word) for word in run.command)
+    return ":" in run.kind[1] or own_noise or bool(os.path.dirname(run.script.path))

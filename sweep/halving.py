@@ -10,22 +10,18 @@ rate, a pull is a training run with a seed of its own. Runs are dear: a noise is
 runs so far, those of earlier rounds included.
 
 The best of many looks better than it is on the seeds that chose it. So the winner meets the
-baseline on fresh seeds, in one comparison that is fixed beforehand.
+baseline on fresh seeds, in one comparison that is fixed beforehand, with the looks of looks.py.
 """
 
 import math
-from itertools import count
 from statistics import fmean
 from typing import NamedTuple
 
-import numpy as np
-
-from analysis import statistics, verdicts
-from analysis.statistics import LEVEL  # of a verdict, two-sided, over all verdicts of one command
-from noisy_wrappers import BASELINE, Configuration, rounded
+from analysis import statistics
+from noisy_wrappers import BASELINE, Configuration
+from sweep.looks import nominal_levels, stops
 
 FIRST_CONFIRMATION_SEED = 1001  # the search uses those below
-SCORED = 0.15  # a run's score in the search is the mean of its tests in this last part of its steps
 
 
 class Round(NamedTuple):
@@ -41,8 +37,9 @@ class State(NamedTuple):
 
     rounds: list[Round]  # those that are complete
     noises: list[Configuration]  # still in the running, in the order given
-    seeds: range  # of the runs that the present round or the confirmation needs
+    seeds: range  # of the runs that the present round or look needs, earlier ones included
     due: list[tuple[Configuration, int]]  # with their seeds, those that are not finished
+    look: int = 0  # of the confirmation, from 1; 0 during the search
 
 
 # --------------------------------------------------------------------------------------- the search
@@ -64,12 +61,12 @@ def schedule(noises, budget):
     return [(n, max(1, round(budget / whole / math.sqrt(n)))) for n in numbers]
 
 
-def advance(noises, budget, confirm, returns):
+def advance(noises, budget, plan, returns):
     """Return how far the choice has come, and which runs are due.
 
     noises: configurations in the order given, which decides between equal scores.
-    returns: {(configuration, seed): return}, the score of a run for the seeds of the search, the
-    final test return for those of the confirmation.
+    plan: a Plan, the seeds of each look of the confirmation and its level.
+    returns: {(configuration, seed): return}.
     """
     rounds, last_seed = [], 0
     for _, further in schedule(len(noises), budget):
@@ -83,18 +80,17 @@ def advance(noises, budget, confirm, returns):
         best = ranking[: math.ceil(len(noises) / 2)]
         noises = [noise for noise in noises if noise in best]
         rounds.append(Round(last_seed, scores, noises))
-    seeds = range(FIRST_CONFIRMATION_SEED, FIRST_CONFIRMATION_SEED + confirm)
-    return State(rounds, noises, seeds, missing([*noises, BASELINE], seeds, returns))
+    for look, number in enumerate(plan.looks, start=1):
+        seeds = fresh_seeds(number)
+        due = missing([*noises, BASELINE], seeds, returns)
+        if due or look == len(plan.looks) or stops(*pair(*noises, seeds, returns), look, plan):
+            return State(rounds, noises, seeds, due, look)
+    raise AssertionError("a confirmation has at least one look")
 
 
-def score(steps, returns):
-    """Return a run's score in the search: the mean of its tests in the last 15 % of its steps.
-
-    steps (tests,): those of its tests in ascending order, returns (tests,): what they returned. The
-    last test always counts.
-    """
-    steps, returns = np.asarray(steps), np.asarray(returns)
-    return float(returns[steps[-1] - steps < SCORED * steps[-1]].mean())
+def fresh_seeds(number):
+    """Return the seeds of a confirmation, which no search uses."""
+    return range(FIRST_CONFIRMATION_SEED, FIRST_CONFIRMATION_SEED + number)
 
 
 def spread(returns):
@@ -119,44 +115,36 @@ def missing(noises, seeds, returns):
 # ----------------------------------------------------------------------------------- the comparison
 
 
-def fewest_seeds(comparisons):
-    """Return the smallest number of fresh seeds with which every verdict can be significant."""
-    return next(n for n in count(4) if 2 / math.comb(2 * n, n) <= LEVEL / comparisons)
+def pair(winner, seeds, returns):
+    """Return the returns of the winner and of the baseline on the fresh seeds."""
+    return tuple([returns[noise, seed] for seed in seeds] for noise in (winner, BASELINE))
 
 
-def compare(winner, seeds, returns):
-    """Compare the winner with the baseline on the fresh seeds, all of which have a return."""
-    pair = ([returns[noise, seed] for seed in seeds] for noise in (winner, BASELINE))
-    return statistics.compare(*pair)
+class Verdict(NamedTuple):
+    """What a confirmation found when it ended."""
+
+    comparison: statistics.Comparison  # with the repeated confidence interval
+    seeds: int  # of the planned ones, when it stopped
+    planned: int
+    needed: float  # the p that this look needed
+
+    @property
+    def significant(self):
+        """Whether there is a difference, in spite of rounding errors."""
+        return round(self.comparison.p, 12) <= self.needed
+
+    @property
+    def helps(self):
+        """Whether the noise was shown to be better than none."""
+        return self.significant and self.comparison.t > 0
 
 
-def helps(comparison, p_corrected):
-    """Tell whether the noise was shown to be better than none."""
-    return verdicts.significant(p_corrected) and comparison.t > 0
-
-
-def sentence(name, winner, noises, comparison, p_corrected, comparisons, unit=""):
-    """Say in one plain sentence what came out.
-
-    name: the algorithm and the environment. noises: how many were searched. comparisons: for how
-    many p is corrected. unit: of the difference.
-    """
-    evidence = f"{comparison.n} fresh seeds, {verdicts.difference(comparison, unit)}"
-    evidence += f", p {verdicts.p_value(comparison.p)}{verdicts.smallest(comparison)}"
-    evidence += verdicts.corrected(p_corrected, comparisons, "verdict")
-    none = f"none of {noises} noises could be shown to help; the best of them, {winner}"
-    said = none if noises > 1 else f"{winner} could not be shown to help"
-    if helps(comparison, p_corrected):
-        said = f"{winner} beats no noise"
-    elif verdicts.significant(p_corrected):
-        said = f"{none}," if noises > 1 else f"{winner}"
-        said += " is worse than no noise"
-    elif comparison.detectable > 0:
-        seen = rounded(comparison.detectable, verdicts.spread_of(comparison))
-        power = "80 % power before the correction" if comparisons > 1 else "80 % power"
-        evidence += f"; with {comparison.n} seeds a difference of {seen}{unit} would have been seen"
-        evidence += f" ({power})"
-    return f"{name}: {said}: {evidence}.{verdicts.borderline(comparison)}"
+def judge(state, plan, returns):
+    """Return the Verdict of a choice whose runs are all finished."""
+    needed = nominal_levels(plan)[state.look - 1]
+    samples = pair(*state.noises, state.seeds, returns)
+    comparison = statistics.compare(*samples, level=needed)
+    return Verdict(comparison, len(state.seeds), plan.looks[-1], needed)
 
 
 def records(algorithm, environment, state, returns, helped):

@@ -142,113 +142,76 @@ def constants(nodes):
 def read_words(script, words):
     """Read a script's options from the words after "--".
 
-    Returns {argument: value}, with values as config.json has them, and the words for the command,
-    with whole numbers such as 1e6 written out. Exits with one line about a name that the script
-    does not have: a typing error is not worth 9,100 failed runs.
+    Returns {argument: its words, or True or False of a switch}, and the words for the command, with
+    whole numbers such as 1e6 written out. Exits with one line about a name that the script does not
+    have: a typing error is not worth 9,100 failed runs.
     """
-    values, command = {}, []
-    flags = {flag: (name, option) for name, option in script.options.items() for flag in spelt(name, option)}
-    groups = []  # of an option and its values
+    given, command = {}, []
+    switches = {name for name, option in script.options.items() if option.kind == "bool"}
+    flags = {spelt(name): name for name in script.options}
+    flags |= {f"--no-{spelt(name)[2:]}": name for name in switches}
     for word in words:
         if re.match("--[A-Za-z]", word):
             flag, equals, value = word.partition("=")
-            groups.append([flag, *([value] if equals else [])])
-        elif not groups:
-            fail(f"{script.file} has no option {word}: the first word after -- is an option's name")
+            flag = flag.replace("_", "-")
+            if flag not in flags:
+                fail(f"{script.file} has no option {flag}{did_you_mean(flag, flags)}")
+            name = flags[flag]
+            given[name] = flag == spelt(name) if name in switches else []
+            command.append(flag)
+            if equals:
+                value = whole(value, script.options[name].kind)
+                given[name] = [value]
+                command[-1] += f"={value}"
+        elif not given:
+            fail(f"{script.file} has no option {word}; after -- comes the name of an option")
         else:
-            groups[-1].append(word)
-    for flag, *given in groups:
-        plain = flag.replace("_", "-")
-        if plain not in flags:
-            near = difflib.get_close_matches(plain, flags, n=1)
-            hint = f"; did you mean {near[0]}?" if near else ""
-            fail(f"{script.file} has no option {flag}{hint}")
-        name, option = flags[plain]
-        if option.kind == "bool" and not given:
-            values[name] = not plain.startswith("--no-") or name.startswith("no_")
-        else:
-            given = [whole(text) if re.search(r"\bint\b", option.kind) else text for text in given]
-            values[name] = value_of(option.kind, given)
-        command += [plain, *given]
-    return values, command
+            value = whole(word, script.options[name].kind)
+            given[name] = [*given[name], value] if isinstance(given[name], list) else [value]
+            command.append(value)
+    return given, command
 
 
-def spelt(name, option):
-    """Return how an option is written on a command line."""
-    plain = name.replace("_", "-")
-    return [f"--{plain}", f"--no-{plain}"] if option.kind == "bool" else [f"--{plain}"]
+def did_you_mean(flag, flags):
+    """Name the most similar flag, or nothing."""
+    near = difflib.get_close_matches(flag, flags, n=1)
+    return f"; did you mean {near[0]}?" if near else ""
 
 
-def whole(text):
-    """Write a whole number such as 1e6 with digits; leave other text as it is."""
+def spelt(name):
+    """Return how an argument is written on a command line."""
+    return f"--{name.replace('_', '-')}"
+
+
+def whole(text, kind):
+    """Write a whole number such as 1e6 with digits, where a script wants one."""
+    if not re.search(r"\bint\b", kind) or re.search(r"\b(float|str)\b", kind):
+        return text
     try:
         return str(int(float(text))) if "e" in text.lower() and float(text).is_integer() else text
     except (ValueError, OverflowError):
         return text
 
 
-class Text(str):
-    """The words of an option whose kind only the script can read."""
+def is_same(value, words):
+    """Tell whether a value of config.json is what an option's words say.
 
-
-def value_of(kind, words):
-    """Return what words mean for an option of this kind, as config.json has it.
-
-    What does not fit, or is of another kind than these, is a Text: only the script knows it.
+    words: text, a list of text, or True or False; what they mean only the script knows for certain.
     """
-    kind = kind.removeprefix("typing.")
-    for alternative in alternatives(kind):
-        container = re.fullmatch(r"(?:[Tt]uple|[Ll]ist|Sequence|set)\[(.*)\]", alternative)
-        if container:
-            return [value_of(inner, [word]) for inner, word in zip(kinds_of(container[1], len(words)), words, strict=True)]
-        if len(words) == 1:
-            found, value = single(alternative, words[0])
-            if found:
-                return value
-    return Text(" ".join(words))
+    if isinstance(words, list):
+        values = value if isinstance(value, list | tuple) else [value]
+        return len(values) == len(words) and all(map(is_same, values, words))
+    if value is None or isinstance(value, bool | dict):
+        return str(value) == str(words)
+    if isinstance(value, int | float):
+        return value == number(words)
+    return value == words or str(value).endswith(f".{words}")  # as of an enumeration
 
 
-def alternatives(kind):
-    """Split "int | None" and Optional[int] into their parts."""
-    optional = re.fullmatch(r"Optional\[(.*)\]", kind)
-    text = f"{optional[1]} | None" if optional else kind
-    union = re.fullmatch(r"Union\[(.*)\]", text)
-    return split(union[1], ",") if union else split(text, "|")
-
-
-def split(text, separator):
-    """Split text at a separator outside of brackets and quotes."""
-    parts, depth, quote = [""], 0, ""
-    for sign in text:
-        if quote or sign in "'\"":
-            quote = "" if sign == quote else quote or sign
-        depth += (sign in "[(") - (sign in ")]")
-        if sign == separator and not depth and not quote:
-            parts.append("")
-        else:
-            parts[-1] += sign
-    return [part.strip() for part in parts if part.strip()]
-
-
-def kinds_of(inner, number):
-    """Return the kinds of a container's values: "int, ..." is as many as there are."""
-    kinds = [kind for kind in split(inner, ",") if kind != "..."]
-    return (kinds + [kinds[-1]] * number)[:number]
-
-
-def single(kind, word):
-    """Return whether a word is of a kind, and its value."""
+def number(words, otherwise=None):
+    """Return the number that an option's words are, if they are one."""
+    text = words[0] if isinstance(words, list) and len(words) == 1 else words
     try:
-        if kind == "None":
-            return word == "None", None
-        if kind == "bool":
-            return word in ("True", "False"), word == "True"
-        if kind.startswith("Literal["):
-            members = ast.literal_eval(kind.removeprefix("Literal"))
-            members = members if isinstance(members, list | tuple) else [members]
-            found = [member for member in members if str(member) == word]
-            return bool(found), found[0] if found else None
-        readers = {"int": int, "float": float, "str": str, "Path": str, "pathlib.Path": str}
-        return (True, readers[kind](word)) if kind in readers else (False, None)
-    except (ValueError, SyntaxError):
-        return False, None
+        return float(text) if re.search("[.e]", str(text)) else int(text)
+    except (ValueError, TypeError):
+        return otherwise
