@@ -46,7 +46,7 @@ import noisy_wrappers as noisy
 from analysis import folders
 from analysis.errors import fail, in_words, take_over_terminal, with_place
 from analysis.folders import PHASES, DamageError
-from analysis.formatting import slug
+from analysis.formatting import rounded, slug
 from analysis.runs import ROBUSTNESS_COLUMNS, script_name, study_name, usual_settings, where_tested
 from analysis.statistics import mean_std
 
@@ -427,9 +427,9 @@ def mean_return(played, episodes):
     """
     results = np.array([results[:episodes] for results in played])
     mean, spread, n = mean_std(results[..., 0].mean(axis=1))
-    text = noisy.rounded(mean, spread)
+    text = rounded(mean, spread)
     if n > 1:
-        text += f" ± {noisy.rounded(spread, spread)}"
+        text += f" ± {rounded(spread, spread)}"
     success = results[..., 2]
     return text if np.isnan(success).all() else f"{text}, {100 * (success > 0).mean():.0f} % solved"
 
@@ -515,7 +515,7 @@ def main(args):
                 print(f"error: {text}", file=sys.stderr)
         elif args.drawing:
             [(drawn, steps, _)] = results
-            print(f"{run.folder.name}, {name}: return {noisy.rounded(drawn)}, {steps} steps")
+            print(f"{run.folder.name}, {name}: return {rounded(drawn)}, {steps} steps")
     if not args.drawing:
         tell(failed)
         if runs := [run for run in runs if run.folder not in failed]:
