@@ -127,7 +127,7 @@ def show_list(args, runs, choices):
     for run in todo:
         folder = f"{run.folder.parent}/{run.folder.name}"  # with a slash, for --runs-dir . too
         print(folder, command_line(run), sep="\t")
-    plan = [f"{counted(len(runs), 'run')}{with_baselines(args, runs)}, {len(todo)} to do"]
+    plan = [f"{counted(len(runs), 'run')}{with_baselines(runs)}, {len(todo)} to do"]
     if choices:
         from sweep import telling
 
@@ -212,11 +212,13 @@ def show_progress(args, runs, over, everything=False):
     return progresses
 
 
-def with_baselines(args, runs):
-    """Say how many runs have no noise, where that is not one for each seed of the others."""
-    baselines = sum("--noise" not in run.command for run in runs)
-    seeds = len({(run.kind, run.seed) for run in runs if "--noise" in run.command})
-    return f" ({baselines} of them without noise)" if seeds not in (0, baselines) else ""
+def with_baselines(runs):
+    """Say how many runs have no noise, where these have other seeds than those with noise."""
+    kinds = {True: set(), False: set()}
+    for run in runs:
+        kinds["--noise" in run.command].add((run.kind, run.seed))
+    number = len(kinds[False])
+    return f" ({number} of them without noise)" if kinds[True] not in (set(), kinds[False]) else ""
 
 
 def check_disk(folder):

@@ -16,6 +16,7 @@ import numpy as np
 from analysis.errors import fail
 from analysis.folders import CONFIRMATION, SEARCH, SUCCESS
 from analysis.statistics import LEVEL, final_value
+from analysis.verdicts import what_all_runs_do
 from noisy_wrappers import BASELINE, Configuration, parse_noise
 from sweep import halving
 from sweep.environment import MANY, ask_all, mean_seconds, remember, remembered, run_seconds
@@ -253,8 +254,6 @@ def follow(args, algorithm, env_id, environment, plan):
 
 def all_equal(args, value, runs):
     """Say that a choice cannot continue whose tests all have one result."""
-    from analysis.verdicts import what_all_runs_do
-
     return (
         f"{what_all_runs_do(value, args.metric)} in {args.total_timesteps:,} steps (runs: {runs}), "
         "so further runs would say nothing about noise; change --total-timesteps, or leave this out"

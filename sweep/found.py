@@ -68,7 +68,7 @@ def remarks(found, place):
 
     found: of all its runs; place: their folder, for people.
     """
-    hindrances, notes = [], []
+    found, hindrances, notes = list(found), [], []
     others = [one for one in found if one.differences]
     if others:
         counts = Counter(text for one in others for text in one.differences)

@@ -139,11 +139,14 @@ class Verdict(NamedTuple):
         return self.significant and self.comparison.t > 0
 
 
-def judge(state, plan, returns):
-    """Return the Verdict of a choice whose runs are all finished."""
+def judge(state, plan, returns, episodes=None):
+    """Return the Verdict of a choice whose runs are all finished.
+
+    episodes: of a test, where returns are rates of success in percent.
+    """
     needed = nominal_levels(plan)[state.look - 1]
     samples = pair(*state.noises, state.seeds, returns)
-    comparison = statistics.compare(*samples, level=needed)
+    comparison = statistics.compare(*samples, level=needed, episodes=episodes)
     return Verdict(comparison, len(state.seeds), plan.looks[-1], needed)
 
 

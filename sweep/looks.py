@@ -12,16 +12,18 @@ now be shown in fewer than 3. That is not binding: the level holds whoever goes 
 
 from functools import cache
 from math import sqrt
+from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
 import scipy
 
-from analysis import statistics
+from analysis.permutation import permutation_t
 
 MOST_LOOKS, SEEDS_OF_A_LOOK = 5, 5  # by default
 POWER = 0.9  # of the whole confirmation, for the gain by which futility is judged
 HOPE = 0.3  # chance of still showing it, below which the confirmation ends
+normal_quantile = NormalDist().inv_cdf
 POINTS, WIDTH = 2001, 10.0  # of the grid of the integration, in standard deviations
 
 
@@ -55,10 +57,7 @@ def bounds(looks, level):
     look to look on a grid (Armitage, McPherson and Rowe, 1969).
     """
     times = [number / looks[-1] for number in looks]
-    spent = [
-        2 * (1 - scipy.special.ndtr(statistics.normal_quantile(1 - level / 4) / sqrt(t)))
-        for t in times
-    ]
+    spent = [2 * (1 - scipy.special.ndtr(normal_quantile(1 - level / 4) / sqrt(t))) for t in times]
     found, grid, density, before, already = [], None, None, 0.0, 0.0
     for time, error in zip(times, spent, strict=True):
         step = sqrt(time - before)
@@ -89,14 +88,12 @@ def bounds(looks, level):
 def futility_limits(looks, level):
     """Return the z below which each look ends the confirmation; the last one ends it anyway."""
     last = bounds(looks, level)[-1]
-    drift = statistics.normal_quantile(1 - level / 2) + statistics.normal_quantile(POWER)
+    drift = normal_quantile(1 - level / 2) + normal_quantile(POWER)
     limits = []
     for number in looks[:-1]:
         time = number / looks[-1]
         left = 1 - time  # of the information: what is to come adds drift * left on average
-        limits.append(
-            (last - drift * left + statistics.normal_quantile(HOPE) * sqrt(left)) / sqrt(time)
-        )
+        limits.append((last - drift * left + normal_quantile(HOPE) * sqrt(left)) / sqrt(time))
     return tuple(limits)
 
 
@@ -105,5 +102,5 @@ def stops(noisy, baseline, look, plan):
 
     noisy, baseline (seeds,): the returns so far.
     """
-    t, p, _ = statistics.permutation_t(noisy, baseline)
+    t, p, _ = permutation_t(noisy, baseline)
     return round(p, 12) <= nominal_levels(plan)[look - 1] or t < futility_limits(*plan)[look - 1]

@@ -171,6 +171,7 @@ def unknown_option(name, known):
     """Say what to write instead of an option that the grid does not have."""
     ours = [scripts.read(path) for path in scripts.scripts_in(scripts.PROJECT).values()]
     of_scripts = {scripts.spelt(option) for script in ours for option in script.options}
+    of_scripts -= GIVEN_BY_THE_GRID.keys()
     if name in of_scripts:
         return f"{name} is an option of the scripts: put it at the end, after --"
     if name in EXECUTOR_OPTIONS:  # benchmark.sh reads it, unless it is written with a value

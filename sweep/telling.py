@@ -5,17 +5,18 @@ import itertools
 import math
 from pathlib import Path
 
+from analysis.choice import CHOICE_COLUMNS, choice_file
 from analysis.errors import fail, in_words
 from analysis.folders import SUCCESS, rewritten
-from analysis.runs import CHOICE_COLUMNS, choice_file
-from analysis.statistics import LEVEL, detectable_shift
-from analysis.verdicts import POINTS, difference, not_zero, p_value, smallest, spread_of, two_digits
-from noisy_wrappers import BASELINE, rounded
+from analysis.formatting import counted, p_value, rounded, two_digits
+from analysis.power import detectable_shift
+from analysis.statistics import LEVEL
+from analysis.verdicts import POINTS, difference_in_words, excluded, smallest
+from noisy_wrappers import BASELINE
 from sweep import halving
 from sweep.environment import time_left
 from sweep.looks import nominal_levels
 from sweep.options import from_caller
-from sweep.words import counted
 
 UNITS = {"return": "", SUCCESS: POINTS}  # of a difference, by the metric
 
@@ -140,20 +141,23 @@ def report(found, args):
     print(*(sentence_of(choice, args) for choice in found), sep="\n", flush=True)
     rows = []
     for choice in found:
-        verdict = halving.judge(choice.state, choice.plan, choice.returns)
+        verdict = judged(choice, args)
         rows += halving.records(*choice.kind, choice.state, choice.returns, verdict.helps)
     write_choice(Path(args.runs_dir, choice_file(args.metric)), rows)
 
 
 def sentence_of(choice, args):
     """Say what a finished choice found."""
-    verdict = halving.judge(choice.state, choice.plan, choice.returns)
-    if args.metric == SUCCESS:  # never percent of a rate
-        comparison = verdict.comparison._replace(difference_percent=math.nan)
-        verdict = verdict._replace(comparison=comparison)
     [winner] = choice.state.noises
-    share = shared_level(choice.plan)
-    return sentence(choice.name, winner, choice.noises, verdict, share, UNITS[args.metric])
+    share, unit = shared_level(choice.plan), UNITS[args.metric]
+    return sentence(choice.name, winner, choice.noises, judged(choice, args), share, unit)
+
+
+def judged(choice, args):
+    """Return the Verdict of a finished choice; a rate of success is one of so many episodes."""
+    episodes = next(iter(choice.runs.values())).number("eval_episodes", 10)
+    episodes = episodes if args.metric == SUCCESS else None
+    return halving.judge(choice.state, choice.plan, choice.returns, episodes)
 
 
 def sentence(name, winner, noises, verdict, share=0, unit=""):
@@ -166,7 +170,7 @@ def sentence(name, winner, noises, verdict, share=0, unit=""):
     seeds = f"{verdict.seeds} fresh seeds"
     if verdict.seeds < verdict.planned:
         seeds = f"stopped after {verdict.seeds} of {verdict.planned} planned fresh seeds"
-    evidence = f"{seeds}, {difference(comparison, unit)}, p {p_value(comparison.p)}"
+    evidence = f"{seeds}, {difference_in_words(comparison, unit)}, p {p_value(comparison.p)}"
     evidence += smallest(comparison)
     if verdict.needed < LEVEL:
         evidence += f", needed: {two_digits(verdict.needed)}"
@@ -179,9 +183,8 @@ def sentence(name, winner, noises, verdict, share=0, unit=""):
         said = (
             f"{none}, is worse than no noise" if noises > 1 else f"{winner} is worse than no noise"
         )
-    elif comparison.difference_high > 0:
-        most = not_zero(comparison.difference_high, spread_of(comparison))
-        evidence += f"; a gain of more than {most}{unit} is excluded"
+    else:
+        evidence += excluded(comparison, unit)
     return f"{name}: {said}: {evidence}.{borderline(verdict)}"
 
 

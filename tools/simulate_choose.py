@@ -18,13 +18,14 @@ from collections import defaultdict
 from functools import cache, partial
 from itertools import product
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 from tabulate import tabulate
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
-from analysis import folders, statistics  # noqa: E402
+from analysis import folders, permutation, statistics  # noqa: E402
 from noisy_wrappers import BASELINE, Configuration  # noqa: E402
 from sweep import halving, looks  # noqa: E402
 from sweep.grid import MOST_BASELINES  # noqa: E402
@@ -32,6 +33,8 @@ from sweep.grid import MOST_BASELINES  # noqa: E402
 GAINS = (0.5, 0.75, 1.0, 1.5, 2.0)
 SPREADS = (1, 0.5, 2, 0.1)  # with noise, in those without
 FEWEST = 10  # seeds of a shape of our own
+PARTITIONS = 9_999  # of a test
+ALL_PARTITIONS = cache(permutation.partitions.__wrapped__)  # those of all looks are kept
 FIXED, FIVE = (looks.Plan(looks.looks_after(25, number), statistics.LEVEL) for number in (1, 5))
 
 
@@ -110,15 +113,15 @@ def choose(noises, plan, returns):
 
 def simulate(noises, plan, gain, draw=normal, spread=1.0, trials=1000, seed=0):
     """Return the shares of choices that find the good noise, confirm it, claim any; their runs."""
-    statistics.RANDOM_PARTITIONS = 9_999
-    statistics.partitions.cache_clear()
     rng, sums = np.random.default_rng(seed), np.zeros(4)
-    for _ in range(trials):
-        returns = Returns(rng, draw, gain, spread)
-        state = choose(noises, plan, returns)
-        claims = halving.judge(state, plan, returns).helps
-        found = state.noises == NOISES[:1]
-        sums += found, found and claims, claims, len(returns)
+    quick = {"RANDOM_PARTITIONS": PARTITIONS, "partitions": ALL_PARTITIONS}
+    with mock.patch.multiple(permutation, **quick):
+        for _ in range(trials):
+            returns = Returns(rng, draw, gain, spread)
+            state = choose(noises, plan, returns)
+            claims = halving.judge(state, plan, returns).helps
+            found = state.noises == NOISES[:1]
+            sums += found, found and claims, claims, len(returns)
     return sums / trials
 
 
@@ -126,14 +129,14 @@ def level(n, m, draw, spread, trials=4000, seed=0):
     """Return how often a test of n seeds with noise against m without claims an effect of none."""
     rng = np.random.default_rng(seed)
     noisy, baseline = spread * draw(rng, (n, trials)), draw(rng, (m, trials))
-    chosen = statistics.partitions(n, m)
+    chosen = permutation.partitions(n, m)
     if len(chosen) > 2000:
-        chosen = statistics.random_partitions(n, m, 1999, rng)
+        chosen = permutation.random_partitions(n, m, 1999, rng)
     ts = [
-        statistics.welch_t(np.concatenate([noisy, baseline])[:, part], chosen)
+        permutation.welch_t(np.concatenate([noisy, baseline])[:, part], chosen)
         for part in np.array_split(np.arange(trials), 20)
     ]
-    shares = [statistics.tails(t) for t in ts]
+    shares = [permutation.tails(t) for t in ts]
     p = np.concatenate([2 * np.minimum(above, below) for above, below in shares])
     return np.mean(p <= statistics.LEVEL)
 

@@ -43,8 +43,9 @@ def folders(*words):
 def finish(folder, steps=1000, more=(), **args):
     """Write what tells that a run of the sweep is finished; more: of config.json, beside args."""
     folder.mkdir(parents=True, exist_ok=True)
-    name = folder.name.rpartition("__")[2]
-    args = {"env_id": "Hopper-v5", "exp_name": name or "x", "seed": 1, "noise": [], "noise_rate": []} | args
+    seed = re.search(r"_s(\d+)_", folder.name)
+    args = {"seed": int(seed[1]) if seed else 1, "exp_name": folder.name.rpartition("__")[2]} | args
+    args = {"env_id": "Hopper-v5", "noise": [], "noise_rate": []} | args
     args |= {"total_timesteps": steps, "eval_episodes": 10}
     versions = {"noisy_wrappers": __version__}
     config = {"algorithm": "SAC", "args": args, "versions": versions} | dict(more)
