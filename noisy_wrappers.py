@@ -32,6 +32,7 @@ import importlib.machinery
 import importlib.metadata
 import inspect
 import json
+import keyword
 import math
 import numbers
 import operator
@@ -131,6 +132,7 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.opportunities = 0
         self.times_applied = 0
         self._counted = True  # since the last opportunity, in times_applied
+        self.relative, self._spread = False, None
         self._position = len(_layers(env, NoiseWrapper))
         self._seed(None)
 
@@ -184,13 +186,16 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             self._seed(seed)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the random streams and the counters, to be taken between two episodes."""
-        return {
+        """Return the streams, the counters and the estimates, to be taken between two episodes."""
+        state = {
             "gate": self._gate.bit_generator.state,
             "noise": self.noise.bit_generator.state,
             "opportunities": self.opportunities,
             "times_applied": self.times_applied,
         }
+        if self._spread is not None:
+            state["spread"] = _without_arrays(vars(self._spread))
+        return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a :meth:`state_dict`; the next call must be ``reset()``."""
@@ -198,12 +203,19 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.noise.bit_generator.state = state["noise"]
         self.opportunities = state["opportunities"]
         self.times_applied = state["times_applied"]
+        if self._spread is not None:
+            self._spread = _Spread(**state["spread"])
 
     def _seed(self, seed: int | None) -> None:
         name = zlib.crc32(type(self).__name__.encode())
         entropy = None if seed is None else [seed, name, self._position]
         seeds = np.random.SeedSequence(entropy).spawn(2)
         self._gate, self.noise = map(np.random.default_rng, seeds)
+
+    def _be_relative(self, relative: bool) -> None:
+        """Measure the spread of what is received, if the noise is in units of that."""
+        self.relative = _flag("relative", relative)
+        self._spread = _Spread() if relative else None
 
     def acts(self) -> bool:
         """Decide with probability p whether the noise acts now: on this step, or in this episode.
@@ -220,13 +232,39 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         That is a new dict: the environment may reuse its own. The first mark after an opportunity
         counts in ``times_applied``.
         """
-        self.times_applied += not self._counted
-        self._counted = True
-        name = type(self).__name__
+        if not self._counted:
+            self._counted = True
+            self.times_applied += 1
         below = info.get("noise")
         if not isinstance(below, tuple):  # nothing, or the environment's own
             below = ()
-        return {**info, "noise": (*below, name)}
+        return {**info, "noise": (*below, type(self).__name__)}
+
+
+class _Spread:
+    """The standard deviation of each dimension of what a wrapper received (Welford's algorithm).
+
+    It is 0 until 100 samples are in, so noise that is relative to it begins then. A sample that is
+    not finite does not count.
+    """
+
+    def __init__(self, count: int = 0, mean: Any = 0.0, squares: Any = 0.0):
+        """Begin, or continue from the variables of another one, in which arrays may be lists."""
+        self.count = count
+        self.mean = np.asarray(mean) if isinstance(mean, list) else mean
+        self.squares = np.asarray(squares) if isinstance(squares, list) else squares
+
+    def add(self, sample: Any) -> None:
+        """Take in an array or a number."""
+        if math.isfinite(np.sum(sample)):
+            self.count += 1
+            difference = sample - self.mean
+            self.mean = self.mean + difference / self.count
+            self.squares = self.squares + difference * (sample - self.mean)
+
+    @property
+    def deviation(self) -> Any:
+        return (self.squares / (self.count - 1)) ** 0.5 if self.count >= 100 else 0.0
 
 
 # ---------------------------------------------------------------------------- noise on observations
@@ -243,6 +281,9 @@ class ObservationNoise(NoiseWrapper):
     What is perturbed has the dtype of its space, and its shape; integers are computed in float64,
     rounded and clipped to their dtype. The space is widened to what noise can reach. The
     observation of ``reset()`` is perturbed like any other.
+
+    With ``relative`` the noise is in standard deviations of each number, which are estimated of all
+    observations that this wrapper has received; the first 99 stay clean.
     """
 
     kind = "observation"
@@ -252,6 +293,9 @@ class ObservationNoise(NoiseWrapper):
         self.keys = _keys(keys)
         super().__init__(env, noise_rate, **parameters, keys=self.keys)
         self._boxes = {} if isinstance(env, _ProbeEnv) else self._find_boxes(env)
+        self._shape: tuple[int, ...] = (sum(math.prod(b.shape) for b in self._boxes.values()),)
+        if () in self._boxes:
+            self._shape = self._boxes[()].shape  # of what is perturbed
 
     def _find_boxes(self, env: Env) -> dict[EntryPath, gym.spaces.Box]:
         """Return the entries to perturb: {path in the observation: their space}."""
@@ -279,7 +323,8 @@ class ObservationNoise(NoiseWrapper):
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and perturb the first observation with probability p."""
-        return self._observe(*super().reset(seed=seed, options=options))
+        observation, info = super().reset(seed=seed, options=options)
+        return self._observe(observation, info)
 
     def step(self, action: Any) -> Step:
         """Step the environment and perturb the observation with probability p."""
@@ -288,14 +333,32 @@ class ObservationNoise(NoiseWrapper):
         return observation, reward, terminated, truncated, info
 
     def _observe(self, observation: Any, info: Info) -> tuple[Any, Info]:
+        """Return what is seen of an observation, and the info."""
+        if self._spread is not None:
+            self._spread.add(self._numbers(observation))
         if not self.acts():
             return observation, info
-        given = self._numbers(observation)
-        noisy = self._with_numbers(observation, self._perturb(given))
-        same = self._with_numbers(observation, given)  # an environment may return another dtype
-        if not np.array_equal(self._numbers(noisy), self._numbers(same), equal_nan=True):
-            info = self.mark(info)
-        return noisy, info
+        return self._perturbed(observation, self._numbers(observation), info)
+
+    def _perturbed(self, observation: Any, given: NDArray[Any], info: Info) -> tuple[Any, Info]:
+        """Return an observation with noise, in which ``given`` are the numbers, and the info."""
+        numbers = np.asarray(self._perturb(given))
+        if numbers.shape != given.shape:
+            wanted = f"an array of shape {given.shape}, not {numbers.shape}"
+            raise ValueError(f"{type(self).__name__}._perturb must return {wanted}")
+        parts: dict[EntryPath, NDArray[Any]] = {}
+        start, changed = 0, False
+        for path, box in self._boxes.items():
+            part, clean = numbers, given
+            if path:  # a part of the vector
+                end = start + math.prod(box.shape)
+                part = numbers[start:end].reshape(box.shape)
+                clean = given[start:end].reshape(box.shape)
+                start = end
+            parts[path] = _cast(part, box.dtype)
+            # an environment may return another dtype than that of its space: that is no noise
+            changed = changed or _differ(parts[path], _cast(clean, box.dtype))
+        return _replaced(observation, parts), self.mark(info) if changed else info
 
     def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
         """Return the numbers of an observation with noise, a new array.
@@ -304,27 +367,27 @@ class ObservationNoise(NoiseWrapper):
         """
         raise NotImplementedError
 
+    def _in_units(self, noise: NDArray[Any]) -> NDArray[Any]:
+        """Return additive noise in units of the observation."""
+        return noise if self._spread is None else noise * self._spread.deviation
+
     def _numbers(self, observation: Any) -> NDArray[Any]:
         """Return a copy of the entries to perturb, which must not be written to."""
         if () in self._boxes:
             numbers = np.array(observation, np.float64)
         else:
             parts = [functools.reduce(operator.getitem, path, observation) for path in self._boxes]
-            numbers = np.concatenate([np.asarray(part, np.float64).ravel() for part in parts])
+            numbers = np.concatenate(parts, axis=None, dtype=np.float64)
         numbers.flags.writeable = False
         return numbers
 
-    def _with_numbers(self, observation: Any, numbers: NDArray[Any]) -> Any:
-        """Return a new observation with these numbers in place of :meth:`_numbers`."""
-        if () in self._boxes:
-            return _cast(numbers, self._boxes[()].dtype)
-        ends = np.cumsum([math.prod(box.shape) for box in self._boxes.values()])
-        parts = {}
-        for (path, box), part in zip(
-            self._boxes.items(), np.split(numbers, ends[:-1]), strict=True
-        ):
-            parts[path] = _cast(part.reshape(box.shape), box.dtype)
-        return _replaced(observation, parts)
+    def _check_scales(self, scale: float | tuple[float, ...], given: Any) -> None:
+        """Raise ValueError unless a tuple of scales, given by the user, fits the observation."""
+        if isinstance(scale, tuple) and self._boxes and self._shape != (len(scale),):
+            raise ValueError(
+                f"scale has {len(scale)} numbers and the observation has shape {self._shape}: "
+                f"give one number for all dimensions or one for each, got {given!r}"
+            )
 
     def _widen(self, ends_of: Callable[[NDArray[Any]], Sequence[Any]]) -> None:
         """Extend the observation space to what ``ends_of`` says noise makes of its bounds."""
@@ -346,7 +409,8 @@ class RandomNormalNoisyObservation(ObservationNoise):
 
     ``scale`` is the paper's sigma, in units of the observation: one number for all dimensions, or a
     tuple with one for each of a one-dimensional observation. e = ``noise.normal(loc, scale,
-    o.shape)``. noisyenv 0.1.1 takes loc before scale.
+    o.shape)``; with ``relative`` times the standard deviation of each dimension. noisyenv 0.1.1
+    takes loc before scale.
 
     >>> env = RandomNormalNoisyObservation(gym.make("CartPole-v1"), 1.0, 0.1)
     >>> observation, info = env.reset(seed=0)
@@ -363,46 +427,58 @@ class RandomNormalNoisyObservation(ObservationNoise):
         scale: float | tuple[float, ...],
         *,
         loc: float = 0.0,
+        relative: bool = False,
         keys: Keys = None,
     ):
         """Raise ValueError unless scale >= 0, both are finite and a tuple fits the observation."""
         self.scale = _scale_or_scales(scale)
         self.loc = _number("loc", loc)
-        super().__init__(env, noise_rate, scale=self.scale, loc=self.loc, keys=keys)
-        if isinstance(self.scale, tuple) and self._boxes:
-            shape = (sum(math.prod(box.shape) for box in self._boxes.values()),)
-            if () in self._boxes:
-                shape = self._boxes[()].shape
-            if shape != (len(self.scale),):
-                raise ValueError(
-                    f"scale has {len(self.scale)} numbers and the observation has shape {shape}: "
-                    f"give one number for all dimensions or one for each, got {scale!r}"
-                )
+        super().__init__(
+            env, noise_rate, scale=self.scale, loc=self.loc, relative=relative, keys=keys
+        )
+        self._be_relative(relative)
+        self._check_scales(self.scale, scale)
         self._widen(lambda bound: (-np.inf, np.inf))
 
     def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
-        return observation + self.noise.normal(self.loc, self.scale, observation.shape)
+        noise = self.noise.normal(self.loc, self.scale, observation.shape)
+        return observation + self._in_units(noise)
 
 
 class RandomUniformNoisyObservation(ObservationNoise):
     """Adds uniform noise to the observation: o + e with each e_i ~ U(low, high) (section 3.1).
 
     ``low`` and ``high`` are the paper's alpha and beta, in units of the observation;
-    e = ``noise.uniform(low, high, o.shape)``.
+    e = ``noise.uniform(low, high, o.shape)``; with ``relative`` times the standard deviation of
+    each dimension.
 
     >>> env = RandomUniformNoisyObservation(gym.make("CartPole-v1"), 1.0, -0.1, 0.1)
     >>> env.reset(seed=0)[0]
     array([ 0.01826801, -0.01052575, -0.1353507 , -0.00589376], dtype=float32)
     """
 
-    def __init__(self, env: Env, noise_rate: Rate, low: float, high: float, *, keys: Keys = None):
+    def __init__(
+        self,
+        env: Env,
+        noise_rate: Rate,
+        low: float,
+        high: float,
+        *,
+        relative: bool = False,
+        keys: Keys = None,
+    ):
         """Raise ValueError unless low <= high and both are finite."""
         self.low, self.high = _interval(low, high)
-        super().__init__(env, noise_rate, low=self.low, high=self.high, keys=keys)
-        self._widen(lambda bound: (bound + self.low, bound + self.high))
+        super().__init__(
+            env, noise_rate, low=self.low, high=self.high, relative=relative, keys=keys
+        )
+        self._be_relative(relative)
+        unknown = (-np.inf, np.inf)  # the standard deviations
+        self._widen(lambda bound: unknown if relative else (bound + self.low, bound + self.high))
 
     def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
-        return observation + self.noise.uniform(self.low, self.high, observation.shape)
+        noise = self.noise.uniform(self.low, self.high, observation.shape)
+        return observation + self._in_units(noise)
 
 
 class RandomUniformScaleObservation(ObservationNoise):
@@ -446,7 +522,9 @@ class RandomMixupObservation(ObservationNoise):
     ``factor`` is the paper's lambda. o_(t-1) is what this wrapper received at the last step, noise
     of inner wrappers included and its own excluded; ``recursive=True`` blends with what it
     returned instead. The first observation of an episode has no predecessor: it passes untouched
-    and is no opportunity. No noise is drawn besides the gate's.
+    and is no opportunity. No noise is drawn besides the gate's. With factor = 0 the agent sees the
+    observation of the step before; with ``recursive`` it keeps seeing the last one that arrived, as
+    where a sensor's packet is lost.
 
     noisyenv 0.1.1 remembers what it returned, as ``recursive=True`` does, so with p = 1 and
     factor = 0 the agent sees one observation forever; and it blends the first observation of an
@@ -479,12 +557,14 @@ class RandomMixupObservation(ObservationNoise):
         self._previous = None
 
     def _observe(self, observation: Any, info: Info) -> tuple[Any, Info]:
-        returned = observation
-        if self._previous is not None:
-            returned, info = super()._observe(observation, info)
-        # A copy: the environment may write its next observation into the same array.
-        self._previous = self._numbers(returned if self.recursive else observation)
-        return returned, info
+        received = self._numbers(observation)  # a copy: the environment may reuse its array
+        remembered = received
+        if self._previous is not None and self.acts():
+            observation, info = self._perturbed(observation, received, info)
+            if self.recursive:
+                remembered = self._numbers(observation)
+        self._previous = remembered
+        return observation, info
 
     def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
         assert self._previous is not None
@@ -492,7 +572,7 @@ class RandomMixupObservation(ObservationNoise):
             return (observation if self.factor else self._previous).copy()
         mixture = self.factor * observation + (1 - self.factor) * self._previous
         low, high = np.minimum(observation, self._previous), np.maximum(observation, self._previous)
-        return np.clip(mixture, low, high)  # rounding must not leave the observation space
+        return np.minimum(np.maximum(mixture, low), high)  # rounding must not leave the space
 
 
 class RandomDropoutObservation(ObservationNoise):
@@ -517,6 +597,98 @@ class RandomDropoutObservation(ObservationNoise):
         return np.where(self.noise.random(observation.shape) < self.keep_prob, observation, 0.0)
 
 
+class RandomObservationBias(ObservationNoise):
+    """Adds the same e ~ N(0, scale^2 I) to all observations of an episode. Not in the paper.
+
+    At ``reset()`` the episode is chosen with probability p, and e is drawn, ``noise.normal(0,
+    scale, o.shape)``; it is drawn for the others too, so that a higher rate leaves the chosen
+    episodes as they are. ``scale`` is in units of the observation, one number or a tuple with one
+    for each dimension; with ``relative``, in its standard deviations before this episode.
+    ``times_applied`` counts episodes. It is how a sensor fails that is calibrated badly.
+
+    >>> env, bare = gym.make("CartPole-v1"), gym.make("CartPole-v1")
+    >>> env = RandomObservationBias(env, 1.0, 0.1)
+    >>> (env.reset(seed=0)[0] - bare.reset(seed=0)[0]).round(4)
+    array([ 0.0398, -0.0424, -0.0879,  0.1642], dtype=float32)
+    >>> (env.step(0)[0] - bare.step(0)[0]).round(4)
+    array([ 0.0398, -0.0424, -0.0879,  0.1642], dtype=float32)
+    """
+
+    def __init__(
+        self,
+        env: Env,
+        noise_rate: Rate,
+        scale: float | tuple[float, ...],
+        *,
+        relative: bool = False,
+        keys: Keys = None,
+    ):
+        """Raise ValueError unless scale >= 0 is finite and a tuple fits the observation."""
+        self.scale = _scale_or_scales(scale)
+        super().__init__(env, noise_rate, scale=self.scale, relative=relative, keys=keys)
+        self._be_relative(relative)
+        self._check_scales(self.scale, scale)
+        self._widen(lambda bound: (-np.inf, np.inf))
+        self._bias: NDArray[Any] | None = None  # of the episode, if it is chosen
+
+    def _begin(self, seed: int | None) -> None:
+        super()._begin(seed)
+        bias = self._in_units(self.noise.normal(0, self.scale, self._shape))
+        self._bias = bias if self.acts() else None
+
+    def _observe(self, observation: Any, info: Info) -> tuple[Any, Info]:
+        received = self._numbers(observation)
+        if self._spread is not None:
+            self._spread.add(received)
+        if self._bias is None:
+            return observation, info
+        return self._perturbed(observation, received, info)
+
+    def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
+        return observation + self._bias
+
+
+class RandomObservationDelay(ObservationNoise):
+    """Shows the observations of an episode k steps late, k uniform on low, ..., high. Our own.
+
+    At ``reset()`` the episode is chosen with probability p, and k is drawn,
+    ``noise.integers(low, high, endpoint=True)``; it is drawn for the others too, so that a higher
+    rate leaves the chosen episodes as they are. In a chosen episode the agent sees what was there k
+    steps before, and until then what ``reset()`` gave: with k = 2 it sees o0 o0 o0 o1 o2. ``high``
+    is ``low`` by default. ``times_applied`` counts the episodes in which it changed something.
+
+    >>> env = RandomObservationDelay(gym.make("CartPole-v1"), 1.0, 1)
+    >>> seen = [env.reset(seed=0)[0], env.step(0)[0], env.step(0)[0]]
+    >>> bool((seen[0] == seen[1]).all()), bool((seen[1] == seen[2]).any())
+    (True, False)
+    """
+
+    def __init__(
+        self, env: Env, noise_rate: Rate, low: int, high: int | None = None, *, keys: Keys = None
+    ):
+        """Raise ValueError unless 0 <= low <= high are integers."""
+        self.low, self.high = _whole_interval(low, high, least=0)
+        unlike = None if self.high == self.low else self.high
+        super().__init__(env, noise_rate, low=self.low, high=unlike, keys=keys)
+        self._delay = 0
+        self._received: deque[NDArray[Any]] = deque()  # what is seen now, and what waits
+
+    def _begin(self, seed: int | None) -> None:
+        super()._begin(seed)
+        delay = int(self.noise.integers(self.low, self.high, endpoint=True))
+        self._delay = delay if self.acts() else 0
+        self._received = deque(maxlen=min(self._delay + 1, sys.maxsize))
+
+    def _observe(self, observation: Any, info: Info) -> tuple[Any, Info]:
+        if not self._delay:
+            return observation, info
+        self._received.append(self._numbers(observation))
+        return self._perturbed(observation, self._received[-1], info)
+
+    def _perturb(self, observation: NDArray[Any]) -> NDArray[Any]:
+        return self._received[0].copy()
+
+
 # --------------------------------------------------------------------------------- noise on rewards
 
 
@@ -537,6 +709,8 @@ class RewardNoise(NoiseWrapper):
     def step(self, action: Any) -> Step:
         """Step the environment and perturb the reward with probability p."""
         observation, reward, terminated, truncated, info = self.env.step(action)
+        if self._spread is not None:
+            self._spread.add(float(_number_in(reward)))
         if self.acts():
             given: Any = _number_in(reward)
             reward = self._perturb(given)
@@ -548,12 +722,17 @@ class RewardNoise(NoiseWrapper):
         """Return a reward with noise."""
         raise NotImplementedError
 
+    def _in_units(self, noise: float) -> float:
+        """Return additive noise in units of the reward."""
+        return noise if self._spread is None else noise * self._spread.deviation
+
 
 class RandomNormalNoisyReward(RewardNoise):
     """Adds Gaussian noise to the reward: r + e with e ~ N(loc, scale^2) (section 3.2).
 
-    ``scale`` is the paper's sigma, in units of the reward; e = ``noise.normal(loc, scale)``.
-    noisyenv 0.1.1 takes loc before scale.
+    ``scale`` is the paper's sigma, in units of the reward; e = ``noise.normal(loc, scale)``. With
+    ``relative`` it is in standard deviations of the rewards that this wrapper has received; the
+    first 99 stay clean. noisyenv 0.1.1 takes loc before scale.
 
     >>> env = RandomNormalNoisyReward(gym.make("CartPole-v1"), 1.0, 0.1)
     >>> _ = env.reset(seed=0)
@@ -561,21 +740,31 @@ class RandomNormalNoisyReward(RewardNoise):
     1.1210431182607201
     """
 
-    def __init__(self, env: Env, noise_rate: Rate, scale: float, *, loc: float = 0.0):
+    def __init__(
+        self,
+        env: Env,
+        noise_rate: Rate,
+        scale: float,
+        *,
+        loc: float = 0.0,
+        relative: bool = False,
+    ):
         """Raise ValueError unless scale >= 0 and both are finite."""
         self.scale = _number("scale", scale, low=0)
         self.loc = _number("loc", loc)
-        super().__init__(env, noise_rate, scale=self.scale, loc=self.loc)
+        super().__init__(env, noise_rate, scale=self.scale, loc=self.loc, relative=relative)
+        self._be_relative(relative)
 
     def _perturb(self, reward: float) -> float:
-        return reward + self.noise.normal(self.loc, self.scale)
+        return reward + self._in_units(self.noise.normal(self.loc, self.scale))
 
 
 class RandomUniformNoisyReward(RewardNoise):
     """Adds uniform noise to the reward: r + e with e ~ U(low, high) (section 3.2).
 
     ``low`` and ``high`` are the paper's alpha and beta, in units of the reward;
-    e = ``noise.uniform(low, high)``.
+    e = ``noise.uniform(low, high)``. With ``relative`` they are in standard deviations of the
+    rewards that this wrapper has received; the first 99 stay clean.
 
     >>> env = RandomUniformNoisyReward(gym.make("CartPole-v1"), 1.0, -0.1, 0.1)
     >>> _ = env.reset(seed=0)
@@ -583,13 +772,16 @@ class RandomUniformNoisyReward(RewardNoise):
     0.9380732431402061
     """
 
-    def __init__(self, env: Env, noise_rate: Rate, low: float, high: float):
+    def __init__(
+        self, env: Env, noise_rate: Rate, low: float, high: float, *, relative: bool = False
+    ):
         """Raise ValueError unless low <= high and both are finite."""
         self.low, self.high = _interval(low, high)
-        super().__init__(env, noise_rate, low=self.low, high=self.high)
+        super().__init__(env, noise_rate, low=self.low, high=self.high, relative=relative)
+        self._be_relative(relative)
 
     def _perturb(self, reward: float) -> float:
-        return reward + self.noise.uniform(self.low, self.high)
+        return reward + self._in_units(self.noise.uniform(self.low, self.high))
 
 
 class RandomUniformScaleReward(RewardNoise):
@@ -621,7 +813,8 @@ class RandomNormalNoisyAction(NoiseWrapper):
 
     The environment receives a + e clipped to its action space, in the space's dtype; the caller's
     action is left as it is. ``scale`` and ``loc`` are in units of the action, the same in every
-    dimension; e = ``noise.normal(loc, scale, a.shape)``. Action noise is part of the dynamics.
+    dimension; e = ``noise.normal(loc, scale, a.shape)``. With ``relative`` they are in halves of
+    each dimension's range. Action noise is part of the dynamics.
 
     >>> env = RandomNormalNoisyAction(gym.make("Pendulum-v1"), 1.0, 0.5)
     >>> _ = env.reset(seed=0)
@@ -634,27 +827,49 @@ class RandomNormalNoisyAction(NoiseWrapper):
 
     kind = "action"
 
-    def __init__(self, env: Env, noise_rate: Rate, scale: float, *, loc: float = 0.0):
-        """Raise ValueError unless scale >= 0, both are finite and actions are a Box of floats."""
+    def __init__(
+        self,
+        env: Env,
+        noise_rate: Rate,
+        scale: float,
+        *,
+        loc: float = 0.0,
+        relative: bool = False,
+    ):
+        """Raise ValueError unless scale >= 0, both are finite and actions are a Box of floats.
+
+        Its bounds must be finite where noise is relative to them.
+        """
         self.scale = _number("scale", scale, low=0)
         self.loc = _number("loc", loc)
-        super().__init__(env, noise_rate, scale=self.scale, loc=self.loc)
+        super().__init__(env, noise_rate, scale=self.scale, loc=self.loc, relative=relative)
+        self.relative = _flag("relative", relative)
         self._space = env.action_space
         if not _is_box(self._space, "f"):
             raise ValueError(
                 f"RandomNormalNoisyAction needs a Box action space of floats, got {self._space}"
             )
+        if relative and not is_bounded(self._space):
+            raise ValueError(f"relative=True needs bounded actions, got {self._space}")
+        self._low, self._high = (
+            bound.astype(np.float64) for bound in (self._space.low, self._space.high)
+        )
+        self._unit = (self._high - self._low) / 2 if relative else None
 
     def step(self, action: Any) -> Step:
         """Perturb the action with probability p and step the environment."""
         if not self.acts():
             return self.env.step(action)
-        space = self._space
-        noise = self.noise.normal(self.loc, self.scale, space.shape)
-        unclipped = np.asarray(action, np.float64) + noise
-        noisy = np.asarray(np.clip(unclipped, space.low, space.high), space.dtype)
+        dtype = self._space.dtype
+        noise = self.noise.normal(self.loc, self.scale, self._space.shape)
+        if self._unit is not None:
+            noise *= self._unit
+        noisy = np.minimum(
+            np.maximum(np.asarray(action, np.float64) + noise, self._low), self._high
+        )
+        noisy = np.asarray(noisy, dtype)
         observation, reward, terminated, truncated, info = self.env.step(noisy)
-        if (noisy != np.asarray(action, space.dtype)).any():
+        if np.count_nonzero(noisy != np.asarray(action, dtype)):
             info = self.mark(info)
         return observation, reward, terminated, truncated, info
 
@@ -791,29 +1006,25 @@ class RandomEarlyTermination(NoiseWrapper):
         return observation, reward, terminated, truncated, info
 
 
-# Fields of MuJoCo's model that are usually randomized.
-_USUAL_FIELDS = ("body_mass", "body_inertia", "geom_friction", "jnt_stiffness", "dof_armature")
-_USUAL_FIELDS += ("dof_damping", "dof_frictionloss", "actuator_gear")
-# What mj_setConst computes from others (engine_setconst.c), in the model and in model.stat.
-_DERIVED_FIELDS = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "dof_length")
-_DERIVED_FIELDS += ("actuator_acc0", "actuator_length0", "actuator_biasprm", "tendon_invweight0")
-_DERIVED_FIELDS += ("tendon_length0", "tendon_lengthspring", "eq_data", "cam_pos0", "cam_poscom0")
-_DERIVED_FIELDS += ("cam_mat0", "light_pos0", "light_poscom0", "light_dir0", "flexedge_length0")
-_DERIVED_FIELDS += ("flexedge_invweight0", "flex_vertmetric", "flex_vert0")
-_STATISTICS = ("meaninertia", "meanmass", "meansize", "extent", "center")
-
-
 class RandomDynamics(NoiseWrapper):
     """Scales masses, frictions and the like of a MuJoCo model for an episode. Not in the paper.
 
     At ``reset()`` the episode is chosen with probability p. In a chosen one, each row of the named
     ``fields`` of the simulator's model (that of a body, a geom, a joint, an actuator) is its own
     value times e ~ U(low, high), ``noise.uniform(low, high, number of rows)`` for each field in
-    turn, drawn for the other episodes too. Fields have MuJoCo's own names, as ``dof_damping``;
-    ``body_mass`` takes ``body_inertia`` along, with the same factors. What MuJoCo derives from
-    these values is derived anew. All is undone at the next ``reset()``: other episodes are those of
-    the bare environment. ``info["dynamics"]`` of a chosen episode's reset has the factors,
-    {field: array}. ``reset()`` raises SpaceError if the environment's own sets one of the fields.
+    turn, drawn for the other episodes too. Fields have MuJoCo's own names, as ``dof_damping``.
+
+    What is scaled are quantities of physics. ``body_mass`` takes ``body_inertia`` along, and
+    ``actuator_gainprm`` the bias of position and velocity servos (``actuator_biasprm``), with the
+    same factors: a servo keeps its target and has another strength. Friction (``geom_friction``,
+    ``pair_friction``) has one factor for all rows, ``noise.uniform(low, high)``: MuJoCo takes the
+    larger one of two geoms, so a contact has its nominal friction times that factor.
+
+    What MuJoCo derives from these values is derived anew. All is undone at the next ``reset()``:
+    other episodes are those of the bare environment, which may randomize other fields itself.
+    ``info["dynamics"]`` of a chosen episode's reset has the factors, {field: array}. ``reset()``
+    raises SpaceError if the environment's own sets one of the fields. Several of these wrappers may
+    scale different fields of one environment, each with a range and a rate of its own.
 
     The model is found in environments of Gymnasium, Gymnasium-Robotics, MyoSuite 3 and dm_control
     (with shimmy). ``times_applied`` counts episodes. Tobin et al., "Domain Randomization", 2017;
@@ -836,63 +1047,57 @@ class RandomDynamics(NoiseWrapper):
         *,
         fields: tuple[str, ...] = ("body_mass", "geom_friction"),
     ):
-        """Raise ValueError unless 0 <= low <= high and the environment's model has the fields."""
+        """Raise ValueError unless 0 <= low <= high and the environment's model has the fields.
+
+        Nor may another RandomDynamics scale one of them.
+        """
         self.low, self.high = _interval(low, high, least=0)
         self.fields = _fields(fields)
         super().__init__(env, noise_rate, low=self.low, high=self.high, fields=self.fields)
-        if _layers(env, RandomDynamics):
-            raise ValueError("this environment has RandomDynamics already: name all fields in one")
-        self._chosen = False  # the episode
-        self._scratch: Any = None  # a model, and data to compute with
+        self._factors: dict[str, NDArray[Any]] = {}  # of the episode; none if it is not chosen
+        self._outer: list[RandomDynamics] = []  # wrappers whose reset() waits for this one's
+        for inner in _layers(env, RandomDynamics):
+            for field in self.fields:
+                if _with_those_along([field]) & _with_those_along(inner.fields):
+                    problem = "another RandomDynamics of this environment scales"
+                    raise ValueError(f"fields: {problem} {field}, too")
         if not isinstance(env, _ProbeEnv):
             self._restore()  # what another wrapper has left of this environment
-            model = self._model()
-            for field in self.fields:
-                if not getattr(model, field).any():
-                    raise ValueError(
-                        f"fields: this environment's model has no {field}, or zeros only, which no "
-                        "factor changes"
-                    )
+            _check_fields(self._model(), self.fields)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Restore the model, perhaps change it anew, and reset the environment."""
-        self._restore()
         self._begin(seed)
-        model = self._model()
-        factors = self._draw(model)
-        self._chosen = self.acts() and any((values != 1).any() for values in factors.values())
-        if self._chosen:
-            self._scale(model, factors)  # before the environment's own reset, which needs it
-        before = {field: getattr(model, field).copy() for field in self.fields}
-        observation, info = self.env.reset(seed=seed, options=options)
-        now = self._model()
-        if now is model:
-            for field, values in before.items():
-                if (getattr(model, field) != values).any():  # no factor would be left
-                    reason = f"this environment's reset() sets {field} itself: name other fields"
-                    raise SpaceError(f"fields: {reason}")
-        elif self._chosen:  # the environment has built or taken another one
-            self._restore()
-            if any(len(factors[name]) != len(getattr(now, name)) for name in self.fields):
-                factors = self._draw(now)
-            self._scale(now, factors)
-        if self._chosen:
-            info = {**self.mark(info), "dynamics": factors}
+        drawn = self._draw(self._model())
+        chosen = self.acts() and any((factors != 1).any() for factors in drawn.values())
+        self._factors = drawn if chosen else {}
+        inner = _layers(self.env, RandomDynamics)
+        if inner:  # the innermost changes the model for all of them, at once
+            inner[-1]._outer.append(self)
+            observation, info = self.env.reset(seed=seed, options=options)
+        else:
+            observation, info = self._reset_scaled(seed, options)
+        if self._factors:
+            info = self.mark(info)
+            others = info["dynamics"] if any(wrapper._factors for wrapper in inner) else {}
+            info["dynamics"] = {**others, **self._factors}
         return observation, info
 
     def step(self, action: Any) -> Step:
         """Step the environment; every step of a chosen episode is a perturbed one."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        if self._chosen:
+        if self._factors:
             info = self.mark(info)
         return observation, reward, terminated, truncated, info
 
     def _draw(self, model: Any) -> dict[str, NDArray[Any]]:
         """Return factors for all rows of the fields."""
-        return {
-            field: self.noise.uniform(self.low, self.high, len(getattr(model, field)))
-            for field in self.fields
-        }
+        factors = {}
+        for field in self.fields:
+            rows = len(getattr(model, field))
+            drawn = self.noise.uniform(self.low, self.high, 1 if field in _FRICTIONS else rows)
+            factors[field] = np.broadcast_to(drawn, rows).copy()
+        return factors
 
     def _model(self) -> Any:
         """Return the environment's mujoco.MjModel."""
@@ -905,35 +1110,171 @@ class RandomDynamics(NoiseWrapper):
                 return model
         raise ValueError(f"RandomDynamics needs an environment with a MuJoCo model, not {base}")
 
-    def _scale(self, model: Any, factors: dict[str, NDArray[Any]]) -> None:
-        """Multiply the rows of the fields, and let MuJoCo derive its constants from them."""
-        import mujoco
+    def _reset_scaled(self, seed: int | None, options: Info | None) -> tuple[Any, Info]:
+        """Scale the model by the factors of this wrapper and the outer ones, and reset."""
+        wrappers, self._outer = [*self._outer, self], []
+        self._restore()
+        model = self._model()
+        self._scale(model, wrappers)  # before the environment's own reset, which needs it
+        named = [field for wrapper in wrappers for field in wrapper.fields]
+        along = [_SCALED_ALONG[field] for field in named if field in _SCALED_ALONG]
+        before = {field: getattr(model, field).copy() for field in named + along}
+        observation, info = self.env.reset(seed=seed, options=options)
+        now = self._model()
+        if now is model:
+            set_by_reset = {f for f in before if (getattr(model, f) != before[f]).any()}
+            for field in named:
+                if field in set_by_reset:  # no factor would be left
+                    reason = f"this environment's reset() sets {field} itself: name other fields"
+                    raise SpaceError(f"fields: {reason}")
+        if now is not model or set_by_reset:  # another model, or the inertia of a mass
+            self._restore()
+            for wrapper in wrappers:
+                if any(len(f) != len(getattr(now, name)) for name, f in wrapper._factors.items()):
+                    wrapper._factors = wrapper._draw(now)
+            self._scale(now, wrappers)
+        return observation, info
 
-        scaled = dict(factors)
-        if "body_mass" in factors:
-            scaled["body_inertia"] = factors["body_mass"]
-        arrays = {name: getattr(model, name, None) for name in (*scaled, *_DERIVED_FIELDS)}
-        nominal = {name: array.copy() for name, array in arrays.items() if array is not None}
-        statistics = {name: np.copy(getattr(model.stat, name)) for name in _STATISTICS}
-        # the environment has them, because another wrapper of it may have to restore them
-        self.unwrapped._unscaled_model = model, nominal, statistics
-        for name, values in scaled.items():
-            arrays[name][:] = (nominal[name].T * values).T
-        # In data of its own, made once: the environment's are left as they are until its reset.
-        if self._scratch is None or self._scratch[0] is not model:
-            self._scratch = model, mujoco.MjData(model)
-        mujoco.mj_setConst(*self._scratch)
-        for name in ("meansize", "extent", "center"):  # of the picture, as the model's file says
-            setattr(model.stat, name, statistics[name])
+    def _scale(self, model: Any, wrappers: "list[RandomDynamics]") -> None:
+        factors = {name: f for wrapper in wrappers for name, f in wrapper._factors.items()}
+        if not factors:
+            return
+        base = self.unwrapped  # which has it, because another wrapper of it may have to undo it
+        if getattr(base, "_scaled_model", None) is None or base._scaled_model.model is not model:
+            base._scaled_model = _ScaledModel(model)
+        base._scaled_model.scale(factors)
 
     def _restore(self) -> None:
-        if changed := getattr(self.unwrapped, "_unscaled_model", None):
-            model, nominal, statistics = changed
-            for name, values in nominal.items():
-                getattr(model, name)[:] = values
-            for name, value in statistics.items():
-                setattr(model.stat, name, value)
-            self.unwrapped._unscaled_model = None
+        if scaled := getattr(self.unwrapped, "_scaled_model", None):
+            scaled.undo()
+
+
+# Fields of MuJoCo's model that are usually randomized.
+_USUAL_FIELDS = ("body_mass", "body_inertia", "geom_friction", "jnt_stiffness", "dof_armature")
+_USUAL_FIELDS += ("dof_damping", "dof_frictionloss", "actuator_gainprm", "actuator_forcerange")
+_USUAL_FIELDS += ("actuator_gear",)
+_FRICTIONS = ("geom_friction", "pair_friction")
+_SCALED_ALONG = {"body_mass": "body_inertia", "actuator_gainprm": "actuator_biasprm"}
+# Which of an actuator's ten parameters are its strength, by its type: of the gain a fixed one, an
+# affine one, a muscle; of the bias none, an affine one (of a servo), a muscle.
+_PARAMETER = np.arange(10)
+_STRENGTH_IN_GAIN = {0: _PARAMETER < 3, 1: _PARAMETER < 3, 2: np.isin(_PARAMETER, (2, 3))}
+_STRENGTH_IN_BIAS = {0: _PARAMETER < 0, 1: np.isin(_PARAMETER, (1, 2)), 2: _STRENGTH_IN_GAIN[2]}
+# What mj_setConst computes from others (engine_setconst.c), in the model and in model.stat.
+_DERIVED_FIELDS = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "dof_length")
+_DERIVED_FIELDS += ("actuator_acc0", "actuator_length0", "tendon_invweight0", "tendon_length0")
+_DERIVED_FIELDS += ("tendon_lengthspring", "eq_data", "cam_pos0", "cam_poscom0", "cam_mat0")
+_DERIVED_FIELDS += ("light_pos0", "light_poscom0", "light_dir0", "flexedge_length0")
+_DERIVED_FIELDS += ("flexedge_invweight0", "flex_vertmetric", "flex_vert0")
+_DERIVED_STATISTICS = ("meaninertia", "meanmass")  # others are of the picture
+
+
+class _ScaledModel:
+    """A MuJoCo model whose fields are scaled for an episode, and what undoes that.
+
+    What MuJoCo derives from the fields is derived in a copy, because mj_setConst also writes what
+    does not depend on them, and the environment may have set that itself. Where the copy shows that
+    a value depends on the factors, it is taken over.
+    """
+
+    def __init__(self, model: Any):
+        """Take a model as it is."""
+        import mujoco
+
+        self.model = model
+        self.data = mujoco.MjData(model)  # to compute with; that of the environment is left alone
+        self.scaled: dict[str, Any] = {}  # {field: (values before, values as written)}
+        self.derived: dict[str, Any] = {}
+
+    def scale(self, factors: dict[str, NDArray[Any]]) -> None:
+        """Multiply the rows of the fields by their factors, {field: factors}."""
+        trial = copy.copy(self.model)
+        nominal = self._derive(trial)
+        for name, of_elements in _factors_of_elements(self.model, factors).items():
+            self._write(self.scaled, name, _values(self.model, name) * of_elements)
+            _set_values(trial, name, _values(self.model, name))
+        for name, value in self._derive(trial).items():
+            depends = value != nominal[name]
+            if np.any(depends):
+                kept = _values(self.model, name)
+                self._write(self.derived, name, np.where(depends, value, kept))
+
+    def undo(self) -> None:
+        """Restore what was written here; what the environment has written since then stays."""
+        written = {name: new for name, (_, new) in self.derived.items()}
+        now = {name: _values(self.model, name) for name in written}
+        derived_anew = any(np.any(now[name] != written[name]) for name in written)
+        scaled = self._derive(copy.copy(self.model)) if derived_anew else {}
+        for name, (before, new) in {**self.scaled, **self.derived}.items():
+            values = _values(self.model, name)
+            _set_values(self.model, name, np.where(values == new, before, values))
+        if derived_anew:  # by the environment's own mj_setConst, while the fields were scaled
+            nominal = self._derive(copy.copy(self.model))
+            for name in written:
+                values = np.where(
+                    now[name] == scaled[name], nominal[name], _values(self.model, name)
+                )
+                _set_values(self.model, name, values)
+        self.scaled, self.derived = {}, {}
+
+    def _write(self, changes: dict[str, Any], name: str, values: NDArray[Any]) -> None:
+        changes[name] = (_values(self.model, name), values)
+        _set_values(self.model, name, values)
+
+    def _derive(self, trial: Any) -> dict[str, NDArray[Any]]:
+        """Return what MuJoCo derives from the values of a copy of the model, which it changes."""
+        import mujoco
+
+        mujoco.mj_setConst(trial, self.data)
+        names = [name for name in _DERIVED_FIELDS if hasattr(trial, name)]
+        return {name: _values(trial, name) for name in (*names, *_DERIVED_STATISTICS)}
+
+
+def _values(model: Any, name: str) -> NDArray[Any]:
+    """Return a copy of a field of MuJoCo's model, or of one of its statistics."""
+    return np.array(getattr(model.stat if name in _DERIVED_STATISTICS else model, name))
+
+
+def _set_values(model: Any, name: str, values: NDArray[Any]) -> None:
+    if name in _DERIVED_STATISTICS:
+        setattr(model.stat, name, float(values))
+    else:
+        getattr(model, name)[:] = values
+
+
+def _with_those_along(fields: Iterable[str]) -> set[str]:
+    return {*fields, *(_SCALED_ALONG[field] for field in fields if field in _SCALED_ALONG)}
+
+
+def _factors_of_elements(model: Any, factors: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Return the factors of all elements of the fields, and of those that are scaled along."""
+    found = {}
+    for field, of_rows in factors.items():
+        for name in _with_those_along([field]):
+            found[name] = (np.ones_like(getattr(model, name)).T * of_rows).T
+    if "actuator_gainprm" in factors:
+        for i, type_of_gain in enumerate(model.actuator_gaintype.tolist()):
+            strength = _STRENGTH_IN_GAIN[type_of_gain]
+            found["actuator_gainprm"][i] = np.where(strength, factors["actuator_gainprm"][i], 1)
+        for i, type_of_bias in enumerate(model.actuator_biastype.tolist()):
+            strength = _STRENGTH_IN_BIAS[type_of_bias]
+            found["actuator_biasprm"][i] = np.where(strength, factors["actuator_gainprm"][i], 1)
+    return found
+
+
+def _check_fields(model: Any, fields: tuple[str, ...]) -> None:
+    """Raise ValueError unless scaling the fields changes a model as it should."""
+    for field in fields:
+        if not getattr(model, field).any():
+            zeros = f"fields: this environment's model has no {field}, or zeros only"
+            raise ValueError(f"{zeros}, which no factor changes")
+    if "actuator_gainprm" in fields:
+        types = {*model.actuator_gaintype.tolist(), *model.actuator_biastype.tolist()}
+        if not types <= _STRENGTH_IN_GAIN.keys():
+            raise ValueError(
+                "fields: actuator_gainprm is the strength of motors, servos and muscles, and this "
+                "environment's model has actuators of other kinds"
+            )
 
 
 # -------------------------------------------------------------------- noises in words, and combined
@@ -954,6 +1295,8 @@ WRAPPERS: dict[str, type[NoiseWrapper]] = {
         RandomNormalNoisyAction,
         RandomActionDelay,
         RandomDynamics,
+        RandomObservationBias,
+        RandomObservationDelay,
     )
 }
 
@@ -981,7 +1324,7 @@ def signatures() -> list[str]:
     """Return the wrappers with their parameters, as a noise is written.
 
     >>> signatures()[0]
-    'RandomNormalNoisyObservation(scale, *, loc=0.0, keys=None)'
+    'RandomNormalNoisyObservation(scale, *, loc=0.0, relative=False, keys=None)'
     """
     found = []
     for name, wrapper in WRAPPERS.items():
@@ -1142,6 +1485,22 @@ class Configuration:
             return cls()
         rates = [re.split(":| to ", rate) for rate in str(noise_rate).split(" + ")]
         return cls(tuple(split_noises(noise)), tuple((float(r[0]), float(r[-1])) for r in rates))
+
+    def for_tests(self) -> Self:
+        """Return it, or raise ValueError if no policy can be tested under it.
+
+        Noise that is relative to observations or rewards would depend on the policy and on earlier
+        tests, and a rate that changes needs a training.
+        """
+        for noise, rate in zip(*self.texts, strict=True):
+            if isinstance(rate, str):
+                raise ValueError(f"a test has no beginning and no end: {noise} at {rate}")
+            _, name, _, arguments = _read_call(noise)
+            measured = name in WRAPPERS and WRAPPERS[name].kind in ("observation", "reward")
+            if measured and arguments.get("relative"):
+                reason = "relative=True would depend on the policy and on earlier tests"
+                raise ValueError(f"{noise} is no noise for a test: {reason}")
+        return self
 
     @property
     def texts(self) -> tuple[list[str], list[Rate]]:
@@ -1380,26 +1739,75 @@ def _call_each(env: Any, method: str, *args: Any, **kwargs: Any) -> Sequence[Any
 
 
 def run_name(
-    env_id: str, exp_name: str, noises: Sequence[str], rates: Sequence[Rate], seed: int
+    env_id: str,
+    exp_name: str,
+    noises: Sequence[str],
+    rates: Sequence[Rate],
+    seed: int,
+    *,
+    env_kwargs: Sequence[str] = (),
+    test_noise: Sequence[str] = (),
+    test_noise_rate: Sequence[Rate] = (),
 ) -> str:
     """Return the name of a run's folder, the same for all spellings of one configuration.
 
-    What tells the runs of a sweep apart comes first: TensorBoard's list shows 31 characters. Where
-    the name would be too long for a file system, the noises are cut and end in a hash.
+    What tells the runs of a sweep apart comes first: TensorBoard's list shows 31 characters. The
+    arguments of the environment follow its name, as in ``parse_env_kwargs``, and the noise of its
+    tests stands last. A part that is too long for a file system is cut and ends in a hash.
 
     >>> run_name("Hopper-v5", "sac", ["RandomUniformScaleReward(.5, 1.5)"], [0.05], seed=1)
     'p0.05_s1_UniformScaleReward_0.5_1.5__Hopper-v5__sac'
     >>> run_name("Hopper-v5", "sac", ["RandomEarlyTermination(50)"], ["1:0"], seed=1)
     'p1.0to0.0_s1_EarlyTermination_50__Hopper-v5__sac'
-    >>> run_name("ALE/Pong-v5", "ppo", [], [], seed=1)
-    'baseline_s1__ALE-Pong-v5__ppo'
+    >>> heavy = {"test_noise": ["RandomDynamics(1.3, 1.3)"], "test_noise_rate": [1.0]}
+    >>> run_name("ALE/Pong-v5", "ppo", [], [], 1, env_kwargs=["mode:1"], **heavy)
+    'baseline_s1__ALE-Pong-v5_mode=1__ppo__tests_p1.0_Dynamics_1.3_1.3'
     """
     rate, *names = (Configuration.read(noises, rates).slug or "baseline").split("_", 1)
     first = "_".join([rate, f"s{seed}", *names])
-    end = f"__{safe_name(env_id)}__{safe_name(exp_name)}"
+    environment = safe_name(env_id)
+    for name, value in sorted(parse_env_kwargs(env_kwargs).items()):
+        is_text = isinstance(value, str) and parse_env_kwargs([f"{name}:{value}"])[name] == value
+        written = value if is_text else repr(value)  # the text '2' is not the number 2
+        plain = safe_name(written)
+        environment += f"_{name}={plain}" if plain == written else f"_{name}={_hashed(written)}"
+    end = f"__{environment}__{safe_name(exp_name)}"
+    if test := Configuration.read(test_noise, test_noise_rate).slug:
+        end += f"__tests_{test}"
     if len(first + end) > 240:  # a file's name has at most 255 bytes
-        first = f"{first[:100]}_{hashlib.sha256(first.encode()).hexdigest()[:16]}"
+        first = f"{first[:100]}_{_hashed(first, 16)}"
+    if len(first + end) > 240:
+        end = f"{end[: 223 - len(first)]}_{_hashed(end, 16)}"
     return first + end
+
+
+def _hashed(text: str, length: int = 8) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:length]
+
+
+def parse_env_kwargs(texts: Sequence[str]) -> dict[str, Any]:
+    """Read arguments of an environment, "name:value", as a script's ``--env-kwargs`` has them.
+
+    A value is a literal of Python, or else text.
+
+    >>> parse_env_kwargs(["mass:2.0", "reward_type:dense", "sizes:(1, 2)", "file:a:b"])
+    {'mass': 2.0, 'reward_type': 'dense', 'sizes': (1, 2), 'file': 'a:b'}
+
+    Raises:
+        ValueError: no colon, a name that cannot be one, or one that is given twice.
+    """
+    found: dict[str, Any] = {}
+    for text in _listed("env_kwargs", texts, '["mass:2.0"]'):
+        name, colon, value = str(text).partition(":")
+        if not colon or not name.isidentifier() or keyword.iskeyword(name):
+            raise ValueError(f"env_kwargs: {text!r} is not name:value, such as mass:2.0")
+        if name in found:
+            raise ValueError(f"env_kwargs: {name} is given twice")
+        try:
+            found[name] = ast.literal_eval(value.strip())
+        except (MemoryError, RecursionError, SyntaxError, TypeError, ValueError):
+            found[name] = value
+    return found
 
 
 def _words(noise: str) -> str:
@@ -1409,7 +1817,7 @@ def _words(noise: str) -> str:
     name, _, arguments = noise.partition("(")
     odd = "'" in re.sub(r"'[A-Za-z_][A-Za-z0-9_.]*'", "", noise)  # a key that is no plain name
     if odd or (":" in name and re.search(r"""[(\[{'"]""", arguments)):  # own, not numbers only
-        words += "_" + hashlib.sha256(noise.encode()).hexdigest()[:8]
+        words += f"_{_hashed(noise)}"
     return words
 
 
@@ -1551,9 +1959,13 @@ def _replaced(nested: Any, entries: dict[EntryPath, Any]) -> Any:
     """Return a nested observation, or its space, with other entries in containers of its own."""
     if () in entries:
         return entries[()]
-    parts = dict(_items(nested))
-    for key in {path[0] for path in entries}:
-        inner = {path[1:]: entry for path, entry in entries.items() if path[0] == key}
+    parts, deeper = dict(_items(nested)), {}
+    for path, entry in entries.items():
+        if len(path) == 1:
+            parts[path[0]] = entry
+        else:
+            deeper.setdefault(path[0], {})[path[1:]] = entry
+    for key, inner in deeper.items():
         parts[key] = _replaced(parts[key], inner)
     if isinstance(nested, gym.spaces.Dict):
         return gym.spaces.Dict(list(parts.items()))
@@ -1571,6 +1983,30 @@ def _has_categories(env: Env) -> bool:
     """Return whether observations contain categories, which flattening makes numbers of."""
     kinds = gym.spaces.Discrete | gym.spaces.MultiDiscrete | gym.spaces.MultiBinary
     return any(isinstance(part, kinds) for _, part in _entries(env.observation_space))
+
+
+def _differ(one: NDArray[Any], other: NDArray[Any]) -> bool:
+    """Return whether two arrays differ; NaN in both is no difference."""
+    unequal = one != other
+    if not np.count_nonzero(unequal):
+        return False
+    first = unequal.argmax()  # usually there is no NaN, so one look is enough
+    if one.item(first) == one.item(first):
+        return True
+    return bool(np.any(unequal & ~(np.isnan(one) & np.isnan(other))))
+
+
+def is_bounded(space: gym.Space[Any]) -> bool:
+    """Return whether all bounds of a Box are finite; the largest float stands for infinity.
+
+    >>> largest = np.finfo(np.float32).max
+    >>> is_bounded(gym.spaces.Box(-1, 1, (2,))), is_bounded(gym.spaces.Box(-largest, 1, (2,)))
+    (True, False)
+    """
+    if not isinstance(space, gym.spaces.Box):
+        return False
+    bounds = np.abs(np.concatenate([space.low, space.high], axis=None, dtype=np.float64))
+    return bool((bounds < np.finfo(np.float32).max).all())
 
 
 def _cast(values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
@@ -1672,8 +2108,9 @@ def _fields(fields: Any) -> tuple[str, ...]:
                 f"fields: {field!r} cannot be scaled for each body, geom, contact pair, joint, "
                 f"degree of freedom, actuator or tendon of MuJoCo's model; usual are {usual}"
             )
-    if {"body_mass", "body_inertia"} <= set(found):
-        raise ValueError("fields: body_mass takes body_inertia along, so name one of them")
+    for field, along in _SCALED_ALONG.items():
+        if along in found and (field in found or along == "actuator_biasprm"):
+            raise ValueError(f"fields: {field} takes {along} along, so name {field} alone")
     return tuple(dict.fromkeys(found))
 
 
@@ -1794,9 +2231,9 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     become floats and the two ends bools; they may be arrays of one element, but not strings.
     Observations, also in dictionaries and tuples, are copied, because an environment may write the
     next one into the same array, and actions, because it may write into those; so are infos, which
-    may be None. An observation that has not the shape of its space, a step of four values and a
-    reset without seed and options raise SpaceError. The spaces are looked up once, because an
-    environment may make new ones, with new generators, at every access.
+    may be None. An observation that has not the shape of its space raises SpaceError. The spaces
+    are looked up once, because an environment may make new ones, with new generators, at every
+    access.
 
     >>> env = FiniteNumbers(gym.make("Pendulum-v1", disable_env_checker=True))
     >>> _ = env.reset(seed=0)
@@ -1820,26 +2257,14 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         base, kinds = self.unwrapped, np.random.Generator | None
         if seed is not None and isinstance(getattr(base, "_np_random", 0), kinds):
             base._np_random, _ = np_random(seed)  # some, as Meta-World's, ignore the seed
-        try:
-            observation, info = self.env.reset(seed=seed, options=options)
-        except (SystemExit, TypeError, ValueError) as error:
-            self._explain(error, "reset(seed=..., options=...) must return (observation, info)")
-            raise
+        observation, info = self.env.reset(seed=seed, options=options)
         return self._checked(observation), dict(info or {})
 
     def step(self, action: Any) -> Step:
         """Step the environment and check the observation and the reward."""
         self._steps += 1
-        try:
-            observation, reward, terminated, truncated, info = self.env.step(copy.copy(action))
-        except (SystemExit, TypeError, ValueError) as error:
-            values = "(observation, reward, terminated, truncated, info)"
-            self._explain(error, f"step() must return {values}")
-            raise
-        number = math.nan
-        if not isinstance(reward, str):
-            with contextlib.suppress(TypeError, ValueError):  # of None, or of several numbers
-                number = float(_number_in(reward))
+        observation, reward, terminated, truncated, info = self.env.step(copy.copy(action))
+        number = reward if type(reward) is float else _as_float(reward)
         if not math.isfinite(number):
             self._blame("returned the reward", reward, action)
         observation, info = self._checked(observation, action), dict(info or {})
@@ -1862,24 +2287,14 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
                     f"{self._where()} returned an observation{_subscript(path)} of shape "
                     f"{part.shape}, and its observation_space has shape {box.shape}"
                 )
-            if not np.isfinite(part).all():
+            # a finite sum has finite parts; looking at each takes longer
+            if (
+                not math.isfinite(np.add.reduce(part, axis=None, dtype=np.float64))
+                and not np.isfinite(part).all()
+            ):
                 self._blame(f"returned the observation{_subscript(path)}", part, action)
             parts[path] = part
         return _replaced(observation, parts) if parts else observation
-
-    def _explain(self, error: BaseException, wanted: str) -> None:
-        """Raise SpaceError if a wrapper, not the environment's code, failed to call or unpack.
-
-        An exit becomes a RuntimeError, because a run would seem to have ended well.
-        """
-        if isinstance(error, SystemExit):
-            text = f"{self._where()} called sys.exit({error.code!r})"
-            raise RuntimeError(text).with_traceback(error.__traceback__) from None
-        *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-        place = frame.f_globals.get("__name__", "")
-        is_old = re.search("unpack|unexpected keyword", str(error))
-        if is_old and place.startswith(("gymnasium.core", "gymnasium.wrappers.", __name__)):
-            raise SpaceError(f"{self._where()}'s {wanted}: {error}") from error
 
     def _blame(self, what: str, value: Any, action: Any) -> None:
         """Stop at a value that is not finite, or rather at an action that was not, either."""
@@ -1889,6 +2304,16 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def _where(self) -> str:
         return f"step {self._steps} of an episode: the environment"
+
+
+def _as_float(reward: Any) -> float:
+    """Return a reward as a float, or NaN if it is not one number."""
+    if isinstance(reward, str):
+        return math.nan
+    try:
+        return float(_number_in(reward))
+    except (TypeError, ValueError):  # None, or several numbers
+        return math.nan
 
 
 def make_flat(env: Env, step_limit: int | None = None) -> Env:
@@ -1909,7 +2334,11 @@ def make_flat(env: Env, step_limit: int | None = None) -> Env:
     Raises:
         SpaceError: actions are not a vector of floats, or observations cannot become a vector; the
             environment has been closed.
+        TypeError: not a gymnasium.Env, for example one of the older gym.
     """
+    if not isinstance(env, gym.Env):
+        kind = type(env)
+        raise TypeError(f"needs a gymnasium.Env, not a {kind.__module__}.{kind.__qualname__}")
     name = env.spec.id if env.spec else str(env)
     if step_limit and env.spec and env.spec.max_episode_steps is None:
         env = gym.wrappers.TimeLimit(env, step_limit)
@@ -2052,12 +2481,15 @@ def seed_globals(seed: int) -> None:
 
 @contextlib.contextmanager
 def kept_generators(env: Env | None = None) -> Iterator[None]:
-    """Restore after some lines the global generators, and those that an environment holds."""
+    """Restore after some lines the global generators, and those of an environment.
+
+    The latter are those that :class:`EnvState` keeps.
+    """
     generators: list[Any] = [random, np.random]
     if torch := sys.modules.get("torch"):
         generators.append(torch.default_generator)
     if env is not None:
-        generators += _held_generators(env).values()
+        generators += _generators(env).values()
     streams = [_stream(generator) for generator in generators]
     try:
         yield
@@ -2221,31 +2653,28 @@ def stop_at_signals() -> Callable[[], int]:
 class EnvState:
     """What an environment carries from one episode to the next, to resume training.
 
-    That is all random generators that it, its wrappers or an environment inside it hold; the random
-    streams and the counters of its noise wrappers, the returns that RecordEpisodeStatistics
-    remembers, and the global generators of ``random`` and NumPy, from which an environment may
-    draw. Further ``generators`` are kept with them. After loading, call :func:`set_progress`, or
-    assign a rate, again. An environment that carries anything else does not resume exactly.
+    These are the random generators that the environment, its wrappers and their spaces have as
+    attributes, with the number of children that they spawned; the streams, counters and estimates
+    of its noise wrappers; the returns that RecordEpisodeStatistics remembers; the global generators
+    of ``random`` and NumPy, from which an environment may draw; and further ``generators``. An
+    environment that carries anything else from one episode to the next, or holds a generator
+    elsewhere, does not resume exactly. After loading, call :func:`set_progress` again.
     """
 
     def __init__(self, env: Env, *generators: np.random.Generator):
         """Take an environment that has been reset with a seed."""
-        self.env = env
-        found = [env.unwrapped.np_random, env.action_space.np_random, *generators]
-        # an environment may have put a generator of another library there, or a module
-        of_numpy = np.random.Generator | np.random.RandomState
-        self.generators = [generator for generator in found if isinstance(generator, of_numpy)]
+        self.env, self.generators = env, generators
         recorded = env.has_wrapper_attr("return_queue")
         self.returns = env.get_wrapper_attr("return_queue") if recorded else deque()
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state in Python's own types, to be taken between two episodes."""
-        held = _held_generators(self.env)
+        attributes = _generators(self.env)
         return {
             "python": _stream(random),
             "numpy": _stream(np.random),
             "generators": [_stream(generator) for generator in self.generators],
-            "attributes": {place: _stream(generator) for place, generator in held.items()},
+            "attributes": {place: _stream(generator) for place, generator in attributes.items()},
             "noise": [_without_arrays(w.state_dict()) for w in noise_wrappers(self.env).values()],
             "returns": [float(value) for value in self.returns],
         }
@@ -2260,9 +2689,9 @@ class EnvState:
         _set_stream(np.random, state["numpy"])
         for generator, stream in zip(self.generators, state["generators"], strict=True):
             _set_stream(generator, stream)
-        held, streams = _held_generators(self.env), state.get("attributes", {})
-        for place in held.keys() & streams.keys():
-            _set_stream(held[place], streams[place])
+        for place, generator in _generators(self.env).items():
+            if place in state["attributes"]:  # others were made later than at the first reset
+                _set_stream(generator, state["attributes"][place])
         wrappers = noise_wrappers(self.env).values()
         for wrapper, part in zip(wrappers, state["noise"], strict=True):
             wrapper.load_state_dict(part)
@@ -2270,57 +2699,50 @@ class EnvState:
         self.returns.extend(state["returns"])
 
 
-def _held_generators(env: Env, place: str = "") -> dict[str, Any]:
-    """Return the generators that an environment, or one that it holds, holds, by their places."""
-    layers, found = _layers(env), {}
-    kinds = np.random.Generator | np.random.RandomState | random.Random
+def _generators(env: Env) -> dict[str, Any]:
+    """Return the generators among the attributes of an environment, its wrappers and their spaces.
+
+    They are named by their places, such as "0._np_random". Nothing else is looked into.
+    """
+    kinds: tuple[Any, ...] = (np.random.Generator, np.random.RandomState, random.Random)
     if torch := sys.modules.get("torch"):
-        kinds |= torch.Generator
-    for i, layer in enumerate(layers):
-        for name, value in _members(layer):
-            if isinstance(value, kinds) and not isinstance(value, random.SystemRandom):
-                found[f"{place}{i}.{name}"] = value
-            elif isinstance(value, gym.Env) and value not in layers and not place:
-                found |= _held_generators(value, f"{i}.{name}.")
+        kinds += (torch.Generator,)
+    holders: dict[str, Any] = {}
+    for i, layer in enumerate(_layers(env)):
+        holders[str(i)] = layer
+        attributes = {name: getattr(layer, name, None) for name in _SPACES} | vars(layer)
+        for name, value in attributes.items():
+            if issubclass(type(value), gym.Space):
+                holders |= _parts(f"{i}.{name}", value)
+    found = {}
+    for place, holder in holders.items():
+        for name, value in vars(holder).items():
+            # type(): isinstance() would ask a weak reference, perhaps a dead one, for its class
+            if issubclass(type(value), kinds) and not issubclass(type(value), random.SystemRandom):
+                found[f"{place}.{name}"] = value
     return found
 
 
-# Their objects are large, and hold no generator of an environment's own
-_LIBRARIES = {*sys.stdlib_module_names, "numpy", "torch", "mujoco", "gymnasium", "dm_control"}
+_SPACES = ("action_space", "observation_space")
 
 
-def _package_of(value: Any) -> str:
-    module = getattr(type(value), "__module__", "")  # which types of SWIG do not have
-    return str(module).partition(".")[0]
-
-
-def _members(holder: Any, depth: int = 3) -> Iterator[tuple[str, Any]]:
-    """Yield what an object holds, also in its containers, its spaces and objects of no library."""
-    containers, libraries = list | tuple | dict, _LIBRARIES - {_package_of(holder)}
-    parts: list[tuple[Any, Any]] = [*_attributes(holder).items()]
-    if isinstance(holder, containers):
-        parts += _items(holder)
-    for name, value in parts:
-        yield str(name), value
-        goes_on = isinstance(value, gym.Space) or _package_of(value) not in libraries
-        if isinstance(value, containers):
-            goes_on = len(value) <= 1000
-        if depth and goes_on and not isinstance(value, gym.Env):
-            for inner, part in _members(value, depth - 1):
-                yield f"{name}.{inner}", part
-
-
-def _attributes(holder: Any) -> dict[str, Any]:
-    """Return the attributes of an object, those in ``__slots__``, too."""
-    state: Any = object.__getstate__(holder)  # its dict, or a pair of that and of its slots
-    parts = state if isinstance(state, tuple) else (state,)
-    return {name: value for part in parts if part for name, value in part.items()}
+def _parts(place: str, space: gym.Space[Any]) -> dict[str, gym.Space[Any]]:
+    """Return a space and the spaces in it, by their places: each draws from its own generator."""
+    getattr(space, "np_random", None)  # which makes the generator if there is none yet
+    found = {place: space}
+    if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple | gym.spaces.OneOf):
+        for key, part in _items(space.spaces):
+            found |= _parts(f"{place}.{key}", part)
+    return found
 
 
 def _stream(generator: Any) -> Any:
     """Return the state of a generator, or of random or np.random, in Python's own types."""
     if isinstance(generator, np.random.Generator):
-        return _without_arrays(generator.bit_generator.state)
+        stream = {"state": generator.bit_generator.state}
+        if isinstance(seeds := generator.bit_generator.seed_seq, np.random.SeedSequence):
+            stream["seeds"] = seeds.state  # with the number of children that were spawned
+        return _without_arrays(stream)
     if generator is np.random or isinstance(generator, np.random.RandomState):  # dm_control's
         return _without_arrays(generator.get_state(legacy=False))
     if generator is random or isinstance(generator, random.Random):
@@ -2330,7 +2752,9 @@ def _stream(generator: Any) -> Any:
 
 def _set_stream(generator: Any, stream: Any) -> None:
     if isinstance(generator, np.random.Generator):
-        generator.bit_generator.state = stream
+        generator.bit_generator.state = stream["state"]
+        if "seeds" in stream:  # in place, because whoever spawns may hold it, too
+            generator.bit_generator.seed_seq.__init__(**stream["seeds"])
     elif generator is np.random or isinstance(generator, np.random.RandomState):
         generator.set_state(stream)
     elif generator is random or isinstance(generator, random.Random):

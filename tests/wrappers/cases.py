@@ -76,10 +76,12 @@ NOISES = [
     "RandomNormalNoisyAction(0.3, loc=-0.5)",
     "RandomActionDelay(1, 3)",
     "RandomDynamics(0.5, 1.5)",
+    "RandomObservationBias(0.3)",
+    "RandomObservationDelay(1, 3)",
 ]
-DYNAMICS = NOISES[-1]
+DYNAMICS = "RandomDynamics(0.5, 1.5)"
 # Those that are decided when an episode begins, and the others.
-EPISODE_NOISES = [text for text in NOISES if "Termination(3" in text or text in NOISES[-2:]]
+EPISODE_NOISES = [text for text in NOISES if "Termination(3" in text or text in NOISES[-4:]]
 STEP_NOISES = [text for text in NOISES if text not in EPISODE_NOISES]
 
 BOX = gym.spaces.Box(-10.0, 10.0, (3,), np.float64)

@@ -65,7 +65,7 @@ def test_factors_golden():
     chosen = 0
     for episode in range(40):
         _, info = noisy.reset(seed=3 if episode == 0 else None)
-        mass, friction = noise.uniform(0.5, 1.5, 4), noise.uniform(0.5, 1.5, 3)
+        mass, friction = noise.uniform(0.5, 1.5, 4), noise.uniform(0.5, 1.5)
         if gate.random() >= 0.5:
             assert info == {} and changed(nominal, model) == set()
             assert noisy.step(np.zeros(2))[4] == {}
@@ -74,9 +74,7 @@ def test_factors_golden():
         np.testing.assert_array_equal(model.body_mass, nominal["body_mass"] * mass)
         inertia = nominal["body_inertia"] * mass[:, None]
         np.testing.assert_array_equal(model.body_inertia, inertia)
-        np.testing.assert_array_equal(
-            model.geom_friction, nominal["geom_friction"] * friction[:, None]
-        )
+        np.testing.assert_array_equal(model.geom_friction, nominal["geom_friction"] * friction)
         assert info["noise"] == ("RandomDynamics",) == noisy.step(np.zeros(2))[4]["noise"]
         assert info["dynamics"].keys() == {"body_mass", "geom_friction"}
         np.testing.assert_array_equal(info["dynamics"]["body_mass"], mass)
@@ -88,11 +86,12 @@ def test_factors_are_uniform_and_independent():
     drawn = []
     for episode in range(3000):
         factors = noisy.reset(seed=0 if episode == 0 else None)[1]["dynamics"]
-        drawn.append(np.concatenate([factors["body_mass"], factors["geom_friction"]]))
+        assert len({*factors["geom_friction"]}) == 1
+        drawn.append([*factors["body_mass"], factors["geom_friction"][0]])
     drawn = np.array(drawn)
     np.testing.assert_allclose(drawn.mean(axis=0), 1, atol=0.02)
     np.testing.assert_allclose(drawn.var(axis=0), 1 / 12, rtol=0.06)
-    np.testing.assert_allclose(np.corrcoef(drawn.T), np.eye(7), atol=0.08)
+    np.testing.assert_allclose(np.corrcoef(drawn.T), np.eye(5), atol=0.08)
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.3])
@@ -194,14 +193,205 @@ class Heavier(Cart):
         return super().reset(**kwargs)
 
 
+def test_the_friction_of_a_contact_is_the_nominal_one_times_the_factor():
+    """MuJoCo takes the larger friction of two geoms: own factors would be larger than asked."""
+    floor = '<worldbody><geom type="plane" size="5 5 1" friction="0.8 0.01 0.001"/>'
+    env = Choosing(MODEL.replace("<worldbody>", floor).replace('pos="0 0 2"', 'pos="0 0 0.05"'))
+    noisy = RandomDynamics(env, 1.0, 0.7, 1.3, fields=("geom_friction",))
+    measured = []
+    for episode in range(300):
+        [factor] = {*noisy.reset(seed=0 if episode == 0 else None)[1]["dynamics"]["geom_friction"]}
+        mujoco.mj_forward(env.model, env.data)
+        frictions = np.array([contact.friction[0] for contact in env.data.contact])
+        assert len(frictions) and frictions.tolist() == [1.0 * factor] * len(frictions)
+        measured.append(factor)
+    measured = np.array(measured)
+    assert measured.mean() == pytest.approx(1, abs=0.03) and np.mean(measured < 0.85) > 0.2
+
+
 def test_contact_pairs_have_a_friction_of_their_own():
-    pair = '<contact><pair geom1="a" geom2="b"/></contact></mujoco>'
+    pairs = '<contact><pair geom1="a" geom2="b"/><pair geom1="a" geom2="c"/></contact></mujoco>'
     text = MODEL.replace('<geom type="box"', '<geom name="a" type="box"')
     text = text.replace('<geom type="capsule"', '<geom name="b" type="capsule"')
-    env = Choosing(text.replace("</mujoco>", pair))
+    text = text.replace('<geom size="0.1"', '<geom name="c" size="0.1"')
+    env = Choosing(text.replace("</mujoco>", pairs))
     friction = env.model.pair_friction.copy()
-    RandomDynamics(env, 1.0, 0.5, 0.5, fields=("pair_friction",)).reset(seed=0)
-    np.testing.assert_array_equal(env.model.pair_friction, 0.5 * friction)
+    noisy = RandomDynamics(env, 1.0, 0.5, 0.9, fields=("pair_friction",))
+    [factor] = {*noisy.reset(seed=0)[1]["dynamics"]["pair_friction"]}
+    np.testing.assert_array_equal(env.model.pair_friction, factor * friction)
+
+
+ACTUATORS = {
+    "motor": '<motor joint="arm" gear="3"/>',
+    "position": '<position joint="arm" kp="30" kv="5"/>',
+    "velocity": '<velocity joint="arm" kv="30"/>',
+    "muscle": '<muscle joint="arm" force="30" lengthrange="0 1"/>',
+}
+ARM = """
+<mujoco>
+  <worldbody>
+    <body>
+      <joint name="arm" axis="0 -1 0" damping="2"/>
+      <geom type="capsule" fromto="0 0 0 0.5 0 0" size="0.05" density="300"/>
+    </body>
+  </worldbody>
+  <actuator>{}</actuator>
+</mujoco>
+"""
+
+
+class Arm(Cart):
+    """Holds an arm against gravity: it rises to where it settles, or at the speed that it has."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+
+    def __init__(self, actuator):
+        self.model = mujoco.MjModel.from_xml_string(ARM.format(ACTUATORS[actuator]))
+        self.data = mujoco.MjData(self.model)
+
+    def observe(self):
+        return self.data.qvel.copy() if self.model.actuator_biasprm[0, 1] == 0 else self.data.qpos
+
+    def reset(self, *, seed=None, options=None):
+        gym.Env.reset(self, seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        return self.observe(), {}
+
+
+def settled(actuator, factor):
+    """Return the model of an arm with a factor on its strength, and where the arm settles."""
+    arm = Arm(actuator)
+    env = RandomDynamics(arm, 1.0, factor, factor, fields=("actuator_gainprm",))
+    env.reset(seed=0)
+    steps = 2000 if actuator == "position" else 10
+    for _ in range(steps):
+        env.step(np.ones(1))
+    return arm.model, float(arm.data.qpos[0] if actuator == "position" else arm.data.qvel[0])
+
+
+def test_the_strength_of_motors_and_servos():
+    """A position servo with half its gain keeps its target, and settles lower beneath it."""
+    nominal, high = settled("position", 1.0)
+    weak, low = settled("position", 0.5)
+    np.testing.assert_array_equal(weak.actuator_gainprm[0, :3], [15, 0, 0])
+    np.testing.assert_array_equal(weak.actuator_biasprm[0, :3], [0, -15, -2.5])
+    load = 9.81 * nominal.body_mass[1] * 0.25  # times the cosine of the angle
+    for angle, gain in ((high, 30), (low, 15)):
+        assert gain * (1 - angle) == pytest.approx(load * np.cos(angle), rel=1e-3)
+    assert 0 < low < high < 1
+    for actuator, gain, bias in [("motor", [0.5, 0, 0], [0, 0, 0]), ("velocity", [15, 0, 0], 0)]:
+        weak, low = settled(actuator, 0.5)
+        np.testing.assert_array_equal(weak.actuator_gainprm[0, :3], gain)
+        wanted = bias if actuator == "motor" else [0, 0, -15]
+        np.testing.assert_array_equal(weak.actuator_biasprm[0, :3], wanted)
+        assert low < settled(actuator, 1.0)[1]
+    weak, nominal = settled("muscle", 0.5)[0], Arm("muscle").model
+    for prm in ("actuator_gainprm", "actuator_biasprm"):  # force and scale, not the shape
+        factor = getattr(weak, prm)[0, :9] / getattr(nominal, prm)[0, :9]
+        np.testing.assert_array_equal(factor, [1, 1, 0.5, 0.5, 1, 1, 1, 1, 1])
+
+
+def test_the_range_of_forces_is_a_field_of_its_own():
+    env = Choosing(MODEL.replace('kp="3"', 'kp="3" forcerange="-4 4"'))
+    RandomDynamics(env, 1.0, 0.5, 0.5, fields=("actuator_forcerange",)).reset(seed=0)
+    assert env.model.actuator_forcerange[1].tolist() == [-2, 2]
+    assert env.model.actuator_gainprm[1, 0] == 3
+
+
+class Randomizing(Cart):
+    """An environment that sets a field itself, at every third reset."""
+
+    def __init__(self, *fields, derives=False):
+        super().__init__()
+        self.fields, self.derives, self.episode = fields, derives, -1
+        self.nominal = [getattr(self.model, field).copy() for field in fields]
+
+    def reset(self, *, seed=None, options=None):
+        gym.Env.reset(self, seed=seed)
+        self.episode += 1
+        factor = self.np_random.uniform(0.5, 1.5)
+        if self.episode % 3 == 0:
+            for field, nominal in zip(self.fields, self.nominal, strict=True):
+                getattr(self.model, field)[:] = nominal * factor + 0.01 * (nominal != 0)
+            if self.derives:
+                mujoco.mj_setConst(self.model, self.data)
+        return super().reset()
+
+
+@pytest.mark.parametrize(
+    ("fields", "derives"),
+    [
+        (("actuator_gainprm", "actuator_biasprm"), False),
+        (("body_inertia",), False),
+        (("eq_data",), False),
+        (("tendon_lengthspring",), False),
+        (("cam_pos0",), False),
+        (("light_pos0",), False),
+        (("body_invweight0", "dof_M0"), False),
+        (("body_pos",), True),
+        (("dof_armature", "dof_damping"), True),
+    ],
+    ids=lambda value: value[0] if isinstance(value, tuple) else "",
+)
+def test_other_episodes_are_those_of_an_environment_that_randomizes_itself(fields, derives):
+    bare, env = Randomizing(*fields, derives=derives), Randomizing(*fields, derives=derives)
+    noisy = RandomDynamics(env, 0.5, 0.5, 1.5)
+    chosen = 0
+    for episode in range(24):
+        seed = 3 if episode == 0 else None
+        bare.reset(seed=seed)
+        info = noisy.reset(seed=seed)[1]
+        different = changed(values(bare.model), env.model)
+        if not info:
+            assert different == set(), episode
+            continue
+        chosen += 1
+        mass, scaled = info["dynamics"]["body_mass"], values(env.model)
+        np.testing.assert_array_equal(scaled["body_mass"], mass * bare.model.body_mass)
+        inertia = mass[:, None] * bare.model.body_inertia
+        np.testing.assert_array_equal(scaled["body_inertia"], inertia)
+        assert not different & ({*fields} - {"body_inertia", "body_invweight0", "dof_M0"})
+    assert 5 < chosen < 20
+
+
+def test_several_at_once_with_other_fields():
+    def make():
+        env = RandomDynamics(Cart(), 0.6, 0.8, 1.2, fields=("body_mass",))
+        env = RandomNormalNoisyReward(env, 0.5, 1.0)
+        return RandomDynamics(env, 0.6, 0.5, 2.0, fields=("dof_damping", "dof_armature"))
+
+    env = make()
+    model, nominal = env.unwrapped.model, values(env.unwrapped.model)
+    gates = [streams(RandomDynamics, 4, position) for position in (0, 2)]
+    seen = set()
+    for episode in range(40):
+        info = env.reset(seed=4 if episode == 0 else None)[1]
+        drawn = [(gates[0][1].uniform(0.8, 1.2, 4),), gates[1][1].uniform(0.5, 2, (2, 8))]
+        chosen = [gate.random() < 0.6 for gate, _ in gates]
+        seen.add(tuple(chosen))
+        assert info.get("noise", ()) == ("RandomDynamics",) * sum(chosen)
+        expected = Cart().model
+        if chosen[0]:
+            expected.body_mass[:] *= drawn[0][0]
+            expected.body_inertia[:] *= drawn[0][0][:, None]
+            np.testing.assert_array_equal(info["dynamics"]["body_mass"], drawn[0][0])
+        if chosen[1]:
+            expected.dof_damping[:] *= drawn[1][0]
+            expected.dof_armature[:] *= drawn[1][1]
+            np.testing.assert_array_equal(info["dynamics"]["dof_armature"], drawn[1][1])
+        if any(chosen):
+            mujoco.mj_setConst(expected, mujoco.MjData(expected))
+        for name in ("body_mass", "body_inertia", "dof_damping", "dof_armature", "dof_M0"):
+            np.testing.assert_allclose(getattr(model, name), getattr(expected, name), rtol=1e-12)
+    assert len(seen) == 4
+    for wrapper in (env, env.env.env):
+        wrapper.noise_rate = 0.0
+    env.reset()
+    assert changed(nominal, model) == set()
+    names = ["RandomDynamics(0.8, 1.2, fields=('body_mass',))"]
+    names += ["RandomDynamics(0.5, 2.0, fields=('dof_damping',))"]
+    assert layers(make_noisy(Cart(), names, [0.5]))[:2] == ["RandomDynamics"] * 2
 
 
 @pytest.mark.parametrize("rate", [1.0, 0.01])
@@ -253,9 +443,17 @@ def test_environments_that_it_cannot_change():
             RandomDynamics(Cart(), 0.1, 0.5, 1.5, fields=(field,))
     with pytest.raises(ValueError, match="body_mass takes body_inertia along"):
         RandomDynamics(Cart(), 0.1, 0.5, 1.5, fields=("body_inertia", "body_mass"))
+    with pytest.raises(ValueError, match="actuator_gainprm takes actuator_biasprm along"):
+        RandomDynamics(Cart(), 0.1, 0.5, 1.5, fields=("actuator_biasprm",))
+    pid = MODEL.replace(
+        '<motor joint="slide" gear="50"/>', '<dcmotor joint="slide" motorconst="1" resistance="1"/>'
+    )
+    with pytest.raises(ValueError, match="strength of motors, servos and muscles"):
+        RandomDynamics(Choosing(pid), 0.1, 0.5, 1.5, fields=("actuator_gainprm",))
     once = RandomNormalNoisyReward(RandomDynamics(Cart(), 0.1, 0.5, 1.5), 0.1, 1)
-    with pytest.raises(ValueError, match="name all fields in one"):
-        RandomDynamics(once, 0.1, 0.5, 1.5)
+    for field in ("body_mass", "body_inertia"):
+        with pytest.raises(ValueError, match=f"another RandomDynamics .* scales {field}, too"):
+            RandomDynamics(once, 0.1, 0.5, 1.5, fields=(field,))
 
 
 def test_it_is_the_innermost():

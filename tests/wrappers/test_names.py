@@ -14,6 +14,7 @@ from noisy_wrappers import (
     WRAPPERS,
     Configuration,
     canonical_env_id,
+    parse_env_kwargs,
     reason,
     refusals,
     run_name,
@@ -62,6 +63,54 @@ def test_long_run_names_fit_into_a_file_system():
     assert name(0.5).endswith("__Humanoid-v5__sac") and re.fullmatch(
         r"[A-Za-z0-9._=+-]+", name(0.5)
     )
+    fields = ("body_mass", "geom_friction", "dof_damping", "dof_armature", "actuator_gainprm")
+    dynamics = f"RandomDynamics(0.7, 1.3, fields={fields})"
+    noises = [dynamics, "RandomNormalNoisyReward(1.0)", "RandomObservationDelay(1, 3)"]
+    tests = {"test_noise": [dynamics, "RandomNormalNoisyAction(0.1)"], "test_noise_rate": [1.0]}
+    names = set()
+    for mass in range(3):
+        kwargs = {"env_kwargs": [f"mass:{mass}", "reward_type:dense"], **tests}
+        for seed in range(3):
+            names.add(run_name("HalfCheetah-v5", "x" * 40, noises, [0.5, 0.1, 0.2], seed, **kwargs))
+            names.add(run_name("HalfCheetah-v5", "x" * 200, noises, [0.5], seed, **kwargs))
+    assert len(names) == 18 and max(map(len, names)) <= 240
+
+
+HEAVY = {"test_noise": ["RandomDynamics(1.3, 1.3)"], "test_noise_rate": [1.0]}
+
+
+def test_the_environments_arguments_and_the_tests_are_part_of_the_name():
+    plain = run_name("E", "x", [A], [0.5], 1)
+    assert plain == run_name("E", "x", [A], [0.5], 1, env_kwargs=(), test_noise=[])
+    name = run_name("E", "x", [A], [0.5], 1, env_kwargs=["reward_type:dense", "mass:2.0"], **HEAVY)
+    first, _, exp_name = plain.rpartition("__")
+    tests = "tests_p1.0_Dynamics_1.3_1.3"
+    assert name == f"{first}_mass=2.0_reward_type=dense__{exp_name}__{tests}"
+    spelled = {"test_noise": ["RandomDynamics(1.30, high=1.3)"], "test_noise_rate": ["1:1"]}
+    kwargs = ["mass:2.00", "reward_type:dense"]
+    assert run_name("E", "x", [A], [0.5], 1, env_kwargs=kwargs, **spelled) == name
+    values = ["2", "'2'", "2.0", "two", "(2, 3)", "[2, 3]", "a b", "a/b", "None", "'None'", "x:2"]
+    names = {run_name("E", "x", [], [], 1, env_kwargs=[f"a:{value}"]) for value in values}
+    assert len(names) == len(values)
+    assert all(re.fullmatch(r"[A-Za-z0-9._=+-]+", name) for name in names)
+
+
+def test_env_kwargs():
+    texts = ["mass:2.0", "reward_type:dense", "n:-3", "on:True", "range:(0, 1)", "at:10:30", "no:"]
+    assert parse_env_kwargs(texts) == {
+        "mass": 2.0,
+        "reward_type": "dense",
+        "n": -3,
+        "on": True,
+        "range": (0, 1),
+        "at": "10:30",
+        "no": "",
+    }
+    assert parse_env_kwargs(["x:__import__('os')"]) == {"x": "__import__('os')"}
+    for bad in (["mass"], ["2x:1"], ["a-b:1"], ["for:1"], [":1"], ["a:1", "a:2"], "mass:2", [3]):
+        with pytest.raises(ValueError, match="^env_kwargs") as error:
+            parse_env_kwargs(bad)
+        assert "\n" not in str(error.value)
 
 
 @st.composite
@@ -75,7 +124,7 @@ def configurations(draw):
             steps = sorted(draw(st.lists(st.sampled_from([1, 2, 12]), min_size=1, max_size=2)))
             arguments = [str(k) for k in steps] if draw(st.booleans()) else ["each_step=True"]
             arguments += draw(st.sampled_from([[], ["truncate=True"], ["truncate=False"]]))
-        elif name == "RandomActionDelay":
+        elif "Delay" in name:
             arguments = [str(draw(st.integers(0, 12)))]
         elif "Uniform" in name or name == "RandomDynamics":
             arguments = [str(x) for x in sorted(draw(st.tuples(few, few)))]
@@ -86,7 +135,9 @@ def configurations(draw):
                 arguments = [str(tuple(draw(st.lists(few, min_size=2, max_size=3))))]
             if "Normal" in name and draw(st.booleans()):
                 arguments.append(f"loc={draw(few)}")
-        if name.endswith("Observation") and draw(st.booleans()):
+        if ("Noisy" in name or "Bias" in name) and draw(st.booleans()):
+            arguments.append(f"relative={draw(st.booleans())}")
+        if "Observation" in name and draw(st.booleans()):
             keys = ["a", "b", "a-b", "a b", "a/b", "a', 'b", "ab", "0"]
             keys = draw(st.lists(st.sampled_from(keys), min_size=1, max_size=2))
             arguments.append(f"keys={tuple(keys)}" if draw(st.booleans()) else "keys=0")

@@ -194,7 +194,7 @@ def test_a_noise_must_return_as_many_numbers_as_it_gets(surplus):
         def _perturb(self, observation):
             return np.ones(len(observation) + surplus)
 
-    with pytest.raises(ValueError, match="reshape"):
+    with pytest.raises(ValueError, match="must return an array of shape"):
         Other(make_goals(), 1.0).reset(seed=0)
 
 

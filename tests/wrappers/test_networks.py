@@ -4,7 +4,8 @@ import copy
 import json
 import random
 import sys
-from dataclasses import dataclass
+import time
+import weakref
 
 import gymnasium as gym
 import numpy as np
@@ -103,6 +104,13 @@ def test_make_flat_refuses_what_networks_cannot_take(observations, actions, word
     with pytest.raises(ValueError, match=word) as error:
         make_flat(Given(observations, actions))
     assert str(actions if "actions" in word or "dim" in word else observations) in str(error.value)
+
+
+def test_an_environment_that_is_none_of_gymnasiums():
+    for env in ([], lambda: None, type("Env", (), {"__module__": "gym.core"})()):
+        with pytest.raises(TypeError, match="needs a gymnasium.Env, not a ") as error:
+            make_flat(env)
+        assert "\n" not in str(error.value)
 
 
 class OneOfJax:
@@ -221,76 +229,62 @@ def test_an_env_state_has_only_pythons_own_types(make_generator):
     assert env.unwrapped.np_random.normal(size=5).tolist() == expected
 
 
-class Nameless(type):
-    """The class of classes that have no module, as SWIG makes them for Box2D."""
-
-    @property
-    def __module__(cls):
-        raise AttributeError("__module__")
-
-
-class Simulator:
-    """Part of an environment, with generators of its own."""
-
-    __module__ = "simulator"  # another one of the user's than the environment's
-
-    def __init__(self):
-        self.rng = np.random.default_rng(0)
-        self.torch = torch.Generator().manual_seed(0)
-
-
-@dataclass(slots=True)
-class Wind:
-    """Another part, without a __dict__."""
-
-    rng: np.random.Generator
-
-
 class Drawing(gym.Env):
-    """Draws from generators that it holds, in many ways, and one that a helper or space holds."""
+    """Draws from all kinds of generators that are its attributes, and spawns at every reset."""
 
-    observation_space = gym.spaces.Box(-9, 9, (10,), np.float64)
-    action_space = gym.spaces.Box(-1, 1, (1,))
-    __slots__ = ("gust",)
+    observation_space = gym.spaces.Box(-9, 9, (7,), np.float64)
+    action_space = gym.spaces.Dict(a=gym.spaces.Box(-1, 1, (1,)))
 
     def __init__(self):
-        self.robot = gym.make("Pendulum-v1")
-        self.simulator, self.goals = Simulator(), gym.spaces.Box(-1, 1, (1,))
-        self.wind, self.gust = Wind(np.random.default_rng(0)), np.random.default_rng(1)
-        self.several = {"of one kind": [np.random.default_rng(i) for i in range(2)]}
-        self.goals.seed(0)
-        self.world = Nameless("World", (), {})()
+        self.goals, self.torch = gym.spaces.Box(-1, 1, (1,)), torch.Generator()
         self.dice = random.SystemRandom()  # nothing can restore it, and nothing fails
+        self.gone = weakref.proxy(Drawing.reset.__get__(self))  # of what has been deleted
+        self.tables = [{str(i): [i] for i in range(10_000)}] * 100
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         if seed is not None:
             self.rng, self.old = np.random.default_rng(seed), np.random.RandomState(seed)
             self.python = random.Random(seed)
-            self.robot.reset(seed=seed)
+            self.goals.seed(seed)
+            self.torch.manual_seed(seed)
         drawn = [self.rng.normal(), self.old.normal(), self.python.random()]
-        drawn += [self.simulator.rng.normal(), self.goals.sample()[0]]
-        drawn += [self.wind.rng.normal(), self.gust.normal()]
-        drawn.append(self.several["of one kind"][1].normal())
-        drawn.append(torch.rand((), generator=self.simulator.torch).item())
-        return np.array([*drawn, self.robot.reset()[0][0]]), {}
+        drawn += [self.np_random.spawn(1)[0].normal(), self.rng.spawn(2)[1].normal()]
+        drawn += [self.goals.sample()[0], torch.rand((), generator=self.torch).item()]
+        return np.array(drawn), {}
 
 
 def test_an_env_state_has_the_generators_among_the_attributes():
+    def play(env):
+        return [*env.reset()[0], env.action_space.sample()["a"][0]]
+
     env = gym.wrappers.TransformReward(Drawing(), abs)
-    first, _ = env.reset(seed=1)
+    env.reset(seed=1)
+    first = play(env)
     saved = json.loads(json.dumps(EnvState(env).state_dict()))
-    second, _ = env.reset()
+    second, third = play(env), play(env)
     other = gym.wrappers.TransformReward(Drawing(), abs)
-    other.reset(seed=2)
-    EnvState(other).load_state_dict(saved)
-    np.testing.assert_array_equal(other.reset()[0], second)
-    assert (first != second).all()
+    for episodes in (0, 3):  # fewer children have been spawned, then more
+        other.reset(seed=2)
+        [play(other) for _ in range(episodes)]
+        EnvState(other).load_state_dict(saved)
+        assert play(other) == second
+    assert all(one != two for one, two in zip(first, second, strict=True))
     with kept_generators(other):
-        third, _ = other.reset()
-    np.testing.assert_array_equal(other.reset()[0], third)
-    del saved["attributes"]  # of a checkpoint that an earlier version wrote
-    EnvState(other).load_state_dict(saved)
+        assert play(other) == third
+    assert play(other) == third
+
+
+def test_what_an_environment_holds_is_not_searched():
+    """A million numbers, as of tables of data, cost nothing."""
+    env = Drawing()
+    env.reset(seed=1)
+    before = time.process_time()
+    for _ in range(20):
+        with kept_generators(env):
+            pass
+    assert time.process_time() - before < 1
+    assert len(json.dumps(EnvState(env).state_dict()["attributes"])) < 60_000
 
 
 def test_success_may_be_a_tensor():

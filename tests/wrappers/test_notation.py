@@ -133,8 +133,9 @@ def test_signatures():
     assert [text.split("(")[0] for text in signatures()] == list(WRAPPERS)
     assert "RandomMixupObservation(factor, *, recursive=False, keys=None)" in signatures()
     assert "RandomUniformScaleReward(low, high)" in signatures()
-    assert "RandomNormalNoisyAction(scale, *, loc=0.0)" in signatures()
+    assert "RandomNormalNoisyAction(scale, *, loc=0.0, relative=False)" in signatures()
     assert "RandomActionDelay(low, high=low)" in signatures()
+    assert "RandomObservationDelay(low, high=low, *, keys=None)" in signatures()
 
 
 def test_the_registry_is_complete():
@@ -151,6 +152,8 @@ def test_the_registry_is_complete():
         "RandomNormalNoisyAction",
         "RandomActionDelay",
         "RandomDynamics",
+        "RandomObservationBias",
+        "RandomObservationDelay",
     ]
     assert all(issubclass(wrapper, NoiseWrapper) for wrapper in WRAPPERS.values())
     assert {text.split("(")[0] for text in NOISES} == set(WRAPPERS)

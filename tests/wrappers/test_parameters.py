@@ -34,7 +34,8 @@ BAD_FLAGS = [0, 1, None, "yes", np.True_]
 
 def bad_parameters():
     for name in WRAPPERS:
-        args = {"RandomEarlyTermination": (3,), "RandomActionDelay": (3,)}.get(name, (0.5,))
+        of_steps = ("RandomEarlyTermination", "RandomActionDelay", "RandomObservationDelay")
+        args = (3,) if name in of_steps else (0.5,)
         if "Uniform" in name or name == "RandomDynamics":
             args = (0.5, 1.0)
             for bad in BAD_NUMBERS:
@@ -46,9 +47,10 @@ def bad_parameters():
             if "Mixup" in name or "Dropout" in name:
                 parameter = "factor" if "Mixup" in name else "keep_prob"
                 yield name, 0.1, (bad,), {}, parameter, bad
-        if "Normal" in name:
+        if "Normal" in name or "Bias" in name:
             for bad in [*BAD_NUMBERS, -0.001, -1, 10**400]:
                 yield name, 0.1, (bad,), {}, "scale", bad
+        if "Normal" in name:
             for bad in BAD_NUMBERS:
                 yield name, 0.1, (0.5,), {"loc": bad}, "loc", bad
     yield "RandomDynamics", 0.1, (-0.1, 1.0), {}, "low", -0.1
@@ -56,10 +58,11 @@ def bad_parameters():
         yield "RandomDynamics", 0.1, (0.5, 1.0), {"fields": ("body_mass", bad)}, "fields", bad
     for bad in [(), None, 5]:
         yield "RandomDynamics", 0.1, (0.5, 1.0), {"fields": bad}, "fields", bad
-    for bad in [-1, *BAD_STEPS[2:]]:
-        yield "RandomActionDelay", 0.1, (bad,), {}, "low", bad
-        yield "RandomActionDelay", 0.1, (0, bad), {}, "high", bad
-    yield "RandomActionDelay", 0.1, (5, 4), {}, "low", 5
+    for name in ("RandomActionDelay", "RandomObservationDelay"):
+        for bad in [-1, *BAD_STEPS[2:]]:
+            yield name, 0.1, (bad,), {}, "low", bad
+            yield name, 0.1, (0, bad), {}, "high", bad
+        yield name, 0.1, (5, 4), {}, "low", 5
     for bad in [3.5, (), ("a", 1), (None,), True]:
         yield "RandomDropoutObservation", 0.1, (0.5,), {"keys": bad}, "keys", bad
     for bad in BAD_STEPS:

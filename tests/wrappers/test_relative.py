@@ -1,0 +1,188 @@
+"""Noise in standard deviations of what the environment gives, and in halves of its actions."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from cases import BOX, GenericEnv, build, rollout, streams
+from test_action_noise import actions_env
+from test_nested import GOALS, sampled
+
+from noisy_wrappers import (
+    Configuration,
+    RandomNormalNoisyAction,
+    RandomNormalNoisyObservation,
+    RandomNormalNoisyReward,
+    RandomObservationBias,
+    RandomUniformNoisyObservation,
+    RandomUniformNoisyReward,
+    make_noisy,
+    parse_noise,
+    run_name,
+)
+
+UNITS = np.array([0.001, 1.0, 500.0])
+SPACE = gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)
+
+
+def units_env():
+    """Observations in millimetres, and in other units; rewards in dollars."""
+
+    def observe(env):
+        return 7 * UNITS + UNITS * env.np_random.normal(size=3)
+
+    return GenericEnv(
+        SPACE,
+        reset=lambda env: (observe(env), {}),
+        step=lambda env, a: (observe(env), 1e4 * env.np_random.random(), False, False, {}),
+    )
+
+
+@pytest.mark.parametrize("rate", [0.3, 1.0])
+@pytest.mark.parametrize(
+    ("wrapper", "args", "draw"),
+    [
+        (RandomNormalNoisyObservation, (0.1,), lambda g: g.normal(0, 0.1, 3)),
+        (RandomNormalNoisyObservation, ((0.1, 0.0, 2.0),), lambda g: g.normal(0, [0.1, 0, 2])),
+        (RandomUniformNoisyObservation, (-0.2, 0.1), lambda g: g.uniform(-0.2, 0.1, 3)),
+        (RandomNormalNoisyReward, (0.1,), lambda g: g.normal(0, 0.1)),
+        (RandomUniformNoisyReward, (-0.2, 0.1), lambda g: g.uniform(-0.2, 0.1)),
+    ],
+)
+def test_relative_golden(wrapper, args, draw, rate):
+    """The gate and the noise draw as otherwise, also while the first 99 samples stay clean."""
+    kind = 1 if "Reward" in wrapper.__name__ else 0
+    bare = rollout(units_env(), seed=7, steps=300)[kind:]
+    env = wrapper(units_env(), rate, *args, relative=True)
+    gate, noise = streams(wrapper, seed=7)
+    received, noisy = [], 0
+    for clean, got in zip(bare, rollout(env, seed=7, steps=300)[kind:], strict=True):
+        received.append(clean[kind])
+        expected, acts = clean[kind], gate.random() < rate
+        if acts:
+            drawn = draw(noise)
+            if len(received) >= 100:
+                expected = expected + drawn * np.std(received, axis=0, ddof=1)
+        np.testing.assert_allclose(got[kind], expected, rtol=1e-12)
+        changed = acts and len(received) >= 100
+        noisy += changed
+        assert ("noise" in got[4]) == changed
+    assert env.times_applied == noisy > 0 and env.opportunities == len(received)
+
+
+def test_a_dimension_that_never_changes_and_samples_that_are_not_finite():
+    observation = np.array([0.1, 2.0, 3.0])
+    env = GenericEnv(SPACE, step=lambda env, a: (observation.copy(), 1.0, False, False, {}))
+    env = RandomNormalNoisyObservation(env, 1.0, 1.0, relative=True)
+    env.reset(seed=0)
+    for i in range(200):
+        observation[1] = np.nan if i == 50 else i
+        seen = env.step(0)[0]
+    assert np.isfinite(seen).all() and seen[1] != 199
+    assert seen[0] == pytest.approx(0.1, abs=0.5)  # the reset's was another
+
+
+def test_what_it_has_estimated_is_resumed(tmp_path):
+    for text in (
+        "RandomNormalNoisyObservation(0.1, relative=True)",
+        "RandomObservationBias(0.1, relative=True)",
+        "RandomUniformNoisyReward(-0.1, 0.1, relative=True)",
+    ):
+        env = build(text, gym.wrappers.TimeLimit(units_env(), 20), 0.7)
+        rollout(env, seed=3, steps=200)
+        torch.save(env.state_dict(), tmp_path / "state.pt")
+        expected = rollout(env, steps=50, seed=4)
+        other = build(text, gym.wrappers.TimeLimit(units_env(), 20), 0.7)
+        other.reset(seed=8)
+        other.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
+        got = rollout(other, steps=50, seed=4)
+        np.testing.assert_array_equal([step[0] for step in got], [step[0] for step in expected])
+        assert [step[1] for step in got] == [step[1] for step in expected]
+        fresh = rollout(build(text, units_env(), 0.7), steps=50, seed=4)
+        assert not any("noise" in step[4] for step in fresh)
+
+
+def test_dictionaries_are_measured_as_one_vector():
+    env = RandomNormalNoisyObservation(
+        sampled(GOALS)[0], 1.0, 1.0, relative=True, keys=("observation", "desired_goal")
+    )
+    samples = sampled(GOALS)[1]
+    steps = rollout(env, seed=0, steps=150)
+    vectors = [np.concatenate([s["desired_goal"], s["observation"]]) for s in samples]
+    np.testing.assert_allclose(
+        env._spread.deviation, np.std([*vectors, *vectors, *vectors, vectors[0]], axis=0, ddof=1)
+    )
+    assert "noise" not in steps[98][4] and "noise" in steps[99][4]
+
+
+def test_actions_are_perturbed_in_halves_of_their_range():
+    low, high = np.float32([-1, 15]), np.float32([1, 30])
+    bare = actions_env(gym.spaces.Box(low, high))
+    env = RandomNormalNoisyAction(bare, 1.0, 0.1, relative=True)
+    _, noise = streams(RandomNormalNoisyAction, seed=3)
+    env.reset(seed=3)
+    for _ in range(50):
+        env.step(np.float32([0, 20]))
+        expected = [0, 20] + noise.normal(0, 0.1, 2) * [1, 7.5]
+        np.testing.assert_allclose(bare.received[-1], np.clip(expected, low, high), rtol=1e-6)
+    largest = np.finfo(np.float32).max
+    for bound in (np.inf, largest):
+        with pytest.raises(ValueError, match="relative=True needs bounded actions"):
+            space = gym.spaces.Box(np.float32([-1, -bound]), np.float32([1, 1]))
+            RandomNormalNoisyAction(actions_env(space), 0.1, 1.0, relative=True)
+
+
+def test_it_is_written_and_named():
+    text = "RandomNormalNoisyObservation(0.01, relative=True)"
+    assert str(parse_noise("RandomNormalNoisyObservation(.01,relative=True, loc=0)")) == text
+    name = "p0.5_s1_NormalNoisyObservation_0.01_relative=True__E__x"
+    assert run_name("E", "x", [text], [0.5], 1) == name
+    assert "relative" not in run_name("E", "x", [text.replace("True", "False")], [0.5], 1)
+    for name in ("NormalNoisyObservation(1", "UniformNoisyReward(0, 1", "NormalNoisyAction(1"):
+        for bad in (1, None, "yes"):
+            with pytest.raises(ValueError, match="relative must be True or False"):
+                parse_noise(f"Random{name}, relative={bad!r})")
+    assert np.isinf(
+        make_noisy(
+            GenericEnv(BOX), ["RandomUniformNoisyObservation(0, 1, relative=True)"], [0.1]
+        ).observation_space.high
+    ).all()
+
+
+@pytest.mark.parametrize(
+    ("noises", "rates", "problem"),
+    [
+        (["RandomNormalNoisyObservation(0.1, relative=True)"], [1.0], "relative=True"),
+        (["RandomUniformNoisyReward(0, 1, relative=True)"], [1.0], "relative=True"),
+        (["RandomObservationBias(1.0, relative=True)"], [0.5], "relative=True"),
+        (["RandomDropoutObservation(0.5)", "RandomObservationDelay(2)"], ["1:0", 1], "1.0:0.0"),
+        (["RandomNormalNoisyAction(0.1, relative=True)", "RandomObservationBias(1)"], [1], None),
+        ([], [], None),
+    ],
+)
+def test_what_a_test_may_have(noises, rates, problem):
+    """A running scale would depend on the policy; a test has neither beginning nor end."""
+    configuration = Configuration.read(noises, rates)
+    if problem is None:
+        assert configuration.for_tests() is configuration
+        return
+    with pytest.raises(ValueError, match=problem) as error:
+        configuration.for_tests()
+    assert "\n" not in str(error.value)
+
+
+def test_a_relative_bias_is_constant_within_an_episode():
+    env = RandomObservationBias(gym.wrappers.TimeLimit(units_env(), 120), 1.0, 0.5, relative=True)
+    twin = units_env()
+    _, noise = streams(RandomObservationBias, 5)
+    received = []
+    for episode in range(3):
+        drawn = noise.normal(0, 0.5, 3)
+        deviation = np.std(received, axis=0, ddof=1) if received else 0
+        seed = 5 if episode == 0 else None
+        steps = [(env.reset(seed=seed)[0], twin.reset(seed=seed)[0])]
+        steps += [(env.step(0)[0], twin.step(0)[0]) for _ in range(120)]
+        for seen, clean in steps:
+            np.testing.assert_allclose(seen, clean + drawn * deviation, rtol=1e-12)
+            received.append(clean)
+    assert (env.times_applied, env.opportunities) == (2, 3)

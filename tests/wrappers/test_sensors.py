@@ -1,0 +1,85 @@
+"""Sensors as they fail: a bias and a delay of an episode, and a packet that is lost."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from cases import GenericEnv, constant_env, numbered_env, rollout, streams
+from test_nested import GOALS, MIXED, sampled
+
+from noisy_wrappers import RandomMixupObservation, RandomObservationBias, RandomObservationDelay
+
+
+@pytest.mark.parametrize("rate", [0.4, 1.0])
+@pytest.mark.parametrize("scale", [0.3, (0.3, 0.0, 2.0)])
+def test_bias_golden(rate, scale):
+    bare = rollout(gym.wrappers.TimeLimit(GenericEnv(), 9), seed=3, steps=200)
+    env = RandomObservationBias(gym.wrappers.TimeLimit(GenericEnv(), 9), rate, scale)
+    gate, noise = streams(RandomObservationBias, seed=3)
+    chosen = []
+    for clean, got in zip(bare, rollout(env, seed=3, steps=200), strict=True):
+        if clean[1] is None:  # a reset
+            bias = noise.normal(0, scale, 3)
+            chosen.append(gate.random() < rate)
+        np.testing.assert_array_equal(got[0], clean[0] + (bias if chosen[-1] else 0))
+        assert got[4] == ({"noise": ("RandomObservationBias",)} if chosen[-1] else {})
+    assert (env.times_applied, env.opportunities) == (sum(chosen), len(chosen))
+    assert len({*chosen}) == (1 if rate == 1 else 2)
+
+
+@pytest.mark.parametrize("reuse", [False, True])
+def test_a_delay_by_hand(reuse):
+    for delay, seen in [(0, [1, 2, 3, 4, 5]), (2, [1, 1, 1, 2, 3]), (2**63 - 1, [1] * 5)]:
+        env = RandomObservationDelay(numbered_env(reuse and delay > 0), 1.0, delay)
+        steps = rollout(env, seed=0, steps=4)
+        assert [step[0][0] for step in steps] == seen
+        steps[0][0][:] = 99  # the agent's copy
+        assert [step[0][0] for step in rollout(env, steps=4)] == [value + 5 for value in seen]
+        changed = [value != number for number, value in enumerate(seen, 1)]
+        assert ["noise" in step[4] for step in steps] == changed
+        assert (env.times_applied, env.opportunities) == (2 * any(changed), 2)
+
+
+@pytest.mark.parametrize("rate", [0.4, 1.0])
+def test_delay_golden(rate):
+    env = RandomObservationDelay(numbered_env(), rate, 1, 3)
+    gate, noise = streams(RandomObservationDelay, seed=3)
+    delays = []
+    for episode in range(200):
+        first = env.reset(seed=3 if episode == 0 else None)[0][0]
+        seen = [env.step(0)[0][0] - first for _ in range(8)]
+        drawn = noise.integers(1, 3, endpoint=True)
+        delays.append(drawn if gate.random() < rate else 0)
+        assert seen == [max(0, t - delays[-1]) for t in range(1, 9)]
+    assert set(delays) == {1, 2, 3} | ({0} if rate < 1 else set())
+
+
+def test_keys_name_the_sensors_that_fail():
+    for wrapper, args in [(RandomObservationBias, (1.0,)), (RandomObservationDelay, (1,))]:
+        env, samples = sampled(GOALS)
+        env = wrapper(env, 1.0, *args, keys=("observation",))
+        seen = [step[0] for step in rollout(env, seed=0, steps=20)]
+        for t in range(1, 20):
+            assert seen[t]["desired_goal"] is samples[t]["desired_goal"]
+            late = samples[t - 1]["observation"]
+            assert (seen[t]["observation"] == late).all() == (wrapper is RandomObservationDelay)
+        env = wrapper(sampled(MIXED)[0], 1.0, *args)
+        assert all(step[0] in env.observation_space for step in rollout(env, seed=0, steps=20))
+
+
+def test_only_a_bias_leaves_the_space():
+    space = gym.spaces.Box(-1, 1, (3,), np.float32)
+    assert RandomObservationDelay(GenericEnv(space), 1.0, 1).observation_space == space
+    assert np.isinf(RandomObservationBias(GenericEnv(space), 1.0, 1).observation_space.high).all()
+    with pytest.raises(ValueError, match="scale has 2 numbers"):
+        RandomObservationBias(constant_env(), 1.0, (1.0, 2.0))
+
+
+def test_a_lost_packet_holds_the_last_one_that_arrived():
+    """As docs/wrappers.md has it: RandomMixupObservation(0.0, recursive=True)."""
+    env = RandomMixupObservation(numbered_env(), 0.5, 0.0, recursive=True)
+    gate, _ = streams(RandomMixupObservation, seed=4)
+    env.reset(seed=4)
+    held = 1
+    for number in range(2, 60):
+        held = held if gate.random() < 0.5 else number
+        assert env.step(0)[0][0] == held
