@@ -49,14 +49,15 @@ class Environment(NamedTuple):
 # ------------------------------------------------------------------------------------- the question
 
 
-def ask(env_id, configurations=(), max_episode_steps=None):
+def ask(env_id, configurations=(), max_episode_steps=None, env_kwargs=()):
     """Make an environment as the scripts do, time it, and try configurations of noise on it.
 
     What it raises if it cannot be made or played passes through.
     """
     deadline = time.perf_counter() + PATIENCE
     with contextlib.redirect_stdout(sys.stderr):
-        made = gym.make(env_id, disable_env_checker=True, max_episode_steps=max_episode_steps)
+        options = noisy.parse_env_kwargs(env_kwargs) | {"max_episode_steps": max_episode_steps}
+        made = gym.make(env_id, disable_env_checker=True, **options)
         declared = made.spec.max_episode_steps
         with noisy.make_flat(made, STEP_LIMIT) as env:
             limit = env.spec.max_episode_steps
@@ -167,11 +168,12 @@ def ask_all(args, configurations):
     configurations: {env_id: [Configuration]}. Exits with a line for each environment that cannot
     be trained in, and for each algorithm that cannot act there.
     """
-    steps = number(args.given_words[args.algos[0]].get("max_episode_steps"))
+    given = args.given_words[args.algos[0]]
+    steps, env_kwargs = number(given.get("max_episode_steps")), given.get("env_kwargs", [])
     answers, reasons = {}, []
     for env_id, noises in configurations.items():
         try:
-            answer = ask(env_id, noises, steps)
+            answer = ask(env_id, noises, steps, env_kwargs)
         except (Exception, SystemExit) as error:  # others may be wrong, too
             plain = (gym.error.Error, noisy.SpaceError, noisy.NotFiniteError, SystemExit)
             reason = with_place(error, plain)

@@ -36,16 +36,17 @@ NOISES = [  # as the paper's authors ran them: dropout keeps 90 %, mixup remembe
     "RandomUniformScaleReward(0.5, 1.5)",
     "RandomUniformScaleReward(0.8, 1.2)",
 ]
-# What choose tries by default, and why: docs/sweeps.md
+# What choose tries by default, in the units of whatever environment it is: docs/sweeps.md
 CHOOSE_NOISES = [
-    "RandomUniformNoisyObservation(-0.001, 0.001)",
+    "RandomNormalNoisyObservation(0.01, relative=True)",
+    "RandomNormalNoisyObservation(0.1, relative=True)",
     "RandomUniformScaleObservation(0.8, 1.2)",
     "RandomMixupObservation(0.5, recursive=True)",
-    "RandomNormalNoisyReward(1.0)",
-    "RandomUniformNoisyReward(-0.001, 0.001)",
+    "RandomNormalNoisyReward(0.1, relative=True)",
+    "RandomNormalNoisyReward(1.0, relative=True)",
     "RandomUniformScaleReward(0.5, 1.5)",
     "RandomEarlyTermination(50)",
-    "RandomNormalNoisyAction(0.1)",
+    "RandomNormalNoisyAction(0.1, relative=True)",
     "RandomActionDelay(0, 2)",
     "RandomDynamics(0.7, 1.3)",
 ]
@@ -150,8 +151,33 @@ def make_run(args, algorithm, env_id, configuration, seed, phase=""):
     command += ["--total-timesteps", str(steps), "--runs-dir", runs_dir, *args.extra[algorithm]]
     own = {"env_id": env_id, "seed": str(seed), "total_timesteps": str(steps)}
     own |= args.given_words[algorithm] | {"exp_name": args.exp_names[algorithm]}
-    folder = Path(runs_dir, run_name(env_id, own["exp_name"], noises, rates, seed))
+    folder = Path(runs_dir, name_of(args, algorithm, env_id, configuration, seed))
     return PlannedRun(folder, (algorithm, env_id), seed, steps, command, script, own)
+
+
+def name_of(args, algorithm, env_id, configuration, seed):
+    """Return the name of a run's folder."""
+    given = args.given_words[algorithm]
+    try:
+        return run_name(
+            env_id,
+            args.exp_names[algorithm],
+            *configuration.texts,
+            seed,
+            env_kwargs=given.get("env_kwargs", []),
+            test_noise=given.get("test_noise", []),
+            test_noise_rate=list(map(rate, given.get("test_noise_rate", []))),
+        )
+    except ValueError as error:
+        return fail(f"after the --: {error}")
+
+
+def rate(text):
+    """Read a noise rate: a number, or text such as "1.0:0.0", which Configuration.read reads."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def grid(args):

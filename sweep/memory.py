@@ -1,7 +1,7 @@
 """What a folder of choices keeps in choice.json: the commands, and what was fixed beforehand.
 
 {"commands": [{"algos": [...], "envs": [...], "words": [...], "extra": [...]}, ...],
- "plans": {"NAME on ENVIRONMENT by METRIC": {"looks": [...], "level": ...}}}
+ "plans": {"ENVIRONMENT__EXP_NAME by METRIC": {"looks": [...], "level": ...}}}
 """
 
 import json
@@ -9,6 +9,8 @@ from pathlib import Path
 
 from analysis.errors import fail, in_words
 from analysis.folders import rewritten
+from noisy_wrappers import BASELINE
+from sweep.grid import name_of
 from sweep.looks import Plan
 
 KEPT = 20  # commands
@@ -32,8 +34,9 @@ def load(runs_dir):
 
 
 def choice_key(args, algorithm, env_id):
-    """Name a choice in choice.json."""
-    return f"{args.exp_names[algorithm]} on {env_id} by {args.metric}"
+    """Name a choice in choice.json: by what its folders have in common, and its metric."""
+    _, _, name = name_of(args, algorithm, env_id, BASELINE, 0).partition("__")
+    return f"{name} by {args.metric}"
 
 
 def plan_of(args, algorithm, env_id):

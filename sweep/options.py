@@ -9,7 +9,7 @@ from pathlib import Path
 from analysis.errors import fail
 from noisy_wrappers import canonical_env_id, safe_name, split_noises
 from sweep import scripts
-from sweep.grid import ENVS, PRESETS, SEEDS
+from sweep.grid import ENVS, PRESETS, SEEDS, rate
 
 EXECUTOR_OPTIONS = ["--dry-run", "--executor", "--jobs", "--sshlogin", "--remote-dir"]
 EXECUTOR_OPTIONS += ["--slurm-args", "--wait", "--help"]  # benchmark.sh reads these
@@ -231,14 +231,6 @@ def seeds(text):
         reason = f"{text!r} is more than {MOST_SEEDS:,} seeds"
         raise argparse.ArgumentTypeError(reason)
     return range(first, last + 1)
-
-
-def rate(text):
-    """Read a noise rate: a number, or text such as "1.0:0.0", which Configuration.read reads."""
-    try:
-        return float(text)
-    except ValueError:
-        return text
 
 
 def entry(text):
