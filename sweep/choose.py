@@ -277,7 +277,7 @@ def walk(args, algorithm, env_id, noises, budget, plan):
             planned = make_run(args, algorithm, env_id, noise, seed, phase)
             found = look(planned, with_curve=True)
             runs[noise, seed] = planned._replace(damage=found.damage)
-            if found.finished and not found.other_release:
+            if found.finished:
                 curve = found.run.curve
                 tests[noise, seed] = values = curve.of(args.metric)
                 values = np.zeros(len(curve.steps)) if values is None else values

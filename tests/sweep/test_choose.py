@@ -3,7 +3,6 @@
 import contextlib
 import csv
 import io
-import json
 import math
 import multiprocessing
 import os
@@ -367,8 +366,6 @@ def test_two_algorithms_and_environments_at_once(tmp_path):
         for env in ("Pendulum-v1", "MountainCarContinuous-v0")
     ]
     assert all("(level shared by 4 verdicts)" in sentence for sentence in sentences)
-    kept = json.loads((tmp_path / "choice.json").read_text())["plans"]
-    assert len(kept) == 4 and all(p == {"looks": [5], "level": 0.0125} for p in kept.values())
     lines = read(tmp_path / "choice.csv")
     assert len(lines) == 4 * (3 + 2 + 2)
     assert {line["noise_rate"] for line in lines} == {"0.0", "1.0", "0.3 + 1.0:0.0"}
