@@ -250,6 +250,7 @@ run_todo() {
   kill -- "-$guard" 2>/dev/null || true
   kill "$watch" 2>/dev/null && { [ ! -t 2 ] || echo >&2; } || true
   group='' ids=()
+  forget_refusals
   tried+=$'\n'$todo
   export SWEEP_WAITED=1 # results of other machines may be seen a little later
 }

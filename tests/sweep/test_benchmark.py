@@ -40,7 +40,7 @@ SCALE, BOTH = (
     "RandomNormalNoisyReward(1.0)+RandomEarlyTermination(1, 100)",
 )
 GRID = ["custom", "--algos", "sac", "--envs", "Pendulum-v1", "--seeds", "1"]
-GRID += ["--noises", SCALE, BOTH, "--noise-rates", "0.5"]
+GRID += ["--noises", SCALE, BOTH, "--noise-rates", "0.5", "--baseline-seeds", "1"]
 # SAC that never starts learning is the cheapest real run there is.
 CHEAP = "--no-compile --learning-starts 1000000000 --buffer-size 1000 --eval-episodes 1"
 CHEAP += " --eval-frequency 1000 --checkpoint-frequency 1000000000"
@@ -424,7 +424,7 @@ def test_slurm_requeues_before_the_time_limit(slurm, tmp_path):
 
 @pytest.fixture
 def no_slurm(tmp_path, stub):
-    """A Slurm that only writes down what it was asked for; returns its environment and that file."""
+    """A Slurm that only writes down what it was asked: its environment, and that file."""
     tools, asked = tmp_path / "bin", tmp_path / "asked"
     tools.mkdir()
     said = {
@@ -1037,9 +1037,8 @@ def test_an_environment_and_runs_in_the_callers_folder(tmp_path, stub):
     subprocess.run(pasted, shell=True, check=True, cwd=ROOT)
     assert result.exists()
     # A script of one's own finds noisy_wrappers, in the sweep and when its line is pasted.
-    (tmp_path / "redq_continuous_noisy.py").write_text(
-        "import noisy_wrappers\n\n\nclass Args:\n    pass\n\n\nraise SystemExit(print('found it') or 3)\n"
-    )
+    text = "import noisy_wrappers\nclass Args: pass\nprint('found it')\nraise SystemExit(3)\n"
+    (tmp_path / "redq_continuous_noisy.py").write_text(text)
     own = ["baseline", "--algos", "redq", "--envs", "Pendulum-v1", "--seeds", "1"]
     swept = run(*own, cwd=tmp_path, script=ROOT / "benchmark.sh")
     assert swept.code == 1 and re.search(
