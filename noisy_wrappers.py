@@ -1862,22 +1862,26 @@ def different_arguments(
     names = [*config["args"], *(name for name in other["args"] if name not in config["args"])]
     differing = {}
     for name in names:
-        if name in may_differ:
-            continue
-        value = _argument(config, other, name)
-        others = _argument(other, config, name)
-        if json.dumps(value, sort_keys=True) != json.dumps(others, sort_keys=True):
-            differing[name] = (value, others)
+        values = _argument(config, other, name), _argument(other, config, name)
+        if name not in may_differ and json.dumps(values[0]) != json.dumps(values[1]):
+            differing[name] = values
     return differing
 
 
 def _argument(config: Mapping[str, Any], other: Mapping[str, Any], name: str) -> Any:
     """Return a run's argument as JSON has it, or its default if only the other run has it."""
     if name in config["args"]:
-        value = config["args"][name]
-    else:
-        value = other.get("defaults", other["args"]).get(name)
-    return json.loads(json.dumps(value, default=str))  # a path as its text, a tuple as a list
+        return as_json(config["args"][name])
+    return as_json(other.get("defaults", other["args"]).get(name))
+
+
+def as_json(value: Any) -> Any:
+    """Return a value as JSON has it: a tuple is a list, a path its text.
+
+    >>> as_json({"noise": ("A()",), "runs_dir": Path("runs")})
+    {'noise': ['A()'], 'runs_dir': 'runs'}
+    """
+    return json.loads(json.dumps(value, default=str))
 
 
 def release(config: Mapping[str, Any]) -> str:
@@ -1890,6 +1894,136 @@ def release(config: Mapping[str, Any]) -> str:
     """
     version = config.get("versions", {}).get("noisy_wrappers", "0.3")
     return ".".join(str(version).split(".")[:2])
+
+
+def canonical_arguments(args: Mapping[str, Any]) -> dict[str, Any]:
+    """Check a script's arguments, {name: value}; return those that have one way to be written.
+
+    They are ``env_id``, with its version, and the noises and rates of training and of tests. The
+    module of "module:Env-v0" is imported.
+
+    Raises:
+        ValueError: a number out of its range (:func:`check_numbers`), a bad ``exp_name``, noise or
+            rate, or an environment that does not exist.
+    """
+    check_numbers(args)
+    if args["exp_name"] in ("", ".", ".."):
+        raise ValueError(f"--exp-name must be a name, not {args['exp_name']!r}")
+    parse_env_kwargs(args["env_kwargs"])
+    noises, rates = Configuration.read(args["noise"], args["noise_rate"]).texts
+    tests = Configuration.read(args["test_noise"], args["test_noise_rate"]).for_tests()
+    canonical = {"env_id": canonical_env_id(args["env_id"]), "noise": noises, "noise_rate": rates}
+    return canonical | {"test_noise": tests.texts[0], "test_noise_rate": tests.texts[1]}
+
+
+def run_folder(args: Mapping[str, Any]) -> Path:
+    """Return the folder of a run with these arguments of a script: :func:`run_name` in runs_dir."""
+    name = run_name(
+        args["env_id"],
+        args["exp_name"],
+        args["noise"],
+        args["noise_rate"],
+        args["seed"],
+        env_kwargs=args["env_kwargs"],
+        test_noise=args["test_noise"],
+        test_noise_rate=args["test_noise_rate"],
+    )
+    return Path(args["runs_dir"], name)
+
+
+def describe_run(
+    script: str, args: Mapping[str, Any], defaults: Mapping[str, Any], env: Env
+) -> dict[str, Any]:
+    """Return the content of a config.json: what a script runs, in which spaces, by which code.
+
+    ``script`` is the path of its file, whose name is NAME_continuous_noisy.py for an algorithm
+    NAME. ``args`` and ``defaults`` are its arguments and their defaults, by name.
+    """
+    path = Path(script)
+    describe = 'git describe --always --dirty --abbrev=40 --exclude="*"'
+    git = subprocess.run(describe, shell=True, cwd=path.parent, capture_output=True, text=True)
+    versions = {"noisy_wrappers": __version__, "python": sys.version.split()[0]}
+    package = type(env.unwrapped).__module__.partition(".")[0]
+    for name in ("numpy", "gymnasium", "mujoco", package):
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            versions[name] = importlib.metadata.version(name)
+    return {
+        "algorithm": path.stem.removesuffix("_continuous_noisy").upper(),
+        "script": path.name,
+        "script_sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "args": as_json(args),
+        "defaults": as_json(defaults),
+        "observation_space": _describe_space(env.observation_space),
+        "action_space": _describe_space(env.action_space),
+        "git_commit": git.stdout.strip() or None,
+        "versions": versions,
+    }
+
+
+def resumed_run(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of the config.json of a run that is resumed, where ``new`` would begin it.
+
+    It is the old one; of versions and scripts that have changed it has both, "2.12.0, 2.13.0".
+
+    Raises:
+        ValueError: it is a run of another algorithm, of another release, or with other arguments.
+    """
+    differing = different_arguments(old, new)
+    if old["algorithm"] != new["algorithm"]:
+        problem = f"a run of {old['algorithm']}, not of {new['algorithm']}"
+    elif release(old) != release(new):
+        problem = f"a run of version {release(old)}, whose numbers differ: finish it with that one"
+    elif differing:
+        texts = [f"{name} {value}, not {other}" for name, (value, other) in differing.items()]
+        problem = f"a run with {'; '.join(texts)}"
+    else:
+        names = ("script_sha256", "matmul_precision", "git_commit")
+        resumed = {**old, **{name: _both(old.get(name), new.get(name)) for name in names}}
+        old_versions = old.get("versions", {})
+        versions = {name: _both(old_versions.get(name), v) for name, v in new["versions"].items()}
+        return {**resumed, "versions": {**old_versions, **versions}}
+    advice = "choose another --exp-name or --runs-dir; --overwrite deletes that run"
+    raise ValueError(f"it holds {problem}: {advice}")
+
+
+def _both(old: Any, new: Any) -> Any:
+    """Return both of two texts, "2.12.0, 2.13.0", or the old one if it has the new one already."""
+    used = str(old).split(", ")
+    return old if str(new) in used else ", ".join([*used, str(new)])
+
+
+def _describe_space(space: gym.spaces.Box) -> dict[str, Any]:
+    """Return a Box for JSON: bounds that are all equal are one, and infinite ones are text."""
+    bounds: dict[str, Any] = {}
+    for name, bound in (("low", space.low), ("high", space.high)):
+        numbers = [number if math.isfinite(number) else str(number) for number in bound.tolist()]
+        bounds[name] = numbers[0] if len(set(numbers)) == 1 else numbers
+    return {"shape": list(space.shape), **bounds, "dtype": str(space.dtype)}
+
+
+class Spaces:
+    """The spaces that a run's config.json tells of, in place of its environment.
+
+    >>> box = {"shape": [2], "low": "-inf", "high": [1.0, 2.0], "dtype": "float32"}
+    >>> Spaces({"observation_space": box, "action_space": box}).action_space
+    Box(-inf, [1. 2.], (2,), float32)
+
+    Attributes:
+        observation_space: a Box of one dimension.
+        action_space: a Box of one dimension.
+    """
+
+    def __init__(self, config: Mapping[str, Any]):
+        """Raise KeyError for a run of version 0.3, whose config.json does not tell its spaces."""
+        self.observation_space = self._read(config["observation_space"])
+        self.action_space = self._read(config["action_space"])
+
+    @staticmethod
+    def _read(saved: Mapping[str, Any]) -> gym.spaces.Box:
+        shape, dtype = tuple(saved["shape"]), np.dtype(saved["dtype"])
+        low, high = np.array(saved["low"], float), np.array(saved["high"], float)
+        low, high = np.broadcast_to(low, shape), np.broadcast_to(high, shape)
+        return gym.spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype.type)
 
 
 # ------------------------------------------------------------------------------ numbers for people
@@ -2359,6 +2493,32 @@ def make_flat(env: Env, step_limit: int | None = None) -> Env:
     raise SpaceError(problem)
 
 
+def make_environments(
+    make_env: Callable[..., Env], args: Mapping[str, Any], test_seed: int
+) -> tuple[Env, Env]:
+    """Make a run's two environments by a script's ``make_env`` and arguments: training, test.
+
+    The one has the noise of the training, the other that of the tests, usually none. What their
+    constructors draw from the global generators depends on the run's seed, or on ``test_seed``.
+
+    Raises:
+        SpaceError: as :func:`make_flat`, or a noise cannot act in this environment.
+    """
+    kwargs = parse_env_kwargs(args["env_kwargs"])
+    kwargs["max_episode_steps"] = args["max_episode_steps"]
+    seed_globals(test_seed)
+    test_env = make_env(args["env_id"], **kwargs)
+    seed_globals(args["seed"])
+    env = make_env(args["env_id"], **kwargs)
+    try:
+        noisy_env = make_noisy(env, args["noise"], args["noise_rate"])
+        return noisy_env, make_noisy(test_env, args["test_noise"], args["test_noise_rate"])
+    except ValueError as error:
+        env.close()
+        test_env.close()
+        raise SpaceError(str(error)) from error
+
+
 def into_space(action: NDArray[Any], space: gym.spaces.Box) -> NDArray[Any]:
     """Return an action in its space's dtype and, to the last bit, within its bounds.
 
@@ -2496,6 +2656,28 @@ def kept_generators(env: Env | None = None) -> Iterator[None]:
     finally:
         for generator, stream in zip(generators, streams, strict=True):
             _set_stream(generator, stream)
+
+
+def play(
+    env: Env, policy: Callable[[NDArray[Any]], Any], episodes: int, seed: int
+) -> NDArray[np.float64]:
+    """Play test episodes, of which the first begins with ``reset(seed=seed)``, the next with + 1.
+
+    ``env`` records its returns (:func:`make_noisy`); ``policy`` gives the action for an
+    observation. Returns an array (episodes, 3): the true return of each, its length, and its
+    :func:`outcome`. The global generators are seeded for each episode, and restored afterwards.
+    """
+    results = np.zeros((episodes, 3))
+    with kept_generators(env):
+        for episode in range(episodes):
+            seed_globals(seed + episode)
+            observation, info = env.reset(seed=seed + episode)
+            terminated = truncated = False
+            while not (terminated or truncated):
+                observation, _, terminated, truncated, info = env.step(policy(observation))
+            record = info["episode"]  # the return is a number or an array
+            results[episode] = np.asarray(record["r"]).item(), record["l"], outcome(info)
+    return results
 
 
 def outcome(info: Mapping[str, Any]) -> float:

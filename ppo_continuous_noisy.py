@@ -13,28 +13,23 @@ You can interrupt it at any time; run the same command again to resume.
 
 import contextlib
 import fcntl
+import functools
+import io
 import json
 import math
 import os
-import shlex
 import signal
 import sys
 import time
-import warnings
 import zipfile
-from collections import deque
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
-
-if __name__ == "__main__":  # Ctrl-C during the imports below ends the program without a traceback
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 import gymnasium as gym
 import numpy as np
 import torch
 import torch.nn as nn
-import tyro
 from torch.func import functional_call, grad_and_value
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
@@ -45,6 +40,7 @@ import noisy_wrappers as noisy
 TEST_SEED = 1_000_000  # of the first test episode; the same in every test of every run
 STEP_LIMIT = 10_000  # of an episode, where neither the environment nor the user sets one
 EVAL_FREQUENCY = 50_000  # default of --eval-frequency; at most a tenth of the run
+NUMBERS = (int, float, np.float64)  # which an update makes tensors of
 
 
 @dataclass
@@ -54,6 +50,7 @@ class Args:
     env_id: str = "HalfCheetah-v5"  # RUN: Gymnasium environment, Name-v0, or module:Name-v0
     seed: int = 1  # seed of everything that is random
     total_timesteps: int = 1_000_000  # environment steps, rounded down to whole rollouts
+    env_kwargs: tuple[str, ...] = ()  # arguments of the environment, each as name:value
     max_episode_steps: int | None = None  # time limit of an episode; None: the environment's own
     exp_name: str = Path(__file__).stem  # name of the experiment, part of the run folder's name
     runs_dir: str = "runs"  # folder in which the run's own folder is made
@@ -61,8 +58,11 @@ class Args:
     checkpoint_frequency: int = 50_000  # environment steps between two checkpoints
     noise: tuple[str, ...] = ()  # NOISE: noises of the training environment; the baseline has none
     noise_rate: tuple[float | str, ...] = ()  # probability of each noise; 1.0:0.0 falls linearly
-    eval_episodes: int = 10  # TESTS: episodes in each test
+    test_noise: tuple[str, ...] = ()  # TESTS: noises of the test environment; it has none
+    test_noise_rate: tuple[float, ...] = ()  # probability of each test noise
+    eval_episodes: int = 10  # episodes in each test
     eval_frequency: int | None = None  # steps between tests; None: up to 50,000; 0: only at the end
+    keep_policies: bool = False  # keep the policy of every test as policy_STEP.pt
 
     cuda: bool = False  # SPEED: train on a GPU (not tested on one yet); these networks are small
     torch_threads: int = 1  # CPU threads; runs in parallel gain more than extra threads
@@ -90,9 +90,8 @@ class Args:
 
 def make_env(env_id, **kwargs):
     """Make the clean environment: observations and actions are vectors, and every episode ends."""
-    with fail_on(noisy.refusals(env_id), f"--env-id {env_id}"):
-        env = gym.make(env_id, disable_env_checker=True, **kwargs)
-        return noisy.make_flat(env, STEP_LIMIT)
+    env = gym.make(env_id, disable_env_checker=True, **kwargs)
+    return noisy.make_flat(env, STEP_LIMIT)
 
 
 def mlp(inputs, outputs, std):
@@ -102,12 +101,6 @@ def mlp(inputs, outputs, std):
         nn.init.orthogonal_(layer.weight, gain)
         nn.init.zeros_(layer.bias)
     return nn.Sequential(layers[0], nn.Tanh(), layers[1], nn.Tanh(), layers[2])
-
-
-def in_numpy(network):
-    """Return an mlp as a NumPy function of one observation, several times faster than PyTorch."""
-    w1, b1, w2, b2, w3, b3 = (parameter.cpu().numpy() for parameter in network.parameters())
-    return lambda x: w3 @ np.tanh(w2 @ np.tanh(w1 @ x + b1) + b2) + b3
 
 
 class Agent(nn.Module):
@@ -127,40 +120,57 @@ class Agent(nn.Module):
         entropy = (self.actor_logstd + 0.5 + 0.5 * math.log(2 * math.pi)).sum()
         return log_prob, entropy, self.critic(observations).squeeze(1)
 
+    def acting(self):
+        """Return the policy's mean as a function, NumPy to NumPy, and its standard deviation."""
+        return in_numpy(self.actor_mean), self.actor_logstd.exp().cpu().numpy()
+
 
 class Saved:
-    """Base of a class whose attributes, numbers and arrays, all go into a checkpoint."""
+    """Base of a class whose attributes, numbers and arrays, are all saved."""
 
     def state_dict(self):
-        """Return the attributes as tensors that share the arrays' memory."""
-        return {name: torch.as_tensor(np.asarray(value)) for name, value in vars(self).items()}
+        """Return the attributes by name."""
+        return vars(self).copy()
 
     def load_state_dict(self, state):
-        """Restore a state_dict."""
-        vars(self).update({name: np.asarray(value)[()] for name, value in state.items()})
+        """Set the attributes."""
+        for name, value in state.items():
+            setattr(self, name, value)
 
 
 class Normalizer(Saved):
-    """Running mean and variance of the samples so far, as in Gymnasium's Normalize wrappers."""
+    """Running mean and variance of observations, as in Gymnasium's NormalizeObservation."""
 
     def __init__(self, shape):
-        # [()] makes a number of an array without dimensions, which is faster
-        self.mean, self.var, self.count = np.zeros(shape)[()], np.ones(shape)[()], 1e-4
+        self.mean, self.var, self.count = np.zeros(shape), np.ones(shape), 1e-4
 
-    def update(self, sample):
-        """Take one sample into account."""
-        delta, total = sample - self.mean, self.count + 1
+    def update(self, observation):
+        """Take one observation into account."""
+        delta, total = observation - self.mean, self.count + 1
         self.mean += delta / total
         self.var += (delta * delta * (self.count / total) - self.var) / total
         self.count = total
 
-    def scale(self, x):
-        """Return x in standard deviations, at most 10 of them."""
-        return (x / np.sqrt(self.var + 1e-8)).clip(-10, 10).astype(np.float32)
+    def normalize(self, observation):
+        """Return the distance from the mean in standard deviations, at most 10 of them."""
+        scaled = (observation - self.mean) / np.sqrt(self.var + 1e-8)
+        return scaled.clip(-10, 10).astype(np.float32)
 
-    def normalize(self, x):
-        """Return the distance of x from the mean, scaled."""
-        return self.scale(x - self.mean)
+
+class RewardScaler(Saved):
+    """Running variance of the discounted return, as in Gymnasium's NormalizeReward, in floats."""
+
+    def __init__(self):
+        self.discounted_return, self.mean, self.var, self.count = 0.0, 0.0, 1.0, 1e-4
+
+    def scale(self, reward, terminated, gamma):
+        """Take a reward into account; return it in standard deviations, at most 10 of them."""
+        self.discounted_return = self.discounted_return * gamma * (1 - terminated) + reward
+        delta, total = self.discounted_return - self.mean, self.count + 1
+        self.mean += delta / total
+        self.var += (delta * delta * (self.count / total) - self.var) / total
+        self.count = total
+        return max(-10.0, min(10.0, reward / math.sqrt(self.var + 1e-8)))
 
 
 class Rollout(Saved):
@@ -170,11 +180,6 @@ class Rollout(Saved):
         self.observations = np.zeros((steps + 1, *env.observation_space.shape), np.float32)
         self.eps, self.actions = np.zeros((2, steps, *env.action_space.shape), np.float32)
         self.rewards, self.dones = np.zeros((2, steps), np.float32)  # done: ended in whatever way
-        self.discounted_return = 0.0
-
-    def state_dict(self):
-        """Return the arrays as tensors that share their memory, and the discounted return."""
-        return super().state_dict() | {"discounted_return": float(self.discounted_return)}
 
 
 def compute_gae(rewards, values, dones, gamma, gae_lambda):
@@ -191,15 +196,16 @@ def compute_gae(rewards, values, dones, gamma, gae_lambda):
     return torch.tensor(advantages)
 
 
-# LOSS: a pure function of the agent's parameters and a minibatch -> the loss, and curves
+# LOSS. The first argument is the network that is learned: the gradient is that of its parameters.
+# It returns (loss, {curve: value}).
 
 
-def ppo_loss(params, agent, minibatch, args):
+def ppo_loss(agent, minibatch, args):
     """Clipped surrogate, clipped value loss and entropy."""
     observations, actions, old_log_probs, advantages, returns, old_values = minibatch
     if args.norm_adv:
         advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-    log_probs, entropy, values = functional_call(agent, params, (observations, actions))
+    log_probs, entropy, values = agent(observations, actions)
     log_ratio = log_probs - old_log_probs
     ratio = log_ratio.exp()
     clipped_ratio = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
@@ -216,66 +222,50 @@ def ppo_loss(params, agent, minibatch, args):
     return policy_loss - args.ent_coef * entropy + args.vf_coef * value_loss, curves
 
 
-def updater(loss, network, optimizer, args):
-    """Return update(*inputs) -> curves: one optimizer step on loss(network parameters, *inputs)."""
-    parameters = dict(network.named_parameters())
-
-    def clipped_gradient(parameters, *inputs):
-        gradient, (_, curves) = grad_and_value(loss, has_aux=True)(parameters, *inputs)
-        norm = torch.stack([value.norm() for value in gradient.values()]).norm()
-        scale = (args.max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
-        return {name: value * scale for name, value in gradient.items()}, curves
-
-    if args.compile:
-        clipped_gradient = torch.compile(clipped_gradient, fullgraph=True, dynamic=False)
-
-    def update(*inputs):
-        gradient, curves = clipped_gradient(parameters, *inputs)
-        for name, parameter in parameters.items():
-            # contiguous: the fused Adam of PyTorch 2.13 misreads any other strides, in silence
-            parameter.grad = gradient[name].contiguous()
-        optimizer.step()
-        return curves
-
-    return update
-
-
-def make_policy(agent, observation_stats, env):
-    """Return the test policy, NumPy to NumPy: mean actions, observation statistics as they are."""
-    act, normalize = in_numpy(agent.actor_mean), observation_stats.normalize
-    return lambda observation: noisy.into_space(act(normalize(observation)), env.action_space)
-
-
+@torch.no_grad()  # updater() takes the gradients; nothing else needs any
 def learn(args, env, test_env, stop):
     """Train one agent; return False if stop(), asked whenever an episode ends, ended it early."""
-    torch.set_num_threads(args.torch_threads)
+    least, most = 2 * args.num_minibatches, args.total_timesteps
+    if not least <= args.num_steps <= most:
+        limits = f"2 * --num-minibatches ({least}) to --total-timesteps ({most})"
+        fail(f"--num-steps must be from {limits}, not {args.num_steps}")
     device = torch.device("cuda" if args.cuda else "cpu")
-    run = Run(args, "PPO", use_matmul_precision(args.matmul_precision, device), env)
+    run = Run(args, env)
     if run.is_finished:
         return True
-    if remark := noisy.remark_on_bounds(args.env_id, env.action_space):
-        say(remark)
 
-    # SETUP: torch.func differentiates the losses, so autograd need not follow the networks
+    # SETUP
     torch.manual_seed(args.seed)
     rng = np.random.default_rng(args.seed)
     env.action_space.seed(args.seed)  # an environment may draw from it
     observation, _ = env.reset(seed=args.seed)
     total_steps = args.total_timesteps // args.num_steps * args.num_steps
     rollout = Rollout(args.num_steps, env)
-    observation_stats, return_stats = Normalizer(observation.shape), Normalizer(())
-    agent = Agent(env).requires_grad_(False).to(device)
+    observation_stats, reward_scaler = Normalizer(observation.shape), RewardScaler()
+    agent = Agent(env).to(device)
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     update = updater(ppo_loss, agent, optimizer, args)
 
-    # RESUME: between two episodes an environment is no more than its EnvState
-    state = [agent, optimizer, rollout, observation_stats, return_stats]
-    start = run.resume([*state, noisy.EnvState(env, rng)])
+    # CHECK: in NumPy the agent acts as in PyTorch it learns, so log-probabilities are those of eps
+    act, std = agent.acting()
+    eps = torch.randn(8, *env.action_space.shape)
+    inputs = torch.randn(8, *env.observation_space.shape)
+    actions = np.stack([act(x) for x in inputs.numpy()]) + std * eps.numpy()
+    log_probs, _, _ = agent(inputs.to(device), torch.from_numpy(actions).to(device))
+    expected = (-0.5 * eps.square() - 0.5 * math.log(2 * math.pi)).sum(1) - np.log(std).sum()
+    if (log_probs.cpu() - expected).abs().max() > 1e-3:
+        fail("the agent acts with one policy and learns another: see acting() and forward()", 1)
+
+    # RESUME: all that training changes belongs in `state`. What is missing there starts afresh when
+    # the run is resumed, and nothing says so (tools/check_script.py finds out).
+    state = {"agent": agent, "optimizer": optimizer, "rollout": rollout}
+    state |= {"observation_stats": observation_stats, "reward_scaler": reward_scaler}
+    start = run.resume(state | {"env": noisy.EnvState(env, rng)})
     if start > 0:
         noisy.set_progress(env, start / total_steps)
         observation, _ = env.reset()
 
-    act, std = in_numpy(agent.actor_mean), agent.actor_logstd.exp().cpu().numpy()
+    act, std = agent.acting()
     observation_stats.update(observation)
     # one loop over steps and not two, over rollouts and steps: a run may resume within a rollout
     for global_step in range(start + 1, total_steps + 1):
@@ -293,10 +283,7 @@ def learn(args, env, test_env, stop):
         observation_stats.update(observation)
 
         # STORE
-        rollout.discounted_return *= args.gamma * (1 - terminated)
-        rollout.discounted_return += reward
-        return_stats.update(rollout.discounted_return)
-        rollout.rewards[step] = return_stats.scale(reward)
+        rollout.rewards[step] = reward_scaler.scale(reward, terminated, args.gamma)
         rollout.dones[step] = terminated or truncated
         if args.bootstrap_truncated and truncated and not terminated:
             value = in_numpy(agent.critic)(observation_stats.normalize(observation))
@@ -325,11 +312,11 @@ def learn(args, env, test_env, stop):
                 order = torch.from_numpy(rng.permutation(args.num_steps)).to(device)
                 shuffled = [tensor[order].tensor_split(args.num_minibatches) for tensor in batch]
                 for minibatch in zip(*shuffled, strict=True):
-                    curves = update(agent, minibatch, args)
+                    curves = update(minibatch, args)
                     clipfracs.append(curves["clipfrac"])
                 if args.target_kl is not None and curves["approx_kl"] > args.target_kl:
                     break
-            act, std = in_numpy(agent.actor_mean), agent.actor_logstd.exp().cpu().numpy()
+            act, std = agent.acting()
 
             curves["clipfrac"] = torch.stack(clipfracs).mean()
             curves["explained_variance"] = 1 - (returns - values).var() / returns.var().clamp(1e-8)
@@ -340,10 +327,11 @@ def learn(args, env, test_env, stop):
             due = global_step - global_step % max(1, args.eval_frequency)
             if done or (args.eval_frequency > 0 and due > global_step - args.num_steps):
                 policy = make_policy(agent, observation_stats, env)
-                results = evaluate(policy, test_env, args.eval_episodes, stop)
-                if results is None:
-                    return False
-                run.log_test(args.total_timesteps if done else due, results)
+                results = noisy.play(test_env, policy, args.eval_episodes, TEST_SEED)
+                due = args.total_timesteps if done else due
+                saved = {"agent": agent.state_dict()}
+                saved["observation_stats"] = observation_stats.state_dict()
+                run.log_test(global_step, results, saved, due)
 
         # NEXT EPISODE
         if terminated or truncated:
@@ -359,21 +347,104 @@ def learn(args, env, test_env, stop):
             observation, _ = env.reset()
             observation_stats.update(observation)
 
-    saved = {"agent": agent.state_dict(), "observation_stats": observation_stats.state_dict()}
-    run.finish(global_step, saved)
+    run.finish(global_step)
     return True
 
 
-def load_policy(run_dir, env):
-    """Return the policy of a finished run."""
-    saved = torch.load(Path(run_dir, "policy.pt"), "cpu", weights_only=True)
+def make_policy(agent, observation_stats, env):
+    """Return the test policy, NumPy to NumPy: mean actions, observation statistics as they are."""
+    act, normalize = in_numpy(agent.actor_mean), observation_stats.normalize
+    return lambda observation: noisy.into_space(act(normalize(observation)), env.action_space)
+
+
+def load_policy(run_dir, env=None):
+    """Return the policy of a run's last test; `env` is for runs of 0.3, which tell no spaces."""
+    config = json.loads(Path(run_dir, "config.json").read_text())
+    env = env or noisy.Spaces(config)
     agent, observation_stats = Agent(env), Normalizer(env.observation_space.shape)
+    saved = read_state(Path(run_dir, "policy.pt"))
     agent.load_state_dict(saved["agent"])
-    observation_stats.load_state_dict(saved["observation_stats"])
-    return make_policy(agent.requires_grad_(False), observation_stats, env)
+    stats = {name: np.array(value) for name, value in saved["observation_stats"].items()}
+    observation_stats.load_state_dict(stats)
+    return make_policy(agent, observation_stats, env)
 
 
-# THE RUN: arguments, tests, speed, files; word for word the same in the three scripts.
+# UPDATES: how a loss becomes a step of an optimizer, and a network a function in NumPy
+
+
+class Learned(nn.Module):
+    """A loss and the network that it learns, whose parameters torch.func exchanges."""
+
+    def __init__(self, loss, network):
+        super().__init__()
+        self.loss, self.network = loss, network
+
+    def forward(self, *inputs):
+        """Return what the loss returns."""
+        return self.loss(self.network, *inputs)
+
+
+def updater(loss, network, optimizer, args):
+    """Return update(*inputs) -> curves: one step of the optimizer on loss(network, *inputs).
+
+    Numbers among the inputs may change from one update to the next. The optimizer may be any whose
+    step() needs no closure. Taking the gradient in the compiled graph is faster than backward().
+    """
+    learned = Learned(loss, network)
+    parameters = {name: p for name, p in learned.named_parameters() if p.requires_grad}
+
+    def clipped_gradient(parameters, inputs):
+        call = functools.partial(functional_call, learned)
+        gradient, (_, curves) = grad_and_value(call, has_aux=True)(parameters, inputs)
+        norm = torch.stack([value.norm() for value in gradient.values()]).norm()
+        scale = (args.max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
+        return {name: value * scale for name, value in gradient.items()}, curves
+
+    gradient_of = compiled(clipped_gradient) if args.compile else clipped_gradient
+
+    def update(*inputs):
+        # a compiled graph would keep a number, and be compiled again for every other one
+        inputs = [torch.tensor(float(x)) if type(x) in NUMBERS else x for x in inputs]
+        gradient, curves = gradient_of(parameters, tuple(inputs))
+        for name, parameter in parameters.items():
+            # contiguous: the fused Adam of PyTorch 2.13 misreads any other strides, in silence
+            parameter.grad = gradient[name].contiguous()
+        optimizer.step()
+        return curves
+
+    return update
+
+
+def relu(x):
+    """Return the positive part of an array."""
+    return np.maximum(x, 0)
+
+
+def in_numpy(network):
+    """Return a network as a function of one observation, NumPy to NumPy.
+
+    Linear, Tanh and ReLU are computed in NumPy, several times faster than in PyTorch. A network
+    that has anything else is called as it is.
+    """
+    layers = []
+    for layer in network if isinstance(network, nn.Sequential) else [network]:
+        if type(layer) is nn.Linear and layer.bias is not None and not layer._forward_pre_hooks:
+            layers.append((layer.weight.numpy(force=True), layer.bias.numpy(force=True), None))
+        elif type(layer) in (nn.Tanh, nn.ReLU):
+            layers.append((None, None, np.tanh if type(layer) is nn.Tanh else relu))
+        else:
+            device = next(network.parameters()).device
+            return lambda x: network(torch.from_numpy(x).to(device)).numpy(force=True)
+
+    def call(x):
+        for weight, bias, function in layers:
+            x = weight @ x + bias if function is None else function(x)
+        return x
+
+    return call
+
+
+# THE RUN: its environments, its folder, signals; word for word the same in the three scripts
 
 
 def fail(message, code=2):
@@ -384,343 +455,295 @@ def fail(message, code=2):
 
 @contextlib.contextmanager
 def fail_on(errors, message, code=2):
-    """Turn such errors into one line, the message and what the error says; note it on others."""
+    """Turn these errors into one line: the message, and what the error says."""
     try:
         yield
     except errors as error:
-        fail(f"{message}: {noisy.reason(error)}", code)
-    except Exception as error:  # of the environment, say: its traceback is what the user needs
-        error.add_note(f"({message})")
-        raise
+        fail(f"{message}: {' '.join(str(error).split()) or type(error).__name__}", code)
 
 
 def say(text):
     """Print a line; training goes on if its reader has left, as in `... | head`."""
     try:
         print(text, flush=True)
-    except OSError:  # of a pipe, or of a terminal
+    except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def read_args():
-    """Read the command line; a whole number may be written as 1e6."""
-    words = sys.argv[1:]
-    for i, word in enumerate(words):
-        flag, equals, number = word.partition("=") if word.startswith("--") else ("", "", word)
-        is_name = (flag or words[i - 1]).replace("_", "-") in ("--exp-name", "--runs-dir")
-        with contextlib.suppress(ValueError):  # it is no number
-            if "e" in number.lower() and float(number).is_integer() and not is_name:
-                words[i] = f"{flag}{equals}{float(number):.0f}"
-    noises = "\n  ".join(["Noises:", *noisy.signatures()])
-    return tyro.cli(Args, args=words, description=f"{__doc__}\n{noises}")
+def compiled(function):
+    """Compile a function as one graph; where that fails, say why and go on without."""
+    graph = torch.compile(function, fullgraph=True, dynamic=False)
+
+    def call(*inputs):
+        nonlocal graph
+        try:
+            return graph(*inputs)
+        except torch._dynamo.exc.FailOnRecompileLimitHit:
+            fail("a number that a loss reads from args changes too often: pass it to the update", 1)
+        except torch._dynamo.exc.TorchDynamoException as error:
+            cache = torch._inductor.runtime.cache_dir_utils.cache_dir()
+            say(f"not compiled, so it is slower: {error} (the compiler's cache is {cache})")
+            graph = function
+            return function(*inputs)
+
+    return call
 
 
-def train(args, stop=lambda: False):
+def train(args, stop=lambda: 0):
     """Train one agent and close its environments; return False if stop() ended it early."""
-    if args.exp_name in ("", ".", ".."):
-        fail(f"--exp-name must be a name, not {args.exp_name!r}")
     if args.cuda and not torch.cuda.is_available():
         fail("--cuda: PyTorch finds no GPU; leave it out to run on the CPU")
     try:
-        noisy.check_numbers(asdict(args))
-        env_id = noisy.canonical_env_id(args.env_id)
-        noise, noise_rate = noisy.Configuration.read(args.noise, args.noise_rate).texts
+        args = replace(args, **noisy.canonical_arguments(asdict(args)))
     except ValueError as error:
         fail(error)
-    limit = {"max_episode_steps": args.max_episode_steps}
-    noisy.seed_globals(TEST_SEED)  # a constructor may draw, too: all runs have the same tests
-    with make_env(env_id, **limit) as test_env:
-        noisy.seed_globals(args.seed)
-        with make_env(env_id, **limit) as env:
-            where = f"--noise in {env_id}" if noise else f"--env-id {env_id}"
-            with fail_on(ValueError, where), warnings.catch_warnings(record=True) as notes:
-                env = noisy.make_noisy(env, noise, noise_rate)
-            told = [note.message for note in notes]
-            for text in told + noisy.remarks(env_id, test_env, STEP_LIMIT):
-                say(text)
-            args = replace(args, env_id=env_id, noise=noise, noise_rate=noise_rate)
-            return learn(args, env, test_env, stop)
-
-
-def evaluate(policy, env, episodes, stop=lambda: False):
-    """Play test episodes -> (N, 3): returns, lengths, noisy.outcome; None if stopped."""
-    long = env.spec.max_episode_steps >= STEP_LIMIT  # there, and only there, stop() ends a test
-    results = np.zeros((episodes, 3))
-    with noisy.kept_generators(env):
-        for episode in range(episodes):
-            noisy.seed_globals(TEST_SEED + episode)
-            observation, _ = env.reset(seed=TEST_SEED + episode)
-            terminated = truncated = False
-            while not (terminated or truncated):
-                observation, reward, terminated, truncated, info = env.step(policy(observation))
-                results[episode, :2] += reward, 1
-                if long and stop():
-                    return None
-            results[episode, 2] = noisy.outcome(info)
-    return results
-
-
-def use_matmul_precision(precision, device):
-    """Set the precision of float32 products, but "highest" where accuracy is lost; return it."""
-    torch.set_float32_matmul_precision("highest" if precision == "bf16" else precision)
-    a, b = torch.randn(2, 256, 256, generator=torch.Generator().manual_seed(0)).to(device)
-    exact = a.double() @ b.double()
-    if torch.norm(a @ b - exact) > 1e-6 * torch.norm(exact):  # TF32; bf16 on a CPU with AMX
+    if args.eval_frequency is None:
+        args.eval_frequency = max(1, min(EVAL_FREQUENCY, args.total_timesteps // 10))
+    torch.compiler.reset()  # forget what earlier runs of this process compiled
+    torch.set_num_threads(args.torch_threads)
+    precision, with_amx = args.matmul_precision, torch.cpu.get_capabilities().get("amx_tile")
+    if with_amx or args.cuda or precision == "bf16":  # "medium" is bf16 with AMX, TF32 on a GPU
         precision = "highest"
-        torch.set_float32_matmul_precision(precision)
-    return precision
+    torch.set_float32_matmul_precision(precision)
+    with fail_on((gym.error.Error, noisy.SpaceError), f"--env-id {args.env_id}"):
+        env, test_env = noisy.make_environments(make_env, asdict(args), TEST_SEED)
+    with env, test_env:  # which closes them
+        return learn(args, env, test_env, stop)
 
 
 class Run:
     """The run's folder: what is written into it, and read again to resume."""
 
-    FILES = ("result.json", "checkpoint.pt", "policy.pt", "eval.csv", "config.json")
-    EVENTS = "events.out.tfevents.*"
+    FILES = ["result.json", "checkpoint.pt", "policy.pt", "policy_*.pt", "eval.csv", "config.json"]
+    FILES += ["robustness.csv", "events.out.tfevents.*", "*.tmp"]
 
-    def __init__(self, args, algorithm, precision, env):
-        """Open the folder; fail if another process uses it, or if it holds a different run."""
-        name = noisy.run_name(args.env_id, args.exp_name, args.noise, args.noise_rate, args.seed)
-        self.folder = Path(args.runs_dir, name)
-        self.args, self.start = args, time.monotonic() - 1e-6  # not 0 s ago: clocks may stand still
-        self.noise, self.returns = noisy.noise_wrappers(env), env.get_wrapper_attr("return_queue")
-        self.outcomes = deque(maxlen=100)  # of the last training episodes
+    def __init__(self, args, env):
+        """Open the folder; exit if another process uses it, or if it holds a different run."""
+        self.args, self.env = args, env
+        self.folder = noisy.run_folder(asdict(args))
         if self.folder.is_symlink():
             fail(f"{self.folder} is a link: remove it, or choose another --exp-name or --runs-dir")
-        with fail_on(OSError, "--runs-dir"):
-            self.folder.mkdir(parents=True, exist_ok=True)
-            lock = os.open(self.folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
-            self.lock = os.fdopen(lock)
-            with fail_on(BlockingIOError, f"{self.folder} is in use by another process"):
-                fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
-            result, self.checkpoint, *_, config = ours = [self.folder / f for f in self.FILES]
-            old = [path.with_suffix(".tmp") for path in ours]  # of a process that was killed
-            if args.overwrite:
-                old += [*ours, self.folder / "robustness.csv"]  # events: see resume()
-            for path in old:
-                path.unlink(missing_ok=True)
-        self.is_finished = result.exists()
-        if any(path.exists() for path in ours):
-            self.config = self._old_config(config, algorithm)
-        else:
-            if args.eval_frequency is None:
-                args.eval_frequency = max(1, min(EVAL_FREQUENCY, args.total_timesteps // 10))
-            self.config = {"algorithm": algorithm, "args": asdict(args)}
-        if self.is_finished:
-            with self._reading(result):
-                self.result = json.loads(result.read_text())
-                self._say_finished()
-            self.checkpoint.unlink(missing_ok=True)
-        else:
-            noises = " + ".join(map("{} at {}".format, args.noise, args.noise_rate))
-            begun = f"{algorithm} on {args.env_id} | noise: {noises or 'none (baseline)'}"
-            begun += f" | seed {args.seed} | {args.total_timesteps:,} steps"
-            say(f"{begun} | {'cuda' if args.cuda else 'cpu'} | {self.folder}")
-            for change in noisy.note_versions(self.config, precision):
-                say(change)
-            if args.compile:
-                say("compiling ...")
-                torch.compiler.reset()  # forget what earlier runs of this process compiled
-                noisy.clean_compiler_cache()
-
-    def _old_config(self, path, algorithm):
-        with self._reading(path):
-            config = json.loads(path.read_text())
-            # an argument that an older version did not have is no difference
-            old = asdict(self.args) | config["args"] | {"algorithm": config["algorithm"]}
-        if self.args.eval_frequency is None:
-            self.args.eval_frequency = old["eval_frequency"]
-        new = {"algorithm": algorithm} | asdict(self.args)
-        new = {name: new[name] for name in new if name not in noisy.MAY_DIFFER_IN_A_RUN}
-        differ = [f"{name} {old[name]}, not {new[name]}" for name in new if old[name] != new[name]]
-        if algorithm != old["algorithm"]:
-            differ = differ[:1]  # others may be due to the scripts' defaults
-        if differ:
-            advice = "choose another --exp-name or --runs-dir; --overwrite deletes that run"
-            fail(f"{self.folder} holds a run with {'; '.join(differ)}: {advice}")
-        return config
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.lock = (self.folder / ".lock").open("a")
+        with fail_on(BlockingIOError, f"{self.folder} is in use by another process"):
+            fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
+        if args.overwrite:
+            self._delete(*self.FILES)
+        self.config = noisy.describe_run(__file__, asdict(args), asdict(Args()), env)
+        self.config["versions"]["torch"] = torch.__version__
+        self.config["matmul_precision"] = torch.get_float32_matmul_precision()
+        self.is_finished = (self.folder / "result.json").exists()
+        config = self.folder / "config.json"
+        if config.exists():
+            with fail_on(ValueError, str(self.folder)):
+                self.config = noisy.resumed_run(json.loads(config.read_text()), self.config)
+        if "," in self.config["script_sha256"]:
+            say("the script has changed since the run began; if it matters, use --exp-name")
+        noises = " + ".join(map("{} at {}".format, args.noise, args.noise_rate)) or "no noise"
+        begun = f"{self.config['algorithm']} on {args.env_id}, {noises}, seed {args.seed}"
+        begun += " (compiles first, which takes a while)" if args.compile else ""
+        say(f"{self.folder} is finished" if self.is_finished else f"{begun}: {self.folder}")
 
     def resume(self, state):
-        """Restore the last checkpoint of the objects in a list; return its step, or 0."""
-        self.state, args, step, sizes = state, self.args, 0, {}
-        self.eval_csv = "step,episode,episodic_return,episodic_length\n"
-        if self.checkpoint.exists():
-            with self._reading(self.checkpoint):
-                step, sizes = self._load()
+        """Restore the last checkpoint of {name: object with a state_dict}; return its step, or 0.
+
+        A state_dict may hold tensors, NumPy's arrays and numbers, and Python's own types.
+        """
+        self.state, self.eval_csv = state, "step,episode,episodic_return,episodic_length,success\n"
+        step, seconds, processor_seconds, path = 0, 0.0, 0.0, self.folder / "checkpoint.pt"
+        if path.exists():
+            with fail_on(Exception, f"cannot read {path} (--overwrite starts afresh)"):
+                if zipfile.ZipFile(path).testzip():  # torch.load checks no checksums
+                    raise ValueError("it is damaged")
+                checkpoint = read_state(path)
+                for name, part in state.items():
+                    part.load_state_dict(checkpoint["state"][name])
+            torch.set_rng_state(checkpoint["torch"])
+            step, self.eval_csv = checkpoint["step"], checkpoint["eval_csv"]
+            seconds, processor_seconds = checkpoint["seconds"], checkpoint["processor_seconds"]
             say(f"resumed at step {step}")
+        else:
+            self._delete("events.out.tfevents.*")
+            for name, part in state.items():  # now, and not when it is needed
+                with fail_on(Exception, f"the state of {name!r} cannot be saved and read back"):
+                    file = io.BytesIO()
+                    torch.save(part.state_dict(), file)
+                    read_state(io.BytesIO(file.getvalue()))
         self._write("config.json", json.dumps(self.config, indent=2) + "\n")
         self._write("eval.csv", self.eval_csv)
-        with self._writing("events.*"):
-            # what was logged after the checkpoint is removed, and purged by a TensorBoard that runs
-            for path in self.folder.glob(self.EVENTS):
-                if path.name in sizes:
-                    os.truncate(path, min(path.stat().st_size, sizes[path.name]))
-                else:
-                    path.unlink()
-            self.writer = SummaryWriter(str(self.folder), purge_step=step + 1)
+        # TensorBoard drops what was logged after the checkpoint
+        self.writer = SummaryWriter(str(self.folder), purge_step=step + 1)
         if step == 0:
-            table = "".join(f"|{name}|{value}|\n" for name, value in asdict(args).items())
-            self.writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + table)
-            # for the table HPARAMS: what tells runs apart, and what they achieved
-            columns = {"env_id": args.env_id, "exp_name": args.exp_name, "seed": args.seed}
-            columns["noise"] = " + ".join(args.noise) or "none"
-            columns["noise_rate"] = " + ".join(map(str, args.noise_rate)) or "none"
-            metrics = "eval/episodic_return_mean", "charts/episodic_return", "eval/success_rate"
-            for summary in hparams(columns, dict.fromkeys(metrics, 0))[:2]:
-                self.writer.file_writer.add_summary(summary)
-        self.bar = tqdm(total=args.total_timesteps, initial=step, file=sys.stdout, disable=None)
-        self.saved_step, self.learning, self.last_test = step, None, ""
-        self.printed = time.monotonic() - 1e-6
-        self.begun = step, self.printed
+            self._log_hyperparameters()
+        total = self.args.total_timesteps
+        self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None, smoothing=0)
+        self.saved_step, self.last_test, self.printed = step, "", time.monotonic()
+        self.learning_since = None  # the step and the time of the first losses
+        self.wall_begun = time.monotonic() - seconds
+        self.processor_begun = time.process_time() - processor_seconds
         return step
 
-    def _load(self):
-        if zipfile.ZipFile(self.checkpoint).testzip():  # torch.load checks no checksums
-            raise ValueError("it is damaged")
-        checkpoint = torch.load(self.checkpoint, weights_only=True)
-        if checkpoint["format"] != 5:
-            raise ValueError("another version wrote it: finish the run with that version")
-        if checkpoint["run"] != self.folder.name:
-            raise ValueError(f"it belongs to {checkpoint['run']}")
-        for part, state in zip(self.state, checkpoint["state"], strict=True):
-            part.load_state_dict(state)
-        torch.set_rng_state(checkpoint["torch"])
-        self.eval_csv = checkpoint["eval_csv"]
-        self.outcomes.extend(checkpoint.get("outcomes", []))
-        self.start = time.monotonic() - checkpoint["seconds"]
-        return checkpoint["step"], checkpoint["events"]
+    def _log_hyperparameters(self):
+        """Log all arguments as a table, and as columns of HPARAMS with what they achieve."""
+        args = {name: str(value) for name, value in asdict(self.args).items()}
+        table = "".join(f"|{name}|{value}|\n" for name, value in args.items())
+        self.writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + table)
+        metrics = ["eval/episodic_return_mean", "charts/episodic_return", "eval/success_rate"]
+        experiment, session_start, _ = hparams(args, dict.fromkeys(metrics, 0))
+        self.writer.file_writer.add_summary(experiment)
+        self.writer.file_writer.add_summary(session_start)
 
     def save(self, step):
         """Write a checkpoint: all that resuming needs, between two episodes."""
-        with self._writing("events.*"):
-            self.writer.flush()  # to be no older than the checkpoint
+        self.writer.flush()  # to be no older than the checkpoint
         checkpoint = {
-            "format": 5,
-            "run": self.folder.name,
             "step": step,
-            "state": [part.state_dict() for part in self.state],
+            "state": {name: part.state_dict() for name, part in self.state.items()},
             "torch": torch.get_rng_state(),
             "eval_csv": self.eval_csv,
-            "outcomes": list(self.outcomes),
-            "events": {path.name: path.stat().st_size for path in self.folder.glob(self.EVENTS)},
-            "seconds": time.monotonic() - self.start,
+            "seconds": time.monotonic() - self.wall_begun,
+            "processor_seconds": time.process_time() - self.processor_begun,
         }
         self._write("checkpoint.pt", checkpoint)
         self.saved_step = step
 
     def log(self, step, **groups):
         """Log numbers as group/name to TensorBoard, and the speed; show the progress."""
-        tags = {f"{g}/{n}": float(x) for g, values in groups.items() for n, x in values.items()}
-        now = time.monotonic()
-        if "losses" in groups and self.learning:
-            tags["charts/SPS"] = (step - self.learning[0]) / (now - self.learning[1])
+        tags, now = {}, time.monotonic()
+        for group, values in groups.items():
+            tags |= {f"{group}/{name}": float(value) for name, value in values.items()}
+        if "losses" in groups and self.learning_since:
+            first_step, since = self.learning_since
+            tags["charts/SPS"] = (step - first_step) / (now - since)
         elif "losses" in groups:  # the first ones: the time until now went into compiling
-            self.learning = step, now - 1e-6
+            self.learning_since = step, now
         if not all(map(math.isfinite, tags.values())):
             reason = f"step {step}: training diverged, some values are not finite: {tags}"
             raise noisy.NotFiniteError(reason)
-        with self._writing("events.*"):
-            for tag, value in tags.items():
-                self.writer.add_scalar(tag, value, step)
-        step = max(step, self.bar.n)  # PPO logs a test under the step at which it fell due
+        for tag, value in tags.items():
+            self.writer.add_scalar(tag, value, step)
+        self._show_progress(step, now)
+
+    def _show_progress(self, step, now):
+        """Move the bar of a terminal; elsewhere print a line after ten seconds, or after a test."""
         self.bar.update(step - self.bar.n)
         self.bar.n = step  # update() does nothing where there is no terminal
-        learned = self.learning and step > self.learning[0]
-        first_step, since = self.learning if learned else self.begun
         if self.bar.disable and now - self.printed > 10:
-            total, sps = self.bar.total, (step - first_step) / (now - since)
-            eta = tqdm.format_interval((total - step) / sps) if learned else "?"
+            first_step, since = self.learning_since or (step, now)
+            speed = (step - first_step) / max(now - since, 1e-6)
+            left = tqdm.format_interval((self.bar.total - step) / speed) if speed else "?"
             # analysis/folders.py reads this line
-            say(f"step={step}/{total} sps={sps:.0f} {self.last_test}eta={eta}")
+            say(f"step={step}/{self.bar.total} sps={speed:.0f} {self.last_test}eta={left}")
             self.printed = now
 
     def log_episode(self, step, info):
         """Log a training episode as the info of its last step tells it."""
-        self.outcomes.append(noisy.outcome(info))
         charts = {"episodic_return": info["episode"]["r"], "episodic_length": info["episode"]["l"]}
-        self.log(step, charts=charts | noisy.success_rate(self.outcomes))
+        self.log(step, charts=charts | noisy.success_rate([noisy.outcome(info)]))
 
-    def log_test(self, step, results):
-        """Log the (N, 3) returns, lengths and outcomes of a test that fell due at a step."""
-        told = ",success\n" in self.eval_csv  # by the environment, in an earlier test
-        success = noisy.success_rate(np.nan_to_num(results[:, 2]) if told else results[:, 2])
-        if success and not told:  # earlier tests, of which it said nothing, were no success
-            self.eval_csv = self.eval_csv.replace("\n", ",0\n").replace(",0", ",success", 1)
-        for i, (episodic_return, length, outcome) in enumerate(results.tolist()):
-            column = f",{outcome == 1:d}" if success else ""
-            self.eval_csv += f"{step},{i},{episodic_return},{length:.0f}{column}\n"
+    def log_test(self, step, results, policy, due=None):
+        """Log the (N, 3) returns, lengths and outcomes of a test, and save the policy.
+
+        eval.csv has the step at which the test fell `due`, if that was an earlier one.
+        """
+        due = due or step
+        for episode, (episodic_return, length, outcome) in enumerate(results.tolist()):
+            success = "" if math.isnan(outcome) else int(outcome)
+            self.eval_csv += f"{due},{episode},{episodic_return},{length:.0f},{success}\n"
+        if self.args.keep_policies:
+            self._write(f"policy_{due}.pt", policy | {"step": step})
+        self._write("policy.pt", policy | {"step": step})
         self._write("eval.csv", self.eval_csv)
         mean, length, _ = results.mean(0)
         std = results[:, 0].std(ddof=1) if len(results) > 1 else 0.0
-        test = {"return_mean": mean, "return_std": std}
-        self.result = {f"final_{name}": value for name, value in (test | success).items()}
-        self.last_test, self.printed = f"eval_return={noisy.rounded(mean, std)} ", -math.inf
-        self.last_test += "".join(f"{name}={rate:.2f} " for name, rate in success.items())
+        success = noisy.success_rate(results[:, 2])
+        self.result = {"final_return_mean": mean, "final_return_std": std}
+        self.result |= {f"final_{name}": rate for name, rate in success.items()}
+        self.last_test, self.printed = f"eval_return={mean:.2f} ", -math.inf
         self.bar.set_description_str(self.last_test)
-        test["length_mean"] = length
-        self.log(step, eval={f"episodic_{name}": x for name, x in test.items()} | success)
+        test = {"episodic_return_mean": mean, "episodic_return_std": std}
+        self.log(step, eval=test | {"episodic_length_mean": length} | success)
 
-    def finish(self, step, policy):
-        """Write policy.pt and, last of all, result.json; the checkpoint has served."""
-        seconds = time.monotonic() - self.start
-        with self._writing("events.*"):
-            self.writer.file_writer.add_summary(hparams({}, {})[2])  # HPARAMS: success
-            self.writer.close()
+    def finish(self, step):
+        """Write, last of all, result.json; the checkpoint has served."""
+        _, _, session_end = hparams({}, {})  # HPARAMS: its status is success
+        self.writer.file_writer.add_summary(session_end)
+        self.writer.close()
+        self.bar.close()
+        noises = noisy.noise_wrappers(self.env).items()
+        returns = self.env.get_wrapper_attr("return_queue")  # of the last 100 training episodes
+        seconds = time.monotonic() - self.wall_begun
         self.result |= {
             "final_return_n": self.args.eval_episodes,
             "total_timesteps": self.args.total_timesteps,
             "trained_timesteps": step,  # PPO: whole rollouts
-            "train_return_mean_last_100": np.mean(self.returns) if self.returns else None,
+            "train_return_mean_last_100": np.mean(returns) if returns else None,
             "steps_per_second": step / seconds,
             "wall_time_seconds": seconds,
-            "noise_applied_fraction": {n: w.applied_fraction for n, w in self.noise.items()},
-            "noise_applied": {n: [w.times_applied, w.opportunities] for n, w in self.noise.items()},
+            "processor_seconds": time.process_time() - self.processor_begun,
+            "noise_applied_fraction": {name: noise.applied_fraction for name, noise in noises},
+            "noise_applied": {name: [w.times_applied, w.opportunities] for name, w in noises},
         }
-        self._write("policy.pt", policy)
         self._write("result.json", json.dumps(self.result, indent=2) + "\n")
-        self.checkpoint.unlink(missing_ok=True)
-        self.bar.close()
-        self._say_finished()
+        self._delete("checkpoint.pt")
+        say(f"{self.folder} is finished: {self.last_test}")
+        say(f"See its curves with: tensorboard --logdir {self.args.runs_dir}")
 
-    def _say_finished(self):
-        mean, std = self.result["final_return_mean"], self.result["final_return_std"]
-        text = f"{self.folder} is finished: mean test return {noisy.rounded(mean, std)}"
-        rate = self.result.get("final_success_rate")
-        say(text if rate is None else f"{text}, success rate {rate:.2f}")
-        say(f"See its curves with: tensorboard --logdir {shlex.quote(self.args.runs_dir)}")
-
-    def _reading(self, path):
-        return fail_on(Exception, f"cannot read {path} (if damaged, --overwrite starts afresh)")
-
-    def _writing(self, name):
-        return fail_on((OSError, RuntimeError), f"cannot write {self.folder / name}", code=1)
+    def _delete(self, *patterns):
+        for pattern in patterns:
+            for path in self.folder.glob(pattern):
+                path.unlink()
 
     def _write(self, name, content):
         # whole or not at all: a kill or a full disk leaves the previous file
-        temporary = (self.folder / name).with_suffix(".tmp")
-        try:
-            with self._writing(name), open(temporary, "wb") as file:
-                if isinstance(content, str):
-                    file.write(content.encode())
-                else:
-                    torch.save(content, file)
-                file.flush()
-                os.fsync(file.fileno())
-                temporary.replace(self.folder / name)
-        finally:
-            temporary.unlink(missing_ok=True)
+        temporary = self.folder / f"{name}.tmp"
+        with open(temporary, "wb") as file:
+            if isinstance(content, str):
+                file.write(content.encode())
+            else:
+                torch.save(content, file)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(self.folder / name)
+
+
+def read_state(file):
+    """Read a checkpoint, which may hold NumPy's arrays and numbers, but no code."""
+    numpy, types = np._core.multiarray, {type(np.dtype(code)) for code in np.typecodes["All"]}
+    types |= {np.ndarray, np.dtype, numpy._reconstruct, numpy.scalar, bytes}
+    with torch.serialization.safe_globals(list(types)):
+        return torch.load(file, weights_only=True)
+
+
+def stop_at_signals():
+    """Answer signals at the end of an episode: return stop() -> the first one's number, or 0."""
+    received, script = [], os.getpid()
+
+    def remember(number, frame):
+        if os.getpid() != script:  # a process that the environment has forked
+            if number != signal.SIGINT:  # Ctrl-C is for the script
+                os._exit(128 + number)
+            return
+        received.append(number)
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # a second Ctrl-C ends the program at once
+        with contextlib.suppress(OSError):  # print() is not safe in here
+            os.write(1, b"stopping after this episode; Ctrl-C again stops without a checkpoint\n")
+
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        if signal.getsignal(number) != signal.SIG_IGN:  # as nohup has it
+            signal.signal(number, remember)
+    return lambda: received[0] if received else 0
 
 
 if __name__ == "__main__":
-    stop = noisy.stop_at_signals()
+    import tyro  # only here: whoever plays a policy does not need it
+
+    stop = stop_at_signals()
     sys.path.append(os.getcwd())  # for what the module of --env-id module:Name-v0 imports
-    finished = False
-    try:
-        with fail_on((noisy.NotFiniteError, noisy.SpaceError), "training stopped", code=1):
-            finished = train(read_args(), stop)
-    except Exception as error:
-        if not stop():  # the environment's processes may have got the signal, too
-            noisy.start_again_if_not_compiled(error)
-            raise
+    noises = "\n  ".join(["Noises:", *noisy.signatures()])
+    args = tyro.cli(Args, description=f"{__doc__}\n{noises}")
+    with fail_on((noisy.NotFiniteError, noisy.SpaceError), "training stopped", code=1):
+        finished = train(args, stop)
     if not finished:
         say("stopped; run the same command again to resume")
         raise SystemExit(128 + stop())

@@ -13,28 +13,23 @@ You can interrupt it at any time; run the same command again to resume.
 
 import contextlib
 import fcntl
+import functools
+import io
 import json
 import math
 import os
-import shlex
 import signal
 import sys
 import time
-import warnings
 import zipfile
-from collections import deque
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
-
-if __name__ == "__main__":  # Ctrl-C during the imports below ends the program without a traceback
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 import gymnasium as gym
 import numpy as np
 import torch
 import torch.nn as nn
-import tyro
 from torch.func import functional_call, grad_and_value
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
@@ -45,6 +40,7 @@ import noisy_wrappers as noisy
 TEST_SEED = 1_000_000  # of the first test episode; the same in every test of every run
 STEP_LIMIT = 10_000  # of an episode, where neither the environment nor the user sets one
 EVAL_FREQUENCY = 10_000  # default of --eval-frequency; at most a tenth of the run
+NUMBERS = (int, float, np.float64)  # which an update makes tensors of
 
 
 @dataclass
@@ -54,6 +50,7 @@ class Args:
     env_id: str = "HalfCheetah-v5"  # RUN: Gymnasium environment, Name-v0, or module:Name-v0
     seed: int = 1  # seed of everything that is random
     total_timesteps: int = 1_000_000  # environment steps to train for
+    env_kwargs: tuple[str, ...] = ()  # arguments of the environment, each as name:value
     max_episode_steps: int | None = None  # time limit of an episode; None: the environment's own
     exp_name: str = Path(__file__).stem  # name of the experiment, part of the run folder's name
     runs_dir: str = "runs"  # folder in which the run's own folder is made
@@ -61,8 +58,11 @@ class Args:
     checkpoint_frequency: int = 50_000  # environment steps between two checkpoints
     noise: tuple[str, ...] = ()  # NOISE: noises of the training environment; the baseline has none
     noise_rate: tuple[float | str, ...] = ()  # probability of each noise; 1.0:0.0 falls linearly
-    eval_episodes: int = 10  # TESTS: episodes in each test
+    test_noise: tuple[str, ...] = ()  # TESTS: noises of the test environment; it has none
+    test_noise_rate: tuple[float, ...] = ()  # probability of each test noise
+    eval_episodes: int = 10  # episodes in each test
     eval_frequency: int | None = None  # steps between tests; None: up to 10,000; 0: only at the end
+    keep_policies: bool = False  # keep the policy of every test as policy_STEP.pt
 
     cuda: bool = False  # SPEED: train on a GPU (not tested on one yet); these networks are small
     torch_threads: int = 1  # CPU threads; runs in parallel gain more than extra threads
@@ -85,51 +85,28 @@ class Args:
 
 def make_env(env_id, **kwargs):
     """Make the clean environment: observations and actions are vectors, and every episode ends."""
-    with fail_on(noisy.refusals(env_id), f"--env-id {env_id}"):
-        env = gym.make(env_id, disable_env_checker=True, **kwargs)
-        return noisy.make_flat(env, STEP_LIMIT)
+    env = gym.make(env_id, disable_env_checker=True, **kwargs)
+    return noisy.make_flat(env, STEP_LIMIT)
 
 
-def mlp(linear, inputs, outputs):
+def mlp(inputs, outputs):
     """Two hidden layers of 256 rectified linear units."""
-    hidden = [linear(inputs, 256), nn.ReLU(), linear(256, 256), nn.ReLU()]
-    return nn.Sequential(*hidden, linear(256, outputs))
-
-
-def in_numpy(network, observation):
-    """Evaluate an mlp for one observation; for one, NumPy is several times faster than PyTorch."""
-    w1, b1, w2, b2, w3, b3 = (parameter.cpu().numpy() for parameter in network.parameters())
-    hidden = np.maximum(w1 @ np.asarray(observation, np.float32) + b1, 0)
-    return w3 @ np.maximum(w2 @ hidden + b2, 0) + b3
-
-
-class TwinLinear(nn.Module):
-    """Two nn.Linear at once, in one batched product: -> (2, B, outputs)."""
-
-    def __init__(self, inputs, outputs):
-        super().__init__()
-        q1, q2 = nn.Linear(inputs, outputs), nn.Linear(inputs, outputs)
-        self.weight = nn.Parameter(torch.stack([q1.weight.T, q2.weight.T]))
-        self.bias = nn.Parameter(torch.stack([q1.bias, q2.bias]).unsqueeze(1))
-
-    def forward(self, inputs):
-        """Apply both to the same inputs (B, inputs), or each to its own (2, B, inputs)."""
-        if self.weight.shape[2] == 1:  # a sum is faster than a product with one column
-            return (inputs * self.weight.mT).sum(2, keepdim=True) + self.bias
-        return inputs @ self.weight + self.bias
+    hidden = [nn.Linear(inputs, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU()]
+    return nn.Sequential(*hidden, nn.Linear(256, outputs))
 
 
 class Critic(nn.Module):
-    """Twin Q-functions of observations (B, O) and actions (B, A)."""
+    """Two Q-functions of observations (B, O) and actions (B, A)."""
 
     def __init__(self, env):
         super().__init__()
         inputs = env.observation_space.shape[0] + env.action_space.shape[0]
-        self.network = mlp(TwinLinear, inputs, 1)
+        self.networks = nn.ModuleList([mlp(inputs, 1), mlp(inputs, 1)])
 
     def forward(self, observations, actions):
-        """Return Q1 and Q2, the rows of (2, B)."""
-        return self.network(torch.cat([observations, actions], 1)).squeeze(2)
+        """Return a list of the values (B,) of each Q-function."""
+        inputs = torch.cat([observations, actions], 1)
+        return [network(inputs).squeeze(1) for network in self.networks]
 
 
 class Actor(nn.Module):
@@ -138,7 +115,7 @@ class Actor(nn.Module):
     def __init__(self, env):
         super().__init__()
         low, high = torch.Tensor(env.action_space.low), torch.Tensor(env.action_space.high)
-        self.network = mlp(nn.Linear, env.observation_space.shape[0], len(low))
+        self.network = mlp(env.observation_space.shape[0], len(low))
         self.action_space = env.action_space
         self.register_buffer("low", low)
         self.register_buffer("high", high)
@@ -151,74 +128,70 @@ class Actor(nn.Module):
         actions = actions * self.action_scale + self.action_bias
         return torch.clamp(actions, self.low, self.high)
 
+    @torch.no_grad()
     def policy(self, observation, eps=0.0):
         """Return the action for one observation, NumPy to NumPy."""
-        scale, bias = self.action_scale.cpu().numpy(), self.action_bias.cpu().numpy()
-        action = np.tanh(in_numpy(self.network, observation)) + eps
-        return noisy.into_space(action * scale + bias, self.action_space)
+        device = self.action_scale.device
+        observations = torch.as_tensor(observation, dtype=torch.float32, device=device)[None]
+        return noisy.into_space(self(observations, eps)[0].cpu().numpy(), self.action_space)
 
 
 class ReplayBuffer:
-    """The last `capacity` transitions, each observation stored once to halve the memory.
+    """The last steps, with each observation stored once: a row's next one is that of the next row.
 
-    The next observation of row i is that of row i + 1; where an episode ended it is `final[i]`.
+    The last observation of an episode has a row of its own, which is no step and is never drawn.
     """
 
-    ARRAYS = ("observations", "actions", "rewards", "terminated")
+    ARRAYS = ("observations", "actions", "rewards", "terminated", "is_step")
 
-    def __init__(self, capacity, env):
-        self.rows = capacity + 1  # one more for the newest next observation
-        self.position, self.size, self.final = 0, 0, {}
-        self.observations = np.zeros((self.rows, *env.observation_space.shape), np.float32)
-        self.actions = np.zeros((self.rows, *env.action_space.shape), np.float32)
-        self.rewards, self.terminated = np.zeros((2, self.rows), np.float32)
+    def __init__(self, rows, env):
+        self.rows, self.position, self.size = rows, 0, 0
+        self.observations = np.zeros((rows, *env.observation_space.shape), np.float32)
+        self.actions = np.zeros((rows, *env.action_space.shape), np.float32)
+        self.rewards, self.terminated = np.zeros((2, rows), np.float32)
+        self.is_step = np.zeros(rows, bool)
 
     def add(self, observation, action, reward, next_observation, terminated, truncated):
-        """Store one transition in place of the oldest."""
+        """Store a step in place of the oldest; the next one begins in the row after it."""
         row, next_row = self.position, (self.position + 1) % self.rows
         self.observations[row], self.observations[next_row] = observation, next_observation
         self.actions[row], self.rewards[row], self.terminated[row] = action, reward, terminated
-        self.final.pop(row, None)
-        if terminated or truncated:
-            self.final[row] = torch.from_numpy(self.observations[next_row].copy())
-        self.position, self.size = next_row, min(self.size + 1, self.rows - 1)
+        self.is_step[row], self.is_step[next_row] = True, False
+        self.position = (next_row + (terminated or truncated)) % self.rows
+        self.size = max(self.size, row + 1, next_row + 1)
 
     def sample(self, batch_size, rng):
         """Draw (s, a, r, s', terminated) uniformly: float32 tensors with batch_size rows."""
-        oldest = self.position - self.size
-        rows = (oldest + rng.integers(self.size, size=batch_size)) % self.rows
-        # take is twice as fast as [rows]
-        arrays = [getattr(self, name).take(rows, axis=0) for name in self.ARRAYS]
-        observations, actions, rewards, terminated = map(torch.from_numpy, arrays)
-        next_observations = torch.from_numpy(self.observations.take((rows + 1) % self.rows, axis=0))
-        for i, row in enumerate(rows.tolist()):
-            if row in self.final:
-                next_observations[i] = self.final[row]
-        return observations, actions, rewards, next_observations, terminated
+        rows = rng.integers(self.size, size=batch_size)
+        while not self.is_step[rows].all():
+            rows = np.where(self.is_step[rows], rows, rng.integers(self.size, size=batch_size))
+        next_observations = self.observations[(rows + 1) % self.rows]
+        batch = self.observations[rows], self.actions[rows], self.rewards[rows], next_observations
+        return [torch.from_numpy(array) for array in (*batch, self.terminated[rows])]
 
     def state_dict(self):
         """Return the filled rows, as tensors that share the buffer's memory."""
-        filled = min(self.size + 1, self.rows)
-        arrays = {name: torch.from_numpy(getattr(self, name)[:filled]) for name in self.ARRAYS}
-        return {**arrays, "final": self.final, "position": self.position, "size": self.size}
+        arrays = {name: getattr(self, name)[: self.size] for name in self.ARRAYS}
+        state = {name: torch.from_numpy(array) for name, array in arrays.items()}
+        return state | {"position": self.position, "size": self.size}
 
     def load_state_dict(self, state):
         """Copy the rows of a state_dict back."""
+        self.position, self.size = state["position"], state["size"]
         for name in self.ARRAYS:
-            getattr(self, name)[: len(state[name])] = state[name].numpy()
-        self.final, self.position, self.size = state["final"], state["position"], state["size"]
+            getattr(self, name)[: self.size] = state[name].numpy()
 
 
-# LOSSES: pure functions of the parameters to learn and of what stays -> the loss, and curves
+# LOSSES. The first argument is the network that is learned: the gradient is that of its parameters.
+# All other networks and tensors are constants. A loss returns (loss, {curve: value}).
 
 
-def critic_loss(params, critic, target_critic, target_actor, batch, eps, gamma):
+def critic_loss(critic, target_critic, target_actor, batch, eps, gamma):
     """Mean squared error of Q1 and Q2 to y = r + gamma min(Q1', Q2')(s', pi'(s') + eps)."""
     observations, actions, rewards, next_observations, terminated = batch
-    next_actions = target_actor(next_observations, eps)
-    next_q = target_critic(next_observations, next_actions).amin(0)
-    y = rewards + (1 - terminated) * gamma * next_q
-    q1, q2 = functional_call(critic, params, (observations, actions))
+    next_q1, next_q2 = target_critic(next_observations, target_actor(next_observations, eps))
+    y = rewards + (1 - terminated) * gamma * torch.minimum(next_q1, next_q2)
+    q1, q2 = critic(observations, actions)
     qf1_loss, qf2_loss = (q1 - y).square().mean(), (q2 - y).square().mean()
     loss = qf1_loss + qf2_loss
     values = {"qf1_values": q1.mean(), "qf2_values": q2.mean()}
@@ -226,59 +199,33 @@ def critic_loss(params, critic, target_critic, target_actor, batch, eps, gamma):
     return loss, values | losses
 
 
-def actor_loss(params, actor, critic, observations):
-    """The mean of -Q1(s, pi(s)), with a frozen critic."""
-    actions = functional_call(actor, params, (observations,))
-    q1 = {name: twin[:1] for name, twin in critic.named_parameters()}  # the first of the twins
-    loss = -functional_call(critic, q1, (observations, actions)).mean()
-    return loss, {"actor_loss": loss}
+def actor_loss(actor, critic, observations):
+    """The mean of -Q1(s, pi(s))."""
+    q1, _ = critic(observations, actor(observations))
+    return -q1.mean(), {"actor_loss": -q1.mean()}
 
 
-def updater(loss, network, optimizer, args):
-    """Return update(*inputs) -> curves: one optimizer step on loss(network parameters, *inputs)."""
-    parameters = dict(network.named_parameters())
-    gradient_of = grad_and_value(loss, has_aux=True)
-    if args.compile:
-        gradient_of = torch.compile(gradient_of, fullgraph=True, dynamic=False)
-    device_type = "cuda" if args.cuda else "cpu"
-    bf16 = torch.autocast(device_type, torch.bfloat16, enabled=args.matmul_precision == "bf16")
-
-    def update(*inputs):
-        with bf16:
-            gradient, (_, curves) = gradient_of(parameters, *inputs)
-        for name, parameter in parameters.items():
-            # contiguous: the fused Adam of PyTorch 2.13 misreads any other strides, in silence
-            parameter.grad = gradient[name].contiguous()
-        # Adam's momentum of dead units ends at 1e-45, and Intel's processors are slow with that
-        torch.set_flush_denormal(True)
-        optimizer.step()
-        torch.set_flush_denormal(False)
-        return curves
-
-    return update
-
-
+@torch.no_grad()  # updater() takes the gradients; nothing else needs any
 def learn(args, env, test_env, stop):
     """Train one agent; return False if stop(), asked whenever an episode ends, ended it early."""
-    if not np.isfinite([env.action_space.low, env.action_space.high]).all():
+    if not noisy.is_bounded(env.action_space):
         fail(f"TD3 needs bounded actions; some actions of {args.env_id} are unbounded")
-    torch.set_num_threads(args.torch_threads)
     device = torch.device("cuda" if args.cuda else "cpu")
-    run = Run(args, "TD3", use_matmul_precision(args.matmul_precision, device), env)
+    run = Run(args, env)
     if run.is_finished:
         return True
 
-    # SETUP: torch.func differentiates the losses, so autograd need not follow the networks
+    # SETUP
     torch.manual_seed(args.seed)
     rng = np.random.default_rng(args.seed)
     env.action_space.seed(args.seed)
     observation, _ = env.reset(seed=args.seed)
-    buffer = ReplayBuffer(min(args.buffer_size, args.total_timesteps), env)
-    actor, critic, target_actor, target_critic = Actor(env), Critic(env), Actor(env), Critic(env)
+    with fail_on(MemoryError, f"--buffer-size {args.buffer_size}"):
+        buffer = ReplayBuffer(args.buffer_size + 1, env)  # one for the next observation
+    actor, critic = Actor(env).to(device), Critic(env).to(device)
+    target_actor, target_critic = Actor(env).to(device), Critic(env).to(device)
     target_actor.load_state_dict(actor.state_dict())
     target_critic.load_state_dict(critic.state_dict())
-    for network in (actor, critic, target_actor, target_critic):
-        network.requires_grad_(False).to(device)
     q_optimizer = torch.optim.Adam(critic.parameters(), lr=args.learning_rate, fused=True)
     actor_optimizer = torch.optim.Adam(actor.parameters(), lr=args.learning_rate, fused=True)
     update_critic = updater(critic_loss, critic, q_optimizer, args)
@@ -286,9 +233,12 @@ def learn(args, env, test_env, stop):
     online_parameters = [*actor.parameters(), *critic.parameters()]
     target_parameters = [*target_actor.parameters(), *target_critic.parameters()]
 
-    # RESUME: between two episodes an environment is no more than its EnvState
-    state = [actor, critic, target_actor, target_critic, q_optimizer, actor_optimizer]
-    start = run.resume([*state, buffer, noisy.EnvState(env, rng)])
+    # RESUME: all that training changes belongs in `state`. What is missing there starts afresh when
+    # the run is resumed, and nothing says so (tools/check_script.py finds out).
+    state = {"actor": actor, "critic": critic, "buffer": buffer}
+    state |= {"target_actor": target_actor, "target_critic": target_critic}
+    state |= {"q_optimizer": q_optimizer, "actor_optimizer": actor_optimizer}
+    start = run.resume(state | {"env": noisy.EnvState(env, rng)})
     if start > 0:
         noisy.set_progress(env, start / args.total_timesteps)
         observation, _ = env.reset()
@@ -298,7 +248,7 @@ def learn(args, env, test_env, stop):
         if global_step <= args.learning_starts:
             action = env.action_space.sample()
         else:
-            eps = args.exploration_noise * torch.randn(env.action_space.shape).numpy()
+            eps = args.exploration_noise * torch.randn(env.action_space.shape).to(device)
             action = actor.policy(observation, eps)
 
         # STEP
@@ -314,11 +264,11 @@ def learn(args, env, test_env, stop):
             batch = [tensor.to(device) for tensor in buffer.sample(args.batch_size, rng)]
             eps = args.policy_noise * torch.randn(batch[1].shape).to(device)
             eps = eps.clamp(-args.noise_clip, args.noise_clip)
-            curves = update_critic(critic, target_critic, target_actor, batch, eps, args.gamma)
+            curves = update_critic(target_critic, target_actor, batch, eps, args.gamma)
 
             if global_step % args.policy_frequency == 0:
                 # LEARN: actor
-                curves |= update_actor(actor, critic, batch[0])
+                curves |= update_actor(critic, batch[0])
 
                 # LEARN: targets
                 torch._foreach_lerp_(target_parameters, online_parameters, args.tau)
@@ -328,10 +278,8 @@ def learn(args, env, test_env, stop):
 
         # TEST
         if done or (args.eval_frequency > 0 and global_step % args.eval_frequency == 0):
-            results = evaluate(actor.policy, test_env, args.eval_episodes, stop)
-            if results is None:
-                return False
-            run.log_test(global_step, results)
+            results = noisy.play(test_env, actor.policy, args.eval_episodes, TEST_SEED)
+            run.log_test(global_step, results, {"actor": actor.state_dict()})
 
         # NEXT EPISODE
         if terminated or truncated:
@@ -346,18 +294,64 @@ def learn(args, env, test_env, stop):
             noisy.set_progress(env, global_step / args.total_timesteps)
             observation, _ = env.reset()
 
-    run.finish(global_step, actor.state_dict())
+    run.finish(global_step)
     return True
 
 
-def load_policy(run_dir, env):
-    """Return the policy of a finished run."""
-    actor = Actor(env).requires_grad_(False)
-    actor.load_state_dict(torch.load(Path(run_dir, "policy.pt"), "cpu", weights_only=True))
+def load_policy(run_dir, env=None):
+    """Return the policy of a run's last test; `env` is for runs of 0.3, which tell no spaces."""
+    config = json.loads(Path(run_dir, "config.json").read_text())
+    actor = Actor(env or noisy.Spaces(config))
+    saved = torch.load(Path(run_dir, "policy.pt"), "cpu", weights_only=True)
+    actor.load_state_dict(saved.get("actor", saved))  # in 0.3 it was all there is
     return actor.policy
 
 
-# THE RUN: arguments, tests, speed, files; word for word the same in the three scripts.
+# UPDATES: how a loss becomes a step of an optimizer
+
+
+class Learned(nn.Module):
+    """A loss and the network that it learns, whose parameters torch.func exchanges."""
+
+    def __init__(self, loss, network):
+        super().__init__()
+        self.loss, self.network = loss, network
+
+    def forward(self, *inputs):
+        """Return what the loss returns."""
+        return self.loss(self.network, *inputs)
+
+
+def updater(loss, network, optimizer, args):
+    """Return update(*inputs) -> curves: one step of the optimizer on loss(network, *inputs).
+
+    Numbers among the inputs may change from one update to the next. The optimizer may be any whose
+    step() needs no closure. Taking the gradient in the compiled graph is faster than backward().
+    """
+    learned, device = Learned(loss, network), next(network.parameters()).device
+    parameters = {name: p for name, p in learned.named_parameters() if p.requires_grad}
+    gradient_of = grad_and_value(functools.partial(functional_call, learned), has_aux=True)
+    gradient_of = compiled(gradient_of) if args.compile else gradient_of
+    bf16 = torch.autocast(device.type, torch.bfloat16, enabled=args.matmul_precision == "bf16")
+
+    def update(*inputs):
+        # a compiled graph would keep a number, and be compiled again for every other one
+        inputs = [torch.tensor(float(x)) if type(x) in NUMBERS else x for x in inputs]
+        with bf16:
+            gradient, (_, curves) = gradient_of(parameters, tuple(inputs))
+        for name, parameter in parameters.items():
+            # contiguous: the fused Adam of PyTorch 2.13 misreads any other strides, in silence
+            parameter.grad = gradient[name].contiguous()
+        # Adam's momentum of dead units ends at 1e-45, and Intel's processors are slow with that
+        torch.set_flush_denormal(True)
+        optimizer.step()
+        torch.set_flush_denormal(False)
+        return curves
+
+    return update
+
+
+# THE RUN: its environments, its folder, signals; word for word the same in the three scripts
 
 
 def fail(message, code=2):
@@ -368,343 +362,295 @@ def fail(message, code=2):
 
 @contextlib.contextmanager
 def fail_on(errors, message, code=2):
-    """Turn such errors into one line, the message and what the error says; note it on others."""
+    """Turn these errors into one line: the message, and what the error says."""
     try:
         yield
     except errors as error:
-        fail(f"{message}: {noisy.reason(error)}", code)
-    except Exception as error:  # of the environment, say: its traceback is what the user needs
-        error.add_note(f"({message})")
-        raise
+        fail(f"{message}: {' '.join(str(error).split()) or type(error).__name__}", code)
 
 
 def say(text):
     """Print a line; training goes on if its reader has left, as in `... | head`."""
     try:
         print(text, flush=True)
-    except OSError:  # of a pipe, or of a terminal
+    except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def read_args():
-    """Read the command line; a whole number may be written as 1e6."""
-    words = sys.argv[1:]
-    for i, word in enumerate(words):
-        flag, equals, number = word.partition("=") if word.startswith("--") else ("", "", word)
-        is_name = (flag or words[i - 1]).replace("_", "-") in ("--exp-name", "--runs-dir")
-        with contextlib.suppress(ValueError):  # it is no number
-            if "e" in number.lower() and float(number).is_integer() and not is_name:
-                words[i] = f"{flag}{equals}{float(number):.0f}"
-    noises = "\n  ".join(["Noises:", *noisy.signatures()])
-    return tyro.cli(Args, args=words, description=f"{__doc__}\n{noises}")
+def compiled(function):
+    """Compile a function as one graph; where that fails, say why and go on without."""
+    graph = torch.compile(function, fullgraph=True, dynamic=False)
+
+    def call(*inputs):
+        nonlocal graph
+        try:
+            return graph(*inputs)
+        except torch._dynamo.exc.FailOnRecompileLimitHit:
+            fail("a number that a loss reads from args changes too often: pass it to the update", 1)
+        except torch._dynamo.exc.TorchDynamoException as error:
+            cache = torch._inductor.runtime.cache_dir_utils.cache_dir()
+            say(f"not compiled, so it is slower: {error} (the compiler's cache is {cache})")
+            graph = function
+            return function(*inputs)
+
+    return call
 
 
-def train(args, stop=lambda: False):
+def train(args, stop=lambda: 0):
     """Train one agent and close its environments; return False if stop() ended it early."""
-    if args.exp_name in ("", ".", ".."):
-        fail(f"--exp-name must be a name, not {args.exp_name!r}")
     if args.cuda and not torch.cuda.is_available():
         fail("--cuda: PyTorch finds no GPU; leave it out to run on the CPU")
     try:
-        noisy.check_numbers(asdict(args))
-        env_id = noisy.canonical_env_id(args.env_id)
-        noise, noise_rate = noisy.Configuration.read(args.noise, args.noise_rate).texts
+        args = replace(args, **noisy.canonical_arguments(asdict(args)))
     except ValueError as error:
         fail(error)
-    limit = {"max_episode_steps": args.max_episode_steps}
-    noisy.seed_globals(TEST_SEED)  # a constructor may draw, too: all runs have the same tests
-    with make_env(env_id, **limit) as test_env:
-        noisy.seed_globals(args.seed)
-        with make_env(env_id, **limit) as env:
-            where = f"--noise in {env_id}" if noise else f"--env-id {env_id}"
-            with fail_on(ValueError, where), warnings.catch_warnings(record=True) as notes:
-                env = noisy.make_noisy(env, noise, noise_rate)
-            told = [note.message for note in notes]
-            for text in told + noisy.remarks(env_id, test_env, STEP_LIMIT):
-                say(text)
-            args = replace(args, env_id=env_id, noise=noise, noise_rate=noise_rate)
-            return learn(args, env, test_env, stop)
-
-
-def evaluate(policy, env, episodes, stop=lambda: False):
-    """Play test episodes -> (N, 3): returns, lengths, noisy.outcome; None if stopped."""
-    long = env.spec.max_episode_steps >= STEP_LIMIT  # there, and only there, stop() ends a test
-    results = np.zeros((episodes, 3))
-    with noisy.kept_generators(env):
-        for episode in range(episodes):
-            noisy.seed_globals(TEST_SEED + episode)
-            observation, _ = env.reset(seed=TEST_SEED + episode)
-            terminated = truncated = False
-            while not (terminated or truncated):
-                observation, reward, terminated, truncated, info = env.step(policy(observation))
-                results[episode, :2] += reward, 1
-                if long and stop():
-                    return None
-            results[episode, 2] = noisy.outcome(info)
-    return results
-
-
-def use_matmul_precision(precision, device):
-    """Set the precision of float32 products, but "highest" where accuracy is lost; return it."""
-    torch.set_float32_matmul_precision("highest" if precision == "bf16" else precision)
-    a, b = torch.randn(2, 256, 256, generator=torch.Generator().manual_seed(0)).to(device)
-    exact = a.double() @ b.double()
-    if torch.norm(a @ b - exact) > 1e-6 * torch.norm(exact):  # TF32; bf16 on a CPU with AMX
+    if args.eval_frequency is None:
+        args.eval_frequency = max(1, min(EVAL_FREQUENCY, args.total_timesteps // 10))
+    torch.compiler.reset()  # forget what earlier runs of this process compiled
+    torch.set_num_threads(args.torch_threads)
+    precision, with_amx = args.matmul_precision, torch.cpu.get_capabilities().get("amx_tile")
+    if with_amx or args.cuda or precision == "bf16":  # "medium" is bf16 with AMX, TF32 on a GPU
         precision = "highest"
-        torch.set_float32_matmul_precision(precision)
-    return precision
+    torch.set_float32_matmul_precision(precision)
+    with fail_on((gym.error.Error, noisy.SpaceError), f"--env-id {args.env_id}"):
+        env, test_env = noisy.make_environments(make_env, asdict(args), TEST_SEED)
+    with env, test_env:  # which closes them
+        return learn(args, env, test_env, stop)
 
 
 class Run:
     """The run's folder: what is written into it, and read again to resume."""
 
-    FILES = ("result.json", "checkpoint.pt", "policy.pt", "eval.csv", "config.json")
-    EVENTS = "events.out.tfevents.*"
+    FILES = ["result.json", "checkpoint.pt", "policy.pt", "policy_*.pt", "eval.csv", "config.json"]
+    FILES += ["robustness.csv", "events.out.tfevents.*", "*.tmp"]
 
-    def __init__(self, args, algorithm, precision, env):
-        """Open the folder; fail if another process uses it, or if it holds a different run."""
-        name = noisy.run_name(args.env_id, args.exp_name, args.noise, args.noise_rate, args.seed)
-        self.folder = Path(args.runs_dir, name)
-        self.args, self.start = args, time.monotonic() - 1e-6  # not 0 s ago: clocks may stand still
-        self.noise, self.returns = noisy.noise_wrappers(env), env.get_wrapper_attr("return_queue")
-        self.outcomes = deque(maxlen=100)  # of the last training episodes
+    def __init__(self, args, env):
+        """Open the folder; exit if another process uses it, or if it holds a different run."""
+        self.args, self.env = args, env
+        self.folder = noisy.run_folder(asdict(args))
         if self.folder.is_symlink():
             fail(f"{self.folder} is a link: remove it, or choose another --exp-name or --runs-dir")
-        with fail_on(OSError, "--runs-dir"):
-            self.folder.mkdir(parents=True, exist_ok=True)
-            lock = os.open(self.folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
-            self.lock = os.fdopen(lock)
-            with fail_on(BlockingIOError, f"{self.folder} is in use by another process"):
-                fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
-            result, self.checkpoint, *_, config = ours = [self.folder / f for f in self.FILES]
-            old = [path.with_suffix(".tmp") for path in ours]  # of a process that was killed
-            if args.overwrite:
-                old += [*ours, self.folder / "robustness.csv"]  # events: see resume()
-            for path in old:
-                path.unlink(missing_ok=True)
-        self.is_finished = result.exists()
-        if any(path.exists() for path in ours):
-            self.config = self._old_config(config, algorithm)
-        else:
-            if args.eval_frequency is None:
-                args.eval_frequency = max(1, min(EVAL_FREQUENCY, args.total_timesteps // 10))
-            self.config = {"algorithm": algorithm, "args": asdict(args)}
-        if self.is_finished:
-            with self._reading(result):
-                self.result = json.loads(result.read_text())
-                self._say_finished()
-            self.checkpoint.unlink(missing_ok=True)
-        else:
-            noises = " + ".join(map("{} at {}".format, args.noise, args.noise_rate))
-            begun = f"{algorithm} on {args.env_id} | noise: {noises or 'none (baseline)'}"
-            begun += f" | seed {args.seed} | {args.total_timesteps:,} steps"
-            say(f"{begun} | {'cuda' if args.cuda else 'cpu'} | {self.folder}")
-            for change in noisy.note_versions(self.config, precision):
-                say(change)
-            if args.compile:
-                say("compiling ...")
-                torch.compiler.reset()  # forget what earlier runs of this process compiled
-                noisy.clean_compiler_cache()
-
-    def _old_config(self, path, algorithm):
-        with self._reading(path):
-            config = json.loads(path.read_text())
-            # an argument that an older version did not have is no difference
-            old = asdict(self.args) | config["args"] | {"algorithm": config["algorithm"]}
-        if self.args.eval_frequency is None:
-            self.args.eval_frequency = old["eval_frequency"]
-        new = {"algorithm": algorithm} | asdict(self.args)
-        new = {name: new[name] for name in new if name not in noisy.MAY_DIFFER_IN_A_RUN}
-        differ = [f"{name} {old[name]}, not {new[name]}" for name in new if old[name] != new[name]]
-        if algorithm != old["algorithm"]:
-            differ = differ[:1]  # others may be due to the scripts' defaults
-        if differ:
-            advice = "choose another --exp-name or --runs-dir; --overwrite deletes that run"
-            fail(f"{self.folder} holds a run with {'; '.join(differ)}: {advice}")
-        return config
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.lock = (self.folder / ".lock").open("a")
+        with fail_on(BlockingIOError, f"{self.folder} is in use by another process"):
+            fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
+        if args.overwrite:
+            self._delete(*self.FILES)
+        self.config = noisy.describe_run(__file__, asdict(args), asdict(Args()), env)
+        self.config["versions"]["torch"] = torch.__version__
+        self.config["matmul_precision"] = torch.get_float32_matmul_precision()
+        self.is_finished = (self.folder / "result.json").exists()
+        config = self.folder / "config.json"
+        if config.exists():
+            with fail_on(ValueError, str(self.folder)):
+                self.config = noisy.resumed_run(json.loads(config.read_text()), self.config)
+        if "," in self.config["script_sha256"]:
+            say("the script has changed since the run began; if it matters, use --exp-name")
+        noises = " + ".join(map("{} at {}".format, args.noise, args.noise_rate)) or "no noise"
+        begun = f"{self.config['algorithm']} on {args.env_id}, {noises}, seed {args.seed}"
+        begun += " (compiles first, which takes a while)" if args.compile else ""
+        say(f"{self.folder} is finished" if self.is_finished else f"{begun}: {self.folder}")
 
     def resume(self, state):
-        """Restore the last checkpoint of the objects in a list; return its step, or 0."""
-        self.state, args, step, sizes = state, self.args, 0, {}
-        self.eval_csv = "step,episode,episodic_return,episodic_length\n"
-        if self.checkpoint.exists():
-            with self._reading(self.checkpoint):
-                step, sizes = self._load()
+        """Restore the last checkpoint of {name: object with a state_dict}; return its step, or 0.
+
+        A state_dict may hold tensors, NumPy's arrays and numbers, and Python's own types.
+        """
+        self.state, self.eval_csv = state, "step,episode,episodic_return,episodic_length,success\n"
+        step, seconds, processor_seconds, path = 0, 0.0, 0.0, self.folder / "checkpoint.pt"
+        if path.exists():
+            with fail_on(Exception, f"cannot read {path} (--overwrite starts afresh)"):
+                if zipfile.ZipFile(path).testzip():  # torch.load checks no checksums
+                    raise ValueError("it is damaged")
+                checkpoint = read_state(path)
+                for name, part in state.items():
+                    part.load_state_dict(checkpoint["state"][name])
+            torch.set_rng_state(checkpoint["torch"])
+            step, self.eval_csv = checkpoint["step"], checkpoint["eval_csv"]
+            seconds, processor_seconds = checkpoint["seconds"], checkpoint["processor_seconds"]
             say(f"resumed at step {step}")
+        else:
+            self._delete("events.out.tfevents.*")
+            for name, part in state.items():  # now, and not when it is needed
+                with fail_on(Exception, f"the state of {name!r} cannot be saved and read back"):
+                    file = io.BytesIO()
+                    torch.save(part.state_dict(), file)
+                    read_state(io.BytesIO(file.getvalue()))
         self._write("config.json", json.dumps(self.config, indent=2) + "\n")
         self._write("eval.csv", self.eval_csv)
-        with self._writing("events.*"):
-            # what was logged after the checkpoint is removed, and purged by a TensorBoard that runs
-            for path in self.folder.glob(self.EVENTS):
-                if path.name in sizes:
-                    os.truncate(path, min(path.stat().st_size, sizes[path.name]))
-                else:
-                    path.unlink()
-            self.writer = SummaryWriter(str(self.folder), purge_step=step + 1)
+        # TensorBoard drops what was logged after the checkpoint
+        self.writer = SummaryWriter(str(self.folder), purge_step=step + 1)
         if step == 0:
-            table = "".join(f"|{name}|{value}|\n" for name, value in asdict(args).items())
-            self.writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + table)
-            # for the table HPARAMS: what tells runs apart, and what they achieved
-            columns = {"env_id": args.env_id, "exp_name": args.exp_name, "seed": args.seed}
-            columns["noise"] = " + ".join(args.noise) or "none"
-            columns["noise_rate"] = " + ".join(map(str, args.noise_rate)) or "none"
-            metrics = "eval/episodic_return_mean", "charts/episodic_return", "eval/success_rate"
-            for summary in hparams(columns, dict.fromkeys(metrics, 0))[:2]:
-                self.writer.file_writer.add_summary(summary)
-        self.bar = tqdm(total=args.total_timesteps, initial=step, file=sys.stdout, disable=None)
-        self.saved_step, self.learning, self.last_test = step, None, ""
-        self.printed = time.monotonic() - 1e-6
-        self.begun = step, self.printed
+            self._log_hyperparameters()
+        total = self.args.total_timesteps
+        self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None, smoothing=0)
+        self.saved_step, self.last_test, self.printed = step, "", time.monotonic()
+        self.learning_since = None  # the step and the time of the first losses
+        self.wall_begun = time.monotonic() - seconds
+        self.processor_begun = time.process_time() - processor_seconds
         return step
 
-    def _load(self):
-        if zipfile.ZipFile(self.checkpoint).testzip():  # torch.load checks no checksums
-            raise ValueError("it is damaged")
-        checkpoint = torch.load(self.checkpoint, weights_only=True)
-        if checkpoint["format"] != 5:
-            raise ValueError("another version wrote it: finish the run with that version")
-        if checkpoint["run"] != self.folder.name:
-            raise ValueError(f"it belongs to {checkpoint['run']}")
-        for part, state in zip(self.state, checkpoint["state"], strict=True):
-            part.load_state_dict(state)
-        torch.set_rng_state(checkpoint["torch"])
-        self.eval_csv = checkpoint["eval_csv"]
-        self.outcomes.extend(checkpoint.get("outcomes", []))
-        self.start = time.monotonic() - checkpoint["seconds"]
-        return checkpoint["step"], checkpoint["events"]
+    def _log_hyperparameters(self):
+        """Log all arguments as a table, and as columns of HPARAMS with what they achieve."""
+        args = {name: str(value) for name, value in asdict(self.args).items()}
+        table = "".join(f"|{name}|{value}|\n" for name, value in args.items())
+        self.writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + table)
+        metrics = ["eval/episodic_return_mean", "charts/episodic_return", "eval/success_rate"]
+        experiment, session_start, _ = hparams(args, dict.fromkeys(metrics, 0))
+        self.writer.file_writer.add_summary(experiment)
+        self.writer.file_writer.add_summary(session_start)
 
     def save(self, step):
         """Write a checkpoint: all that resuming needs, between two episodes."""
-        with self._writing("events.*"):
-            self.writer.flush()  # to be no older than the checkpoint
+        self.writer.flush()  # to be no older than the checkpoint
         checkpoint = {
-            "format": 5,
-            "run": self.folder.name,
             "step": step,
-            "state": [part.state_dict() for part in self.state],
+            "state": {name: part.state_dict() for name, part in self.state.items()},
             "torch": torch.get_rng_state(),
             "eval_csv": self.eval_csv,
-            "outcomes": list(self.outcomes),
-            "events": {path.name: path.stat().st_size for path in self.folder.glob(self.EVENTS)},
-            "seconds": time.monotonic() - self.start,
+            "seconds": time.monotonic() - self.wall_begun,
+            "processor_seconds": time.process_time() - self.processor_begun,
         }
         self._write("checkpoint.pt", checkpoint)
         self.saved_step = step
 
     def log(self, step, **groups):
         """Log numbers as group/name to TensorBoard, and the speed; show the progress."""
-        tags = {f"{g}/{n}": float(x) for g, values in groups.items() for n, x in values.items()}
-        now = time.monotonic()
-        if "losses" in groups and self.learning:
-            tags["charts/SPS"] = (step - self.learning[0]) / (now - self.learning[1])
+        tags, now = {}, time.monotonic()
+        for group, values in groups.items():
+            tags |= {f"{group}/{name}": float(value) for name, value in values.items()}
+        if "losses" in groups and self.learning_since:
+            first_step, since = self.learning_since
+            tags["charts/SPS"] = (step - first_step) / (now - since)
         elif "losses" in groups:  # the first ones: the time until now went into compiling
-            self.learning = step, now - 1e-6
+            self.learning_since = step, now
         if not all(map(math.isfinite, tags.values())):
             reason = f"step {step}: training diverged, some values are not finite: {tags}"
             raise noisy.NotFiniteError(reason)
-        with self._writing("events.*"):
-            for tag, value in tags.items():
-                self.writer.add_scalar(tag, value, step)
-        step = max(step, self.bar.n)  # PPO logs a test under the step at which it fell due
+        for tag, value in tags.items():
+            self.writer.add_scalar(tag, value, step)
+        self._show_progress(step, now)
+
+    def _show_progress(self, step, now):
+        """Move the bar of a terminal; elsewhere print a line after ten seconds, or after a test."""
         self.bar.update(step - self.bar.n)
         self.bar.n = step  # update() does nothing where there is no terminal
-        learned = self.learning and step > self.learning[0]
-        first_step, since = self.learning if learned else self.begun
         if self.bar.disable and now - self.printed > 10:
-            total, sps = self.bar.total, (step - first_step) / (now - since)
-            eta = tqdm.format_interval((total - step) / sps) if learned else "?"
+            first_step, since = self.learning_since or (step, now)
+            speed = (step - first_step) / max(now - since, 1e-6)
+            left = tqdm.format_interval((self.bar.total - step) / speed) if speed else "?"
             # analysis/folders.py reads this line
-            say(f"step={step}/{total} sps={sps:.0f} {self.last_test}eta={eta}")
+            say(f"step={step}/{self.bar.total} sps={speed:.0f} {self.last_test}eta={left}")
             self.printed = now
 
     def log_episode(self, step, info):
         """Log a training episode as the info of its last step tells it."""
-        self.outcomes.append(noisy.outcome(info))
         charts = {"episodic_return": info["episode"]["r"], "episodic_length": info["episode"]["l"]}
-        self.log(step, charts=charts | noisy.success_rate(self.outcomes))
+        self.log(step, charts=charts | noisy.success_rate([noisy.outcome(info)]))
 
-    def log_test(self, step, results):
-        """Log the (N, 3) returns, lengths and outcomes of a test that fell due at a step."""
-        told = ",success\n" in self.eval_csv  # by the environment, in an earlier test
-        success = noisy.success_rate(np.nan_to_num(results[:, 2]) if told else results[:, 2])
-        if success and not told:  # earlier tests, of which it said nothing, were no success
-            self.eval_csv = self.eval_csv.replace("\n", ",0\n").replace(",0", ",success", 1)
-        for i, (episodic_return, length, outcome) in enumerate(results.tolist()):
-            column = f",{outcome == 1:d}" if success else ""
-            self.eval_csv += f"{step},{i},{episodic_return},{length:.0f}{column}\n"
+    def log_test(self, step, results, policy, due=None):
+        """Log the (N, 3) returns, lengths and outcomes of a test, and save the policy.
+
+        eval.csv has the step at which the test fell `due`, if that was an earlier one.
+        """
+        due = due or step
+        for episode, (episodic_return, length, outcome) in enumerate(results.tolist()):
+            success = "" if math.isnan(outcome) else int(outcome)
+            self.eval_csv += f"{due},{episode},{episodic_return},{length:.0f},{success}\n"
+        if self.args.keep_policies:
+            self._write(f"policy_{due}.pt", policy | {"step": step})
+        self._write("policy.pt", policy | {"step": step})
         self._write("eval.csv", self.eval_csv)
         mean, length, _ = results.mean(0)
         std = results[:, 0].std(ddof=1) if len(results) > 1 else 0.0
-        test = {"return_mean": mean, "return_std": std}
-        self.result = {f"final_{name}": value for name, value in (test | success).items()}
-        self.last_test, self.printed = f"eval_return={noisy.rounded(mean, std)} ", -math.inf
-        self.last_test += "".join(f"{name}={rate:.2f} " for name, rate in success.items())
+        success = noisy.success_rate(results[:, 2])
+        self.result = {"final_return_mean": mean, "final_return_std": std}
+        self.result |= {f"final_{name}": rate for name, rate in success.items()}
+        self.last_test, self.printed = f"eval_return={mean:.2f} ", -math.inf
         self.bar.set_description_str(self.last_test)
-        test["length_mean"] = length
-        self.log(step, eval={f"episodic_{name}": x for name, x in test.items()} | success)
+        test = {"episodic_return_mean": mean, "episodic_return_std": std}
+        self.log(step, eval=test | {"episodic_length_mean": length} | success)
 
-    def finish(self, step, policy):
-        """Write policy.pt and, last of all, result.json; the checkpoint has served."""
-        seconds = time.monotonic() - self.start
-        with self._writing("events.*"):
-            self.writer.file_writer.add_summary(hparams({}, {})[2])  # HPARAMS: success
-            self.writer.close()
+    def finish(self, step):
+        """Write, last of all, result.json; the checkpoint has served."""
+        _, _, session_end = hparams({}, {})  # HPARAMS: its status is success
+        self.writer.file_writer.add_summary(session_end)
+        self.writer.close()
+        self.bar.close()
+        noises = noisy.noise_wrappers(self.env).items()
+        returns = self.env.get_wrapper_attr("return_queue")  # of the last 100 training episodes
+        seconds = time.monotonic() - self.wall_begun
         self.result |= {
             "final_return_n": self.args.eval_episodes,
             "total_timesteps": self.args.total_timesteps,
             "trained_timesteps": step,  # PPO: whole rollouts
-            "train_return_mean_last_100": np.mean(self.returns) if self.returns else None,
+            "train_return_mean_last_100": np.mean(returns) if returns else None,
             "steps_per_second": step / seconds,
             "wall_time_seconds": seconds,
-            "noise_applied_fraction": {n: w.applied_fraction for n, w in self.noise.items()},
-            "noise_applied": {n: [w.times_applied, w.opportunities] for n, w in self.noise.items()},
+            "processor_seconds": time.process_time() - self.processor_begun,
+            "noise_applied_fraction": {name: noise.applied_fraction for name, noise in noises},
+            "noise_applied": {name: [w.times_applied, w.opportunities] for name, w in noises},
         }
-        self._write("policy.pt", policy)
         self._write("result.json", json.dumps(self.result, indent=2) + "\n")
-        self.checkpoint.unlink(missing_ok=True)
-        self.bar.close()
-        self._say_finished()
+        self._delete("checkpoint.pt")
+        say(f"{self.folder} is finished: {self.last_test}")
+        say(f"See its curves with: tensorboard --logdir {self.args.runs_dir}")
 
-    def _say_finished(self):
-        mean, std = self.result["final_return_mean"], self.result["final_return_std"]
-        text = f"{self.folder} is finished: mean test return {noisy.rounded(mean, std)}"
-        rate = self.result.get("final_success_rate")
-        say(text if rate is None else f"{text}, success rate {rate:.2f}")
-        say(f"See its curves with: tensorboard --logdir {shlex.quote(self.args.runs_dir)}")
-
-    def _reading(self, path):
-        return fail_on(Exception, f"cannot read {path} (if damaged, --overwrite starts afresh)")
-
-    def _writing(self, name):
-        return fail_on((OSError, RuntimeError), f"cannot write {self.folder / name}", code=1)
+    def _delete(self, *patterns):
+        for pattern in patterns:
+            for path in self.folder.glob(pattern):
+                path.unlink()
 
     def _write(self, name, content):
         # whole or not at all: a kill or a full disk leaves the previous file
-        temporary = (self.folder / name).with_suffix(".tmp")
-        try:
-            with self._writing(name), open(temporary, "wb") as file:
-                if isinstance(content, str):
-                    file.write(content.encode())
-                else:
-                    torch.save(content, file)
-                file.flush()
-                os.fsync(file.fileno())
-                temporary.replace(self.folder / name)
-        finally:
-            temporary.unlink(missing_ok=True)
+        temporary = self.folder / f"{name}.tmp"
+        with open(temporary, "wb") as file:
+            if isinstance(content, str):
+                file.write(content.encode())
+            else:
+                torch.save(content, file)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(self.folder / name)
+
+
+def read_state(file):
+    """Read a checkpoint, which may hold NumPy's arrays and numbers, but no code."""
+    numpy, types = np._core.multiarray, {type(np.dtype(code)) for code in np.typecodes["All"]}
+    types |= {np.ndarray, np.dtype, numpy._reconstruct, numpy.scalar, bytes}
+    with torch.serialization.safe_globals(list(types)):
+        return torch.load(file, weights_only=True)
+
+
+def stop_at_signals():
+    """Answer signals at the end of an episode: return stop() -> the first one's number, or 0."""
+    received, script = [], os.getpid()
+
+    def remember(number, frame):
+        if os.getpid() != script:  # a process that the environment has forked
+            if number != signal.SIGINT:  # Ctrl-C is for the script
+                os._exit(128 + number)
+            return
+        received.append(number)
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # a second Ctrl-C ends the program at once
+        with contextlib.suppress(OSError):  # print() is not safe in here
+            os.write(1, b"stopping after this episode; Ctrl-C again stops without a checkpoint\n")
+
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        if signal.getsignal(number) != signal.SIG_IGN:  # as nohup has it
+            signal.signal(number, remember)
+    return lambda: received[0] if received else 0
 
 
 if __name__ == "__main__":
-    stop = noisy.stop_at_signals()
+    import tyro  # only here: whoever plays a policy does not need it
+
+    stop = stop_at_signals()
     sys.path.append(os.getcwd())  # for what the module of --env-id module:Name-v0 imports
-    finished = False
-    try:
-        with fail_on((noisy.NotFiniteError, noisy.SpaceError), "training stopped", code=1):
-            finished = train(read_args(), stop)
-    except Exception as error:
-        if not stop():  # the environment's processes may have got the signal, too
-            noisy.start_again_if_not_compiled(error)
-            raise
+    noises = "\n  ".join(["Noises:", *noisy.signatures()])
+    args = tyro.cli(Args, description=f"{__doc__}\n{noises}")
+    with fail_on((noisy.NotFiniteError, noisy.SpaceError), "training stopped", code=1):
+        finished = train(args, stop)
     if not finished:
         say("stopped; run the same command again to resume")
         raise SystemExit(128 + stop())

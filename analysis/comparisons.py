@@ -158,7 +158,8 @@ def judged_beside(noises, rates, family, metric, smallest_gain=None):
     keys = [*STUDY, "environment", "noise"]
     several = rates.groupby(keys)["noise"].transform("size") > 1
     pairs = zip(rates["n"], rates["n_baseline"], strict=True)
-    lopsided = several & np.array([verdicts.is_lopsided(*pair) for pair in pairs], bool)
+    lopsided = [verdicts.is_lopsided(*pair, verdicts.MOST_RATIO_OF_RATES) for pair in pairs]
+    lopsided = several & np.array(lopsided, bool)
     rates.loc[lopsided, ["t", "p", "smallest_p"]] = np.nan
     many = judged(rates[several].copy(), family, metric, smallest_gain)
     found = noises.set_index(keys)[VERDICT]

@@ -77,7 +77,7 @@ def comparison_figures(study, statistics, best):
 def span(numbers):
     """Write the numbers of seeds or environments behind a line or a panel: "5", or "3 to 5"."""
     low, high = min(numbers, default=0), max(numbers, default=0)
-    return f"{low}" if low == high else f"{low} to {high}"
+    return f"{low:.0f}" if low == high else f"{low:.0f} to {high:.0f}"
 
 
 def panels(environments, labels, metric, below):

@@ -146,21 +146,19 @@ def family_notes(noises):
 
 def lopsided_notes(compared):
     """Say where verdicts may be wrong too often, because one side has few of all seeds."""
+    pairs = zip(compared.noises["n"], compared.noises["n_baseline"], strict=True)
+    noises = compared.noises[np.array([verdicts.is_lopsided(*pair) for pair in pairs], bool)]
+    rates = compared.rates[compared.rates["n"].ge(2) & compared.rates["smallest_p"].isna()]
     notes = []
     for rows, said in (
-        (compared.noises, "a verdict may be wrong more often than in 5 %"),
-        (compared.rates, "rows of a single rate have no verdict: it would be wrong too often"),
+        (noises, "a verdict may be wrong more often than in 5 %"),
+        (rates, "single rates have no verdict, which would be wrong too often"),
     ):
-        seeds = zip(rows["n"], rows["n_baseline"], strict=True)
-        lopsided = rows[np.array([verdicts.is_lopsided(*pair) for pair in seeds], bool)]
-        if said.startswith("rows"):
-            lopsided = lopsided[lopsided["p"].isna()]
-        for key, group in lopsided.groupby(STUDY, sort=False):
-            pairs = {seeds_of(*pair) for pair in group[["n", "n_baseline"]].to_numpy()}
-            where = ", ".join(group["environment"].unique())
+        for key, group in rows.groupby(STUDY, sort=False):
+            seeds = sorted({seeds_of(*pair) for pair in group[["n", "n_baseline"]].to_numpy()})
             notes.append(
-                f"{study_name(*key)}, {where}: with {' and '.join(sorted(pairs))} seeds with and "
-                f"without noise {said}, if noise changes how much returns spread."
+                f"{study_name(*key)}, {', '.join(group['environment'].unique())}: with "
+                f"{listed(seeds)} seeds with and without noise {said} (docs/statistics.md)"
             )
     return notes
 

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from test_analyze import SCALE, write_run
+from sweeps import SCALE, write_run
 
 from analysis.folders import SUCCESS, DamageError, read_run
 from noisy_wrappers import BASELINE, Configuration

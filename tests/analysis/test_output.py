@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 import pytest
-from test_analyze import SCALE, run, write_run
+from sweeps import SCALE, run, write_run
 
 import analyze
 import evaluate

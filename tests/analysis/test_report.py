@@ -11,7 +11,7 @@ from html import escape, unescape
 import pandas as pd
 import pytest
 from fabricated import fabricate
-from test_analyze import RESULTS, SCALE, main, run, small_sweep, write_run
+from sweeps import RESULTS, SCALE, main, run, small_sweep, write_pairs, write_run
 
 import analysis.verdicts
 import analyze
@@ -83,7 +83,7 @@ def test_report_sorts_in_a_browser(results, tmp_path):
         const read = name => [...table.tBodies[0].rows].map(r => r.cells[column(name)].textContent);
         const click = name => { heads[column(name)].querySelector("button").click();
           return [heads[column(name)].getAttribute("aria-sort"), read(name)]; };
-        return [number("-1,234.5 \u00b1 6"), click("mean"), click("mean"), click("improvement %"),
+        return [number("-1,234.5 \u00b1 6"), click("mean"), click("mean"), click("difference %"),
           click("noise")];"""
     answer = in_browser(results / "report.html", script, 1280, tmp_path)
     value, (_, first), (_, second), (state, improvements), (_, noises) = answer
@@ -129,7 +129,7 @@ def test_a_picture_comes_first_and_only_tables_scroll(width, results, tmp_path):
 def test_no_table_of_a_large_report_scrolls_or_cuts_a_number(kind, large_results, tmp_path):
     if kind == "committed":
         large_results = tmp_path
-        main(analyze.Args(RESULTS / "data/runs", tmp_path, RESULTS / "paper"))
+        main(analyze.Args(RESULTS / "data/runs", tmp_path))
     script = """
         document.querySelectorAll("details").forEach(details => details.open = true);
         const cells = [...document.querySelectorAll("td")];
@@ -163,6 +163,7 @@ def test_an_empty_section_is_left_out(tmp_path):
     run(tmp_path)
     page = (tmp_path / "results/report.html").read_text()
     assert 'id="best"' in page and 'id="statistics"' in page
+    assert page.index('id="noises"') < page.index('id="best"') < page.index('id="statistics"')
     for name in ("consistent", "consistently_worse", "missing", "robustness"):
         assert f'id="{name}"' not in page and f'href="#{name}"' not in page
     assert "None." not in page
@@ -178,9 +179,8 @@ def test_a_single_run_has_no_empty_section(tmp_path):
 
 def test_the_counts_at_the_top_are_those_of_the_list(tmp_path):
     for env in ("Hopper-v5", "Pusher-v5"):
-        for seed in range(5):
-            write_run(tmp_path / "runs", [100 + seed], env=env, seed=seed)
-            write_run(tmp_path / "runs", [130 + seed], env=env, seed=seed, noise=SCALE, rate=0.1)
+        write_pairs(tmp_path / "runs", range(100, 105), range(130, 135), env=env)
+        write_pairs(tmp_path / "runs", [], range(140, 145), rate=0.2, env=env)
     run(tmp_path)
     page = (tmp_path / "results/report.html").read_text()
     top, listed = page.split("</h1>")[1].split("<ul>", 1)
@@ -190,7 +190,9 @@ def test_the_counts_at_the_top_are_those_of_the_list(tmp_path):
 
 def test_of_many_versions_is_said_at_the_end(tmp_path):
     for seed in (1, 2):
-        write_run(tmp_path / "runs", [seed], seed=seed, versions={"mujoco": f"3.{seed}.0"})
+        write_run(
+            tmp_path / "runs", [seed], seed=seed, config={"versions": {"mujoco": f"3.{seed}.0"}}
+        )
         write_run(tmp_path / "runs", [seed], seed=seed, noise=SCALE, rate=0.5)
     run(tmp_path)
     page = (tmp_path / "results/report.html").read_text()
