@@ -157,17 +157,10 @@ def make_run(args, algorithm, env_id, configuration, seed, phase=""):
 
 def name_of(args, algorithm, env_id, configuration, seed):
     """Return the name of a run's folder."""
-    given = args.given_words[algorithm]
+    names = ("env_kwargs", "test_noise", "test_noise_rate")
+    given = {name: args.given_words[algorithm].get(name, []) for name in names}
     try:
-        return run_name(
-            env_id,
-            args.exp_names[algorithm],
-            *configuration.texts,
-            seed,
-            env_kwargs=given.get("env_kwargs", []),
-            test_noise=given.get("test_noise", []),
-            test_noise_rate=list(map(rate, given.get("test_noise_rate", []))),
-        )
+        return run_name(env_id, args.exp_names[algorithm], *configuration.texts, seed, **given)
     except ValueError as error:
         return fail(f"after the --: {error}")
 

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 from analysis.errors import fail
-from noisy_wrappers import canonical_env_id, safe_name, split_noises
+from noisy_wrappers import Configuration, canonical_env_id, safe_name, split_noises
 from sweep import scripts
 from sweep.grid import ENVS, PRESETS, SEEDS, rate
 
@@ -139,6 +139,8 @@ def check_words(args, words):
     read = {name: scripts.read_words(script, words) for name, script in args.scripts.items()}
     args.given_words = {name: given for name, (given, _) in read.items()}
     args.extra = {name: command for name, (_, command) in read.items()}
+    for given in args.given_words.values():
+        given |= spelt_as_stored(given)
     args.exp_names = {
         name: " ".join(args.given_words[name].get("exp_name", [script.exp_name]))
         for name, script in args.scripts.items()
@@ -148,6 +150,17 @@ def check_words(args, words):
             "--exp-name: several algorithms would write into the same folders: name one algorithm "
             "with --algos, or leave --exp-name out and use another --runs-dir"
         )
+
+
+def spelt_as_stored(given):
+    """Return the options about the noise of tests as a run stores them."""
+    if "test_noise" not in given:
+        return {}
+    try:
+        test = Configuration.read(given["test_noise"], map(rate, given.get("test_noise_rate", [])))
+    except ValueError as error:
+        fail(f"--test-noise: {error}")
+    return dict(zip(("test_noise", "test_noise_rate"), map(list, test.texts), strict=True))
 
 
 def machines():

@@ -75,6 +75,11 @@ def our_own():
     }
 
 
+def shapes():
+    """Return all shapes of returns: {name: draw}."""
+    return DRAWS | our_own()
+
+
 def draw_again(rng, shape, values):
     """Draw from values with replacement."""
     return rng.choice(values, shape)
@@ -111,12 +116,24 @@ def choose(noises, plan, returns):
             returns[run]  # is drawn
 
 
+TESTS = {}  # of one choice: advance tests the earlier looks again whenever it is asked
+
+
+def once(x, y):
+    """Do a test that was not done before."""
+    key = (*x, None, *y)
+    if key not in TESTS:
+        TESTS[key] = permutation.permutation_t(x, y)
+    return TESTS[key]
+
+
 def simulate(noises, plan, gain, draw=normal, spread=1.0, trials=1000, seed=0):
     """Return the shares of choices that find the good noise, confirm it, claim any; their runs."""
     rng, sums = np.random.default_rng(seed), np.zeros(4)
     quick = {"RANDOM_PARTITIONS": PARTITIONS, "partitions": ALL_PARTITIONS}
-    with mock.patch.multiple(permutation, **quick):
+    with mock.patch.multiple(permutation, **quick), mock.patch.object(looks, "permutation_t", once):
         for _ in range(trials):
+            TESTS.clear()
             returns = Returns(rng, draw, gain, spread)
             state = choose(noises, plan, returns)
             claims = halving.judge(state, plan, returns).helps
@@ -151,27 +168,38 @@ def main():
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
     parser.add_argument("--trials", type=int, default=2000)
-    trials = parser.parse_args().trials
-    shapes = DRAWS | our_own()
+    parser.add_argument("--tables", nargs="+", type=int, default=[1, 2, 3, 4])
+    args = parser.parse_args()
+    for number in args.tables:
+        (power_of_a_confirmation, false_claims, whole_choices, levels)[number - 1](args.trials)
 
+
+def power_of_a_confirmation(trials):
+    """Print the first table."""
     print("Power of a confirmation of one noise, and runs of at most 50\n")
     columns = [f"{what}, +{gain:g} sd" for gain in (0, *GAINS) for what in ("shown", "runs")]
     rows = []
     for (name, draw), (design, plan) in product(
-        shapes.items(), (("1 look", FIXED), ("5 looks", FIVE))
+        shapes().items(), (("1 look", FIXED), ("5 looks", FIVE))
     ):
         cells = [simulate(1, plan, gain, draw, trials=trials) for gain in (0, *GAINS)]
         texts = [text for cell in cells for text in (f"{cell[2]:.3f}", f"{cell[3]:.0f}")]
         rows.append((name, design, *texts))
     print_table(("returns", "design", *columns), rows)
 
+
+def false_claims(trials):
+    """Print the second table."""
     print("False claims that a noise helps, by the spread with noise, in percent; 5 looks\n")
     rows = []
-    for name, draw in shapes.items():
+    for name, draw in shapes().items():
         claims = [simulate(1, FIVE, 0, draw, spread, 2 * trials)[2] for spread in SPREADS]
         rows.append((name, *(f"{100 * share:.1f}" for share in claims)))
     print_table(("returns", *(f"x {spread:g}" for spread in SPREADS)), rows)
 
+
+def whole_choices(trials):
+    """Print the third table."""
     print("Search and confirmation: found, confirmed, and runs\n")
     rows = []
     for noises, (name, draw) in product((22, 90, 10, 4), list(DRAWS.items())[:3]):
@@ -180,12 +208,15 @@ def main():
         rows.append((noises, name, *texts))
     print_table(("noises", "returns", *(f"+{gain:g} sd" for gain in (0, 1, 1.5, 2))), rows)
 
+
+def levels(trials):
+    """Print the fourth table."""
     print("Level of one test with unequal numbers of seeds, in percent: the worst shape\n")
     rows = []
     for n, m in ((5, 5), (5, 8), (5, 10), (5, 13), (5, 25), (5, 50), (10, 26), (3, 10)):
         worst = {
-            (100 * level(n, m, draw, spread), f"{name}, x {spread:g}")
-            for (name, draw), spread in product(shapes.items(), SPREADS)
+            (100 * level(n, m, draw, spread, 2 * trials), f"{name}, x {spread:g}")
+            for (name, draw), spread in product(shapes().items(), SPREADS)
         }
         rows.append(
             (f"{n} + {m}", *(f"{share:.1f} ({where})" for share, where in sorted(worst)[-3:]))
