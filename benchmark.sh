@@ -24,9 +24,14 @@ Every preset includes the baselines.
 
 Grid options replace a preset's values
   --algos sac td3 ppo
+             an algorithm of your own, redq, is the file redq_continuous_noisy.py in the project's or
+             in the current folder
   --envs Hopper-v5 my_envs:MyEnv-v0
              your own environment, from my_envs.py in the current folder
   --seeds 1-5 7
+  --baseline-seeds 1-13
+             seeds without noise. By default those of --seeds; in custom n sqrt(k) for n seeds of
+             each of k noises and rates, at most 2.6 n
   --noises "RandomNormalNoisyReward(1.0)" "RandomEarlyTermination(50)+RandomMixupObservation(0.5)"
              noises joined by + are combined
   --noise-rates 0.05 1.0 1.0:0.0
@@ -39,13 +44,15 @@ Grid options replace a preset's values
              runs/demo)
 
 Options of choose
-  --noises paper           the paper's 15 noises at 6 rates: 318 runs. The default is 10 noises at
-                           rates 0.05 and 1.0, 105 runs if all can act (see docs/sweeps.md). Both confirm
-                           a true gain of 1.5 standard deviations in 9 of 10 cases
+  --noises paper           the paper's 15 noises at 6 rates: 318 runs at most. The default is 11 noises
+                           at rates 0.05 and 1.0, 110 runs at most if all can act (docs/sweeps.md). Both
+                           confirm a true gain of 1.5 standard deviations in nearly 9 of 10 cases
   --exclude "NOISE@RATE"   noises to leave out, for example because they always fail
-  --budget N               about how many runs the search may take (default: 3 for each noise, at
-                           least 1); even with the least it takes about two for each noise
-  --confirm N              fresh seeds for the final comparison (default: 25)
+  --budget N               about how many runs the search may take (default: 3 for each noise and
+                           rate, at least 1); even with the least it takes about two for each
+  --confirm N              fresh seeds for the final comparison, at most (default: 25)
+  --looks N                how often the comparison is looked at, and may end (default: after each
+                           fifth of the seeds; 1: at the end)
   --metric success_rate    choose by the rate of success (default: return), where the info of an
                            episode's last step has is_success or success
 
@@ -63,7 +70,8 @@ Executor options
   --slurm-args "..."    options for sbatch, e.g. "--partition=cpu --time=24:00:00"
   --wait                slurm: wait for the jobs and report (choose always waits)
 
-Put options of the training scripts, such as --eval-episodes 20, at the end, after "--".
+Put options of the training scripts, such as --eval-episodes 20, at the end, after "--"; also
+--exp-name, which keeps runs with other options or of another version apart.
 
 Examples
   ./benchmark.sh choose --algos ppo --envs Pusher-v5 --noise-rates 1.0

@@ -127,14 +127,14 @@ def show_list(args, runs, choices):
     for run in todo:
         folder = f"{run.folder.parent}/{run.folder.name}"  # with a slash, for --runs-dir . too
         print(folder, command_line(run), sep="\t")
-    plan = [f"{counted(len(runs), 'run')}{with_baselines(runs)}, {len(todo)} to do"]
+    lines = [f"{counted(len(runs), 'run')}{with_baselines(runs)}, {len(todo)} to do"]
     if choices:
         from sweep import telling
 
-        plan = telling.plan(choices, args)
+        lines = telling.before_a_batch(choices, args)
     elif args.view == "dry-run" and todo:
-        plan[0] += "; " + cost(args, done, todo)
-    for line in plan:
+        lines[0] += "; " + cost(args, done, todo)
+    for line in lines:
         print(line, file=sys.stderr)
 
 

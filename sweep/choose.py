@@ -33,14 +33,13 @@ class Choice(NamedTuple):
     """The choice of a noise for one algorithm and environment, as far as it has come."""
 
     kind: tuple[str, str]  # algorithm, in capitals, and environment
-    noises: int  # that it began with
+    number: int  # of configurations that it began with
     plan: Plan  # of its confirmation
     batches: list[int]  # how many runs each round of the search has, and each look
     state: halving.State
     runs: dict[tuple[Configuration, int], PlannedRun]  # those that have been due so far
     returns: dict[tuple[Configuration, int], float]  # of the finished ones: returns, or the metric
     run_seconds: float | None  # about what a run takes, if anything tells
-    results: tuple[float, ...] = ()  # different results of all tests
     problem: str = ""  # why it cannot continue
 
     @property
@@ -135,7 +134,7 @@ def untried(args, env_id, environment, plans):
     All of them until the first run of a choice there is finished. From then on a choice keeps its
     noises: only such as were never tried, or were refused and are named all the same.
     """
-    noises = candidates(args, args.algos[0], env_id)
+    whole = candidates(args, args.algos[0], env_id)
     tried = environment.tried
     kept = candidates(args, args.algos[0], env_id, None if args.noises else environment)
     begun = (
@@ -143,8 +142,8 @@ def untried(args, env_id, environment, plans):
         for algorithm in args.algos
     )
     if not any(begun):
-        return noises
-    return [n for n in noises if n.noise not in tried or (args.noises and tried[n.noise])]
+        return whole
+    return [n for n in whole if n.noise not in tried or (args.noises and tried[n.noise])]
 
 
 def tell_what_is_left_out(args, env_id, environment):
@@ -188,28 +187,28 @@ def is_on_rewards(noise):
 
 
 def candidates(args, algorithm, env_id, environment=None):
-    """Return the noises to choose from, each once, but for those that cannot act there.
+    """Return the configurations to choose from, each once, but for those that cannot act there.
 
     environment: what is known of it. Exits if the user has named a noise that cannot act.
     """
-    noises = dict.fromkeys(configurations(args, algorithm, env_id))
-    noises.pop(BASELINE, None)  # at rate 0 a noise is none
+    found = dict.fromkeys(configurations(args, algorithm, env_id))
+    found.pop(BASELINE, None)  # at rate 0 a noise is none
     if any(rate is None for pairs in args.exclude for _, rate in pairs):
         fail('--exclude needs a rate with each noise, as in "NOISE@0.1"')
     for excluded in set(map(configuration_of, args.exclude)):
-        if excluded not in noises:
+        if excluded not in found:
             fail(f"--exclude: {excluded} is not among the noises")
-        del noises[excluded]
+        del found[excluded]
     if environment:
         tried = environment.tried
-        reasons = {noise.noise: tried[noise.noise] for noise in noises if noise.noise in tried}
+        reasons = {noise.noise: tried[noise.noise] for noise in found if noise.noise in tried}
         if args.noises and any(reasons.values()):
             fail(f"--noises: these cannot act in {env_id}: {unfit_noises(reasons)}")
         few = on_few_rewards(args, environment)
-        noises = [n for n in noises if not reasons.get(n.noise) and n.noise not in few]
-    if not noises:
+        found = [n for n in found if not reasons.get(n.noise) and n.noise not in few]
+    if not found:
         fail("there is no noise to choose from")
-    return list(noises)
+    return list(found)
 
 
 # --------------------------------------------------------------------------------- how far they are
@@ -217,33 +216,24 @@ def candidates(args, algorithm, env_id, environment=None):
 
 def follow(args, algorithm, env_id, environment, plan):
     """Return one choice: where the finished runs have brought it."""
-    noises = candidates(args, algorithm, env_id, environment)
-    budget = 3 * len(noises) if args.budget is None else args.budget
-    if budget < len(noises):
-        fail(f"--budget must be at least {len(noises)}, a run for each noise, not {budget}")
-    schedule = halving.schedule(len(noises), budget)
-    last_seed = sum(seeds for _, seeds in schedule)
+    tried = candidates(args, algorithm, env_id, environment)
+    budget = 3 * len(tried) if args.budget is None else args.budget
+    if budget < len(tried):
+        fail(f"--budget must be at least {len(tried)}, a run for each configuration, not {budget}")
+    sizes = halving.sizes_of_rounds(len(tried), budget)
+    last_seed = sum(seeds for _, seeds in sizes)
     if last_seed >= halving.FIRST_CONFIRMATION_SEED:
-        fail(f"--budget {budget} is too large: the best noises would run with {last_seed} seeds")
-    state, runs, returns, tests = walk(args, algorithm, env_id, noises, budget, plan)
+        fail(f"--budget {budget} is too large: the best would run with {last_seed} seeds")
+    state, runs, returns, tests = walk(args, algorithm, env_id, tried, budget, plan)
     seconds = mean_seconds(map(runs.get, returns))
     if seconds is None and environment.timed_steps:
         seconds = run_seconds(next(iter(runs.values())), environment)
-    results = tuple(set().union(*(values for values in tests.values() if values is not None)))
+    results = set().union(*([0.0] if values is None else values for values in tests.values()))
     looks = [0, *plan.looks]
-    batches = [number * seeds for number, seeds in schedule]
+    batches = [number * seeds for number, seeds in sizes]
     batches += [2 * (after - before) for before, after in itertools.pairwise(looks)]
-    choice = Choice(
-        (algorithm.upper(), env_id),
-        len(noises),
-        plan,
-        batches,
-        state,
-        runs,
-        returns,
-        seconds,
-        results,
-    )
+    kind = algorithm.upper(), env_id
+    choice = Choice(kind, len(tried), plan, batches, state, runs, returns, seconds)
     over = state.rounds or not state.due  # the first batch
     if over and args.metric == SUCCESS and all(values is None for values in tests.values()):
         return choice._replace(problem=NO_SUCCESS)
@@ -260,7 +250,7 @@ def all_equal(args, value, runs):
     )
 
 
-def walk(args, algorithm, env_id, noises, budget, plan):
+def walk(args, algorithm, env_id, tried, budget, plan):
     """Go from batch to batch as long as runs are finished.
 
     Returns the state; the runs that were due; what the finished ones returned, or their metric; and
@@ -269,7 +259,7 @@ def walk(args, algorithm, env_id, noises, budget, plan):
     """
     runs, returns, tests = {}, {}, {}
     while True:
-        state = halving.advance(noises, budget, plan, returns)
+        state = halving.advance(tried, budget, plan, returns)
         if runs.keys() >= set(state.due):  # they have not finished
             return state, runs, returns, tests
         for noise, seed in state.due:

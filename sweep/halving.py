@@ -5,9 +5,9 @@ is computed from them and from nothing else, so a choice can be interrupted anyw
 reads the returns from the run folders and names the runs that are due; benchmark.sh starts them.
 
 The search is sequential halving (Karnin, Koren and Somekh, 2013, "Almost Optimal Exploration in
-Multi-Armed Bandits", https://proceedings.mlr.press/v28/karnin13.html). An arm is a noise with its
-rate, a pull is a training run with a seed of its own. Runs are dear: a noise is judged by all its
-runs so far, those of earlier rounds included.
+Multi-Armed Bandits", https://proceedings.mlr.press/v28/karnin13.html). An arm is a configuration,
+that is noises with their rates; a pull is a training run with a seed of its own. Runs are dear: a
+configuration is judged by all its runs so far, those of earlier rounds included.
 
 The best of many looks better than it is on the seeds that chose it. So the winner meets the
 baseline on fresh seeds, in one comparison that is fixed beforehand, with the looks of looks.py.
@@ -27,8 +27,8 @@ FIRST_CONFIRMATION_SEED = 1001  # the search uses those below
 class Round(NamedTuple):
     """A round of the search whose runs are all finished."""
 
-    seeds: int  # each noise has run with the seeds from 1 to this one
-    scores: dict[Configuration, float]  # of all its noises
+    seeds: int  # each candidate has run with the seeds from 1 to this one
+    scores: dict[Configuration, float]  # of all its candidates
     survivors: list[Configuration]
 
 
@@ -36,7 +36,7 @@ class State(NamedTuple):
     """How far the choice for one algorithm and environment has come."""
 
     rounds: list[Round]  # those that are complete
-    noises: list[Configuration]  # still in the running, in the order given
+    candidates: list[Configuration]  # still in the running, in the order given
     seeds: range  # of the runs that the present round or look needs, earlier ones included
     due: list[tuple[Configuration, int]]  # with their seeds, those that are not finished
     look: int = 0  # of the confirmation, from 1; 0 during the search
@@ -45,46 +45,46 @@ class State(NamedTuple):
 # --------------------------------------------------------------------------------------- the search
 
 
-def schedule(noises, budget):
-    """Return the size of every round: [(noises, further seeds for each of them)].
+def sizes_of_rounds(number, budget):
+    """Return the size of every round: [(candidates, further seeds for each of them)].
 
-    As in Karnin et al., each of ceil(log2 n) rounds halves the noises. There the rounds share the
-    budget equally; here in proportion to the square root of their number of noises, because a good
-    noise is lost in the first rounds more often than in the last (tools/simulate_choose.py). The
-    budget, in runs, is a target: every noise gets at least one seed in every round.
+    As in Karnin et al., each of ceil(log2 n) rounds halves the candidates. There the rounds share
+    the budget equally; here in proportion to the square root of their number of candidates, because
+    a good one is lost in the first rounds more often than in the last. The budget, in runs, is a
+    target: every candidate gets at least one seed in every round.
     """
     numbers = []
-    while noises > 1:
-        numbers.append(noises)
-        noises = math.ceil(noises / 2)
+    while number > 1:
+        numbers.append(number)
+        number = math.ceil(number / 2)
     whole = sum(map(math.sqrt, numbers))
     return [(n, max(1, round(budget / whole / math.sqrt(n)))) for n in numbers]
 
 
-def advance(noises, budget, plan, returns):
+def advance(candidates, budget, plan, returns):
     """Return how far the choice has come, and which runs are due.
 
-    noises: configurations in the order given, which decides between equal scores.
+    candidates: configurations, in the order given, which decides between equal scores.
     plan: a Plan, the seeds of each look of the confirmation and its level.
     returns: {(configuration, seed): return}.
     """
     rounds, last_seed = [], 0
-    for _, further in schedule(len(noises), budget):
+    for _, further in sizes_of_rounds(len(candidates), budget):
         last_seed += further
         seeds = range(1, last_seed + 1)
-        due = missing(noises, seeds, returns)
+        due = missing(candidates, seeds, returns)
         if due:
-            return State(rounds, noises, seeds, due)
-        scores = {noise: fmean(returns[noise, seed] for seed in seeds) for noise in noises}
-        ranking = sorted(noises, key=scores.get, reverse=True)  # leaves equals in their order
-        best = ranking[: math.ceil(len(noises) / 2)]
-        noises = [noise for noise in noises if noise in best]
-        rounds.append(Round(last_seed, scores, noises))
+            return State(rounds, candidates, seeds, due)
+        scores = {one: fmean(returns[one, seed] for seed in seeds) for one in candidates}
+        ranking = sorted(candidates, key=scores.get, reverse=True)  # leaves equals in their order
+        best = ranking[: math.ceil(len(candidates) / 2)]
+        candidates = [candidate for candidate in candidates if candidate in best]
+        rounds.append(Round(last_seed, scores, candidates))
     for look, number in enumerate(plan.looks, start=1):
         seeds = fresh_seeds(number)
-        due = missing([*noises, BASELINE], seeds, returns)
-        if due or look == len(plan.looks) or stops(*pair(*noises, seeds, returns), look, plan):
-            return State(rounds, noises, seeds, due, look)
+        due = missing([*candidates, BASELINE], seeds, returns)
+        if due or look == len(plan.looks) or stops(*pair(*candidates, seeds, returns), look, plan):
+            return State(rounds, candidates, seeds, due, look)
     raise AssertionError("a confirmation has at least one look")
 
 
@@ -94,21 +94,21 @@ def fresh_seeds(number):
 
 
 def spread(returns):
-    """Return the standard deviation over the seeds of a noise in the search, pooled over noises.
+    """Return the standard deviation over the seeds of one configuration, pooled over the search.
 
-    returns: {(configuration, seed): return}. NaN if no noise has two.
+    returns: {(configuration, seed): return}. NaN if no candidate has two.
     """
     groups = {}
-    for (noise, seed), value in returns.items():
+    for (candidate, seed), value in returns.items():
         if seed < FIRST_CONFIRMATION_SEED:
-            groups.setdefault(noise, []).append(value)
+            groups.setdefault(candidate, []).append(value)
     std, freedom = statistics.pooled_std(list(groups.values()))
     return float(std) if freedom else math.nan
 
 
-def missing(noises, seeds, returns):
-    """Return the runs that have no return yet, the first seed of every noise first."""
-    wanted = [(noise, seed) for seed in seeds for noise in noises]
+def missing(candidates, seeds, returns):
+    """Return the runs that have no return yet, the first seed of every candidate first."""
+    wanted = [(candidate, seed) for seed in seeds for candidate in candidates]
     return [run for run in wanted if run not in returns]
 
 
@@ -117,7 +117,7 @@ def missing(noises, seeds, returns):
 
 def pair(winner, seeds, returns):
     """Return the returns of the winner and of the baseline on the fresh seeds."""
-    return tuple([returns[noise, seed] for seed in seeds] for noise in (winner, BASELINE))
+    return tuple([returns[candidate, seed] for seed in seeds] for candidate in (winner, BASELINE))
 
 
 class Verdict(NamedTuple):
@@ -145,7 +145,7 @@ def judge(state, plan, returns, episodes=None):
     episodes: of a test, where returns are rates of success in percent.
     """
     needed = nominal_levels(plan)[state.look - 1]
-    samples = pair(*state.noises, state.seeds, returns)
+    samples = pair(*state.candidates, state.seeds, returns)
     comparison = statistics.compare(*samples, level=needed, episodes=episodes)
     return Verdict(comparison, len(state.seeds), plan.looks[-1], needed)
 
@@ -154,9 +154,9 @@ def records(algorithm, environment, state, returns, helped):
     """Yield the rows of choice.csv for one finished choice; their columns are CHOICE_COLUMNS."""
     kind = algorithm, environment
     for number, done in enumerate(state.rounds, start=1):
-        for noise, score in done.scores.items():
-            survives = "yes" if noise in done.survivors else "no"
-            yield *kind, "search", number, *noise.columns, done.seeds, score, survives
-    for noise, survives in ((BASELINE, ""), (*state.noises, "yes" if helped else "no")):
-        score = fmean(returns[noise, seed] for seed in state.seeds)
-        yield *kind, "confirmation", "", *noise.columns, len(state.seeds), score, survives
+        for candidate, score in done.scores.items():
+            survives = "yes" if candidate in done.survivors else "no"
+            yield *kind, "search", number, *candidate.columns, done.seeds, score, survives
+    for candidate, survives in ((BASELINE, ""), (*state.candidates, "yes" if helped else "no")):
+        score = fmean(returns[candidate, seed] for seed in state.seeds)
+        yield *kind, "confirmation", "", *candidate.columns, len(state.seeds), score, survives

@@ -23,7 +23,7 @@ UNITS = {"return": "", SUCCESS: POINTS}  # of a difference, by the metric
 # ---------------------------------------------------------------------------------- before a batch
 
 
-def plan(found, args):
+def before_a_batch(found, args):
     """Return lines that say, before a batch starts, what it is for and what all of it will take.
 
     They also say what gain can be confirmed; before any run only in standard deviations.
@@ -41,7 +41,7 @@ def plan(found, args):
 
 def question(choice):
     """Say what a choice will decide, and how."""
-    which = f"the best of {choice.noises} noises" if choice.noises > 1 else "the noise"
+    which = f"the best of {choice.number} configurations" if choice.number > 1 else "the noise"
     *early, last = choice.plan.looks
     looks = f", or fewer: after {', '.join(map(str, early))} it may be clear" if early else ""
     return (
@@ -104,16 +104,16 @@ def describe(choice):
     seeds = f"seeds {state.seeds[0]} to {state.seeds[-1]}" if len(state.seeds) > 1 else "seed 1"
     due = f"{seeds}; runs to do: {len(state.due)}"
     if not state.look:
-        noises = f"{len(state.noises)} of {counted(choice.noises, 'noise')}"
-        return f"{choice.name}, round {len(state.rounds) + 1} of {rounds}: {noises}, {due}"
-    [winner] = state.noises
+        left = f"{len(state.candidates)} of {counted(choice.number, 'configuration')}"
+        return f"{choice.name}, round {len(state.rounds) + 1} of {rounds}: {left}, {due}"
+    [winner] = state.candidates
     looks = len(choice.plan.looks)
     which = f", look {state.look} of {looks}" if looks > 1 else ""
     return f"{choice.name}, confirmation{which}: {winner} against no noise, {due}"
 
 
 def standing(found, args):
-    """Yield lines that say where each choice stands, which noises survive, and what is left.
+    """Yield lines that say where each choice stands, what is in the running, and what is left.
 
     When all choices are finished, these are the verdicts.
     """
@@ -125,7 +125,7 @@ def standing(found, args):
         if choice.state.due and choice.state.rounds:
             yield f"  mean {args.metric} after round {len(choice.state.rounds)}:"
             scores = choice.state.rounds[-1].scores
-            for noise in sorted(choice.state.noises, key=scores.get, reverse=True):
+            for noise in sorted(choice.state.candidates, key=scores.get, reverse=True):
                 yield f"  {rounded(scores[noise]):>10}  {noise}"
     yield total(found, args)
 
@@ -148,9 +148,9 @@ def report(found, args):
 
 def sentence_of(choice, args):
     """Say what a finished choice found."""
-    [winner] = choice.state.noises
+    [winner] = choice.state.candidates
     share, unit = shared_level(choice.plan), UNITS[args.metric]
-    return sentence(choice.name, winner, choice.noises, judged(choice, args), share, unit)
+    return sentence(choice.name, winner, choice.number, judged(choice, args), share, unit)
 
 
 def judged(choice, args):
@@ -160,11 +160,11 @@ def judged(choice, args):
     return halving.judge(choice.state, choice.plan, choice.returns, episodes)
 
 
-def sentence(name, winner, noises, verdict, share=0, unit=""):
+def sentence(name, winner, number, verdict, share=0, unit=""):
     """Say in one plain sentence what came out.
 
-    name: the algorithm and the environment. noises: how many were searched. share: how many
-    verdicts share the level. unit: of the difference.
+    name: the algorithm and the environment. number: of configurations that were searched. share:
+    how many verdicts share the level. unit: of the difference.
     """
     comparison = verdict.comparison
     seeds = f"{verdict.seeds} fresh seeds"
@@ -175,13 +175,13 @@ def sentence(name, winner, noises, verdict, share=0, unit=""):
     if verdict.needed < LEVEL:
         evidence += f", needed: {two_digits(verdict.needed)}"
         evidence += f" (level shared by {share} verdicts)" if share else ""
-    none = f"none of {noises} noises could be shown to help; the best of them, {winner}"
-    said = none if noises > 1 else f"{winner} could not be shown to help"
+    none = f"none of {number} configurations could be shown to help; the best of them, {winner}"
+    said = none if number > 1 else f"{winner} could not be shown to help"
     if verdict.helps:
         said = f"{winner} beats no noise"
     elif verdict.significant:
         said = (
-            f"{none}, is worse than no noise" if noises > 1 else f"{winner} is worse than no noise"
+            f"{none}, is worse than no noise" if number > 1 else f"{winner} is worse than no noise"
         )
     else:
         evidence += excluded(comparison, unit)

@@ -137,7 +137,7 @@ def simulate(noises, plan, gain, draw=normal, spread=1.0, trials=1000, seed=0):
             returns = Returns(rng, draw, gain, spread)
             state = choose(noises, plan, returns)
             claims = halving.judge(state, plan, returns).helps
-            found = state.noises == NOISES[:1]
+            found = state.candidates == NOISES[:1]
             sums += found, found and claims, claims, len(returns)
     return sums / trials
 

@@ -22,7 +22,7 @@ from analysis.statistics import Comparison, contrast
 from noisy_wrappers import BASELINE, Configuration
 from sweep import choose, telling
 from sweep.environment import Environment, remember
-from sweep.halving import FIRST_CONFIRMATION_SEED, Verdict, advance, judge, records, schedule
+from sweep.halving import FIRST_CONFIRMATION_SEED, Verdict, advance, judge, records, sizes_of_rounds
 from sweep.looks import Plan, bounds, futility_limits, looks_after, nominal_levels
 from sweep.options import parse_args
 
@@ -62,14 +62,14 @@ def draw(rng, effects):
 
 
 def test_schedule():
-    assert schedule(1, 3) == []
-    assert schedule(2, 6) == [(2, 3)]
+    assert sizes_of_rounds(1, 3) == []
+    assert sizes_of_rounds(2, 6) == [(2, 3)]
     # The shares of two rounds are 12 * 2 / (2 + 1.41) = 7.03 runs and 4.97: 1.8 and 2.5 a noise.
-    assert schedule(4, 12) == [(4, 2), (2, 2)]
-    assert schedule(5, 15) == [(5, 1), (3, 2), (2, 2)]
-    assert schedule(90, 270) == [(90, 1), (45, 1), (23, 2), (12, 3), (6, 4), (3, 5), (2, 6)]
-    assert schedule(16, 16) == [(16, 1), (8, 1), (4, 1), (2, 1)]  # never less than one seed
-    assert len(schedule(64, 640)) == 6 and len(schedule(65, 640)) == 7
+    assert sizes_of_rounds(4, 12) == [(4, 2), (2, 2)]
+    assert sizes_of_rounds(5, 15) == [(5, 1), (3, 2), (2, 2)]
+    assert sizes_of_rounds(90, 270) == [(90, 1), (45, 1), (23, 2), (12, 3), (6, 4), (3, 5), (2, 6)]
+    assert sizes_of_rounds(16, 16) == [(16, 1), (8, 1), (4, 1), (2, 1)]  # never less than one seed
+    assert len(sizes_of_rounds(64, 640)) == 6 and len(sizes_of_rounds(65, 640)) == 7
 
 
 def test_advance_by_hand():
@@ -88,7 +88,7 @@ def test_advance_by_hand():
     returns |= {(b, 2): 1.0, (b, 3): 3.0, (c, 2): 2.0, (c, 3): 2.0}
     # Of seeds 2 and 3 alone, both means are 2; of all seeds, b has 3 and c has 2.67.
     state = advance(noises, 7, Plan((4,), 0.05), returns)
-    assert state.noises == [b]
+    assert state.candidates == [b]
     assert [done.survivors for done in state.rounds] == [[b, c], [b]]
     assert state.rounds[1].scores == {b: 3.0, c: pytest.approx(8 / 3)}
     assert state.seeds == range(1001, 1005)
@@ -112,9 +112,9 @@ def test_equal_scores_are_decided_by_the_order_given():
 def test_every_choice_takes_the_announced_number_of_runs(count):
     rng = np.random.default_rng(count)
     state, returns = play(named(count), 3 * count, draw(rng, rng.normal(0, 0.1, count)))
-    search = sum(noises * seeds for noises, seeds in schedule(count, 3 * count))
+    search = sum(noises * seeds for noises, seeds in sizes_of_rounds(count, 3 * count))
     assert len(returns) == search + 2 * CONFIRM
-    assert len(state.noises) == 1 and len(state.rounds) == math.ceil(math.log2(count))
+    assert len(state.candidates) == 1 and len(state.rounds) == math.ceil(math.log2(count))
 
 
 def test_a_planted_noise_is_found_and_confirmed():
@@ -124,7 +124,7 @@ def test_a_planted_noise_is_found_and_confirmed():
         best = rng.integers(90)
         effects[best] = 1.5  # five standard deviations of a seed
         state, returns = play(named(90), 270, draw(rng, effects))
-        assert state.noises == [named(90)[best]]
+        assert state.candidates == [named(90)[best]]
         assert judge(state, ONE_LOOK, returns).helps
 
 
@@ -282,7 +282,7 @@ def test_verdicts_in_words():
     assert early.endswith("p = 0.011, needed: 0.013 (level shared by 3 verdicts).")
     unclear = GOOD._replace(p=0.07, difference_low=-1.0, percent_low=-2.0)
     told = said(unclear, needed=0.022)
-    assert "none of 90 noises could be shown to help; the best of them, Random" in told
+    assert "none of 90 configurations could be shown to help; the best of them, Random" in told
     assert told.endswith("; excluded: a gain of more than 28 %, a loss of more than 2.0 %.")
     assert "at 1.0 could not be shown to help: " in said(unclear, noises=1)
     odd = " Borderline: the interval includes zero."  # beside such a p it looks like a mistake
@@ -485,7 +485,7 @@ def test_the_default_noises_and_those_of_the_paper(tmp_path):
     def tried(more=""):
         args = parse_args("status", "/", f"{words} {more}".split())
         [choice] = choose.choices(args)
-        return choice.state.noises
+        return choice.state.candidates
 
     assert len(tried()) == 22 and {noise.noise_rate for noise in tried()} == {"0.05", "1.00"}
     assert len({noise.noise for noise in tried()}) == 11
@@ -544,7 +544,7 @@ def test_what_the_confirmation_can_show(tmp_path):
 
     def lines(words):
         args = arguments(words, tmp_path)
-        plan = telling.plan(choose.choices(args), args)
+        plan = telling.before_a_batch(choose.choices(args), args)
         return [line for line in plan if "fresh seeds confirm" in line]
 
     unit = "standard deviations over seeds with 80 % power"
@@ -686,12 +686,12 @@ def test_status_says_who_survives(tmp_path, monkeypatch):
     )
     line, total = telling.standing(choose.choices(args), args)
     assert total == "15 runs in all, 7 to search and 8 to confirm; 0 are done"
-    assert line == "PPO on Pendulum-v1, round 1 of 2: 3 of 3 noises, seed 1; runs to do: 3"
+    assert line == "PPO on Pendulum-v1, round 1 of 2: 3 of 3 configurations, seed 1; runs to do: 3"
     for choice in choose.choices(args):
         for run in choice.state.due:
             stub_run.train(choice.runs[run].command)
     assert list(telling.standing(choose.choices(args), args)) == [
-        "PPO on Pendulum-v1, round 2 of 2: 2 of 3 noises, seeds 1 to 3; runs to do: 4",
+        "PPO on Pendulum-v1, round 2 of 2: 2 of 3 configurations, seeds 1 to 3; runs to do: 4",
         "  mean return after round 1:",
         f"  {rounded(scores[best]):>10}  {best} at 1.0",
         f"  {rounded(scores[second]):>10}  {second} at 1.0",

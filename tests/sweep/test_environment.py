@@ -181,7 +181,7 @@ def test_noises_that_cannot_act_are_left_out_or_refused(tmp_path):
     assert line.count("cannot perturb categories") == 1 and f"{SCALE}, " in line
     assert f"; {LATE} (an episode has at most 8 steps)" in line
     assert re.search(r"; RandomDynamics\(0\.7, 1\.3\) \([^()]*MuJoCo", line)
-    assert " of 4 noises" in shown.err
+    assert " of 4 configurations" in shown.err
     named = ["--noises", LATE, "RandomNormalNoisyReward(1.0)", "--noise-rates", "1"]
     shown = choose("Tiny", *named, "--runs-dir", tmp_path)
     assert (shown.code, shown.out) == (2, "")
@@ -310,8 +310,12 @@ def test_a_plan_says_what_it_will_decide(tmp_path):
     speed, left_out, few, question, first, total, gain, place = shown.err.splitlines()
     assert "RandomDynamics" in left_out and "Reward" in few
     milliseconds = float(re.fullmatch(r"toy_envs:Slow-v0: ([\d.]+) ms a step", speed)[1])
-    assert question.startswith("PPO on toy_envs:Slow-v0: is the best of 14 noises better than no ")
-    assert first.startswith("PPO on toy_envs:Slow-v0, round 1 of 4: 14 of 14 noises, seed 1")
+    assert question.startswith(
+        "PPO on toy_envs:Slow-v0: is the best of 14 configurations better than no "
+    )
+    assert first.startswith(
+        "PPO on toy_envs:Slow-v0, round 1 of 4: 14 of 14 configurations, seed 1"
+    )
     hours = re.search(
         r"at most 92 runs, .*, about ([\d,]+) core-hours are left, ([\d.,]+) h", total
     )
@@ -366,12 +370,12 @@ def test_any_dry_run_says_what_it_costs_and_finished_runs_tell_better(tmp_path):
 
 def test_a_status_makes_no_environment(tmp_path, monkeypatch):
     words = ["--runs-dir", tmp_path, "--noise-rates", "1"]
-    assert "of 11 noises" in choose("Tiny", *words, view_name="status").out
-    assert "of 9 noises" in choose("Tiny", *words).err and not list(tmp_path.iterdir())
+    assert "of 11 configurations" in choose("Tiny", *words, view_name="status").out
+    assert "of 9 configurations" in choose("Tiny", *words).err and not list(tmp_path.iterdir())
     assert choose("Tiny", *words, view_name="list").code == 0
     monkeypatch.setattr(environment, "ask", None)
     shown = choose("Tiny", *words, view_name="status").out
-    assert "9 of 9 noises" in shown and "core-hours are left" in shown
+    assert "9 of 9 configurations" in shown and "core-hours are left" in shown
 
 
 def test_a_choice_that_has_begun_is_not_asked_again(tmp_path, monkeypatch):
@@ -391,10 +395,10 @@ def test_another_choice_in_the_folder_changes_no_noises_of_the_first(tmp_path):
     other = ["--noises", f"{SCALE}@1", "--confirm", "4", *short]
     for line in choose("Tiny", *other, view_name="list").out.splitlines():
         train(line)
-    assert "9 of 9 noises" in choose("Tiny", *first, view_name="status").out
+    assert "9 of 9 configurations" in choose("Tiny", *first, view_name="status").out
     [path] = tmp_path.glob("logs/*.json")
     path.unlink()
-    assert "9 of 9 noises" in choose("Tiny", *first, view_name="list").err
+    assert "9 of 9 configurations" in choose("Tiny", *first, view_name="list").err
     # what no earlier choice tried is tried, and one that cannot act is refused whoever asks again
     for _ in range(2):
         other[1] = f"{LATE[:-1]}, 60)@1"
@@ -410,7 +414,7 @@ def test_a_refusal_holds_until_the_noise_is_named_again(tmp_path):
     tried = known.tried | {SCALE: "NameError: an error that has been mended"}
     remember(tmp_path, "toy_envs:Tiny-v0", known._replace(tried=tried))
     for algos in (["ppo"], ["ppo", "sac"]):
-        assert "8 of 8 noises" in choose("Tiny", *first, view_name="list", algos=algos).err
+        assert "8 of 8 configurations" in choose("Tiny", *first, view_name="list", algos=algos).err
     named = ["--noises", f"{SCALE}@1", "--confirm", "4", *short]
     assert choose("Tiny", *named, view_name="list").code == 0
     assert choose("Tiny", *named, view_name="status").code == 0

@@ -522,9 +522,9 @@ def test_baselines_that_pay(noises, more, baselines):
         (f"{C} --seeds 1-3", "leave out --seeds"),
         (
             f"{C} --noises paper --budget 89",
-            "--budget must be at least 90, a run for each noise, not 89",
+            "--budget must be at least 90, a run for each configuration, not 89",
         ),
-        (f"{C} --budget 100000", "--budget 100000 is too large: the best noises would run with"),
+        (f"{C} --budget 100000", "--budget 100000 is too large: the best would run with"),
         (f"{C} --confirm 3", "--confirm must be at least 4, not 3: with fewer seeds no difference"),
         (f"{C} --envs Hopper Pusher-v5 --confirm 4", "--confirm must be at least 5, not 4: "),
         (f"{C} --noises {A} --noise-rates 0", "there is no noise to choose from"),
