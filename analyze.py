@@ -45,6 +45,7 @@ from analysis.tables import (
 )
 from analysis.verdicts import POINTS, clear_first, headlines, in_sentences, tally
 
+MOST_ROWS = 15  # of the first table in a terminal; the report has all
 # Columns that a terminal may have room for, the most important ones first
 MISSING_IN_SHORT = ["status", "reason", "seeds", "environment", "noise", "noise_rate", "run"]
 
@@ -142,6 +143,10 @@ def print_results(out, results):
     for line in verdicts_in_short(results):
         say(line)
     print()
+    first = tables["noises"]
+    if 0 < len(first.frame) <= MOST_ROWS:
+        say("Does a noise help at all? Its rates together, against no noise:")
+        print(f"\n{text_table(first, width)}\n")
     if len(tables["best"].frame):
         say("The best noise in each environment, which may still be worse than no noise:")
         print(f"\n{text_table(tables['best'], width)}\n")

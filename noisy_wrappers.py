@@ -1494,7 +1494,7 @@ class Configuration:
         """
         for noise, rate in zip(*self.texts, strict=True):
             if isinstance(rate, str):
-                raise ValueError(f"a test has no beginning and no end: {noise} at {rate}")
+                raise ValueError(f"policies are tested at constant rates, not at {rate}")
             _, name, _, arguments = _read_call(noise)
             measured = name in WRAPPERS and WRAPPERS[name].kind in ("observation", "reward")
             if measured and arguments.get("relative"):

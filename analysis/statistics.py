@@ -97,7 +97,8 @@ def fieller(x, y, level=LEVEL, episodes=None):
 
     Both means are uncertain. The interval has the ratios r for which Student's t of mean x -
     r mean y does not reject 0, with Satterthwaite's degrees of freedom at the observed ratio. It is
-    NaN where that set is unbounded: mean y is not clearly unequal to zero.
+    NaN where that set is unbounded, because mean y is not clearly unequal to zero, or nearly so:
+    percent_of tells no change beyond 1,000 % either.
 
     x (seeds,), y (other seeds,), two or more on each side; level, episodes: see contrast.
     Fieller (1954), https://doi.org/10.1111/j.2517-6161.1954.tb00159.x
@@ -115,6 +116,8 @@ def fieller(x, y, level=LEVEL, episodes=None):
     product = means.prod()
     root = sqrt(max(0.0, product**2 - of_x * of_y))
     changes = 100 * (np.array([product - root, product + root]) / of_y - 1) * np.sign(means[1])
+    if max(abs(changes)) > 100 / PERCENT_OF_SPAN:
+        return nan, nan
     low, high = (at_least_minus_100(change, np.append(x, y)) for change in sorted(changes))
     return float(low), float(high)
 

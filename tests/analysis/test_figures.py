@@ -159,13 +159,6 @@ def test_changing_rates_and_combinations_have_lines(tmp_path):
     assert named == ["no noise", "rate 1.00 to 0.00", "rate 1.00"]
 
 
-@pytest.mark.parametrize("number, width", [(1, 5.2), (2, 8), (3, 10), (5, 10)])
-def test_a_figure_is_as_wide_as_its_panels_need(number, width):
-    what = list("ABCDE"[:number]), ["no noise"], "return", "steps"
-    figure, axes, _ = analysis.figures.panels(*what)
-    assert figure.get_figwidth() == width and len(axes) == number
-
-
 def test_committed_figures_are_those_that_a_page_shows():
     pages = [RESULTS.parent / "README.md", *RESULTS.glob("*.md"), *RESULTS.parent.glob("docs/*.md")]
     shown = re.findall(r"!\[[^]]*\]\([^)]*figures/([^)]*)\)", "".join(p.read_text() for p in pages))

@@ -269,11 +269,6 @@ def test_compressed_damaged_and_unfinished_runs(tmp_path, capsys):
     assert run(tmp_path, out="none")["robustness_score"].empty  # nothing to compare with
 
 
-def test_no_robustness_without_its_files(tmp_path):
-    write_run(tmp_path / "runs", [1.0])
-    assert not [name for name in run(tmp_path) if "robustness" in name]
-
-
 def test_heatmap(tmp_path):
     table = {config: dict(conditions) for config, conditions in HOPPER.items()}
     for conditions in table.values():

@@ -182,15 +182,6 @@ def test_of_many_comparisons_the_first_are_shown_and_all_are_counted():
     assert analysis.verdicts.tally(rest["verdict"]) == "7 comparisons: 7 worse"
 
 
-def test_a_table_has_the_digits_that_the_spread_deserves():
-    numbers = {"mean": [0.8712, 9512.3, 1e-6, 5.0], "std": [0.034, 210.0, 0, np.nan]}
-    numbers |= {"score": [0.5, np.nan, 1234567.8, 0]}
-    text = analysis.formatting.shown(analysis.formatting.Table("t", pd.DataFrame(numbers), "", ""))
-    cells = ["0.871 \u00b1 0.034", "9,512 \u00b1 210", "1.000e-06 \u00b1 0", "5.000 \u00b1 \u2013"]
-    assert list(text["mean"]) == cells
-    assert list(text["score"]) == ["0.5000", "\u2013", "1,234,568", "0"]
-
-
 def test_which_numbers_of_seeds_are_lopsided():
     seeds = [(5, 13), (5, 14), (50, 5), (30, 50), (20, 100), (3, 3)]
     expected = [False, True, True, False, False, False]
