@@ -322,11 +322,11 @@ def rewritten(path):
             new.unlink(missing_ok=True)
 
 
-# ---------------------------------------------------------- until sweep/ and evaluate.py have moved
+# ------------------------------------------------------------------------- until sweep/ has moved
 
 
 def read_config(folder):
-    """Read config.json as sweep/ and evaluate.py did before there was read_run."""
+    """Read config.json as sweep/ did before there was read_run."""
     run = read_identity(folder)
     return {
         "algorithm": run.algorithm,
@@ -344,14 +344,8 @@ def read_config(folder):
 
 
 def read_result(folder, config):
-    """Read result.json as sweep/ and evaluate.py did; config: from read_config."""
+    """Read result.json as sweep/ did; config: from read_config."""
     return read_result_of(config["run"])
-
-
-def difference(settings, reference):
-    """Return the names of the settings that both have, with different values, in order."""
-    shared = sorted(settings.keys() & reference.keys())
-    return [name for name in shared if settings[name] != reference[name]]
 
 
 def flat_choice(runs_dir):

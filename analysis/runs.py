@@ -261,7 +261,7 @@ def ranges(numbers):
     return ", ".join(f"{low}" if low == high else f"{low}-{high}" for low, high in parts)
 
 
-# ---------------------------------------------------------- until sweep/ and evaluate.py have moved
+# ------------------------------------------------------------------------- until sweep/ has moved
 
 
 def read_run(folder):
@@ -273,8 +273,3 @@ def read_run(folder):
         row |= {"steps": curve.steps, "returns": curve.returns}
         row["success_rates"] = curve.success_rates
     return row
-
-
-def usual_settings(settings):
-    """Return the most frequent arguments of a study, as evaluate.py had them."""
-    return usual_config([{"args": arguments} for arguments in settings])["args"]

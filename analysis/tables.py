@@ -44,7 +44,7 @@ COLUMNS = {name: text.split() for name, text in _COLUMNS.items()} | {
     "statistics_together": [*RATES, *IQM_CHANGE, *PROBABILITY, *MORE],
 }  # after those that name a study
 COLUMNS = {name: [*STUDY, *columns] for name, columns in COLUMNS.items()}
-ONLY_CSV = (*IQM, *MORE)
+ONLY_CSV = (*IQM, *MORE, "detectable")
 
 # --------------------------------------------------------------------------------------------- rows
 
