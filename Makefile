@@ -5,7 +5,7 @@ BIN := .venv/bin
 SHELL := bash
 .SHELLFLAGS := -o pipefail -c
 
-.PHONY: demo test lint results clean
+.PHONY: demo test changes lint results clean
 
 demo: $(BIN)/.run
 	@echo "Ten runs of PPO, five of them with noise: about three minutes on one core"
@@ -19,6 +19,10 @@ demo: $(BIN)/.run
 
 test: $(BIN)/.dev
 	$(BIN)/python -m pytest --numprocesses 3 --dist worksteal
+
+# Every change of docs/changing.md through tools/check_script.py and a sweep; `make test` does two.
+changes: $(BIN)/.dev
+	CHANGES=all $(BIN)/python -m pytest --numprocesses 3 --dist worksteal tests/scripts/test_changing.py
 
 lint: $(BIN)/.dev
 	$(BIN)/ruff check .

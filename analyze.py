@@ -1,15 +1,15 @@
 """Make the paper's tables and figures from a folder of runs, with statistics fit for few seeds.
 
     python analyze.py
-    python analyze.py --runs-dir runs/demo --out somewhere --compare results/paper
+    python analyze.py --runs-dir runs/demo --out somewhere --smallest-gain 10
 
 The tables, the figures and report.html go to RUNS_DIR/results unless --out says otherwise. Open
 report.html first.
 
-The unit of replication is the seed: a run's value at a step is the mean over its test episodes, and
-every mean, standard deviation (ddof=1) and interval is taken over runs. Only finished runs (those
-with a result.json) count; all others are listed, and the exit status is 1 if one is damaged. The
-paper is Khraishi and Okhrati (2023),
+The unit of replication is the seed: a run counts with the mean of its tests in the last 15 % of its
+steps, and every mean, standard deviation (ddof=1) and interval is taken over runs. Only finished
+runs (those with a result.json) count; all others are listed, and the exit status is 1 if one is
+damaged. The paper is Khraishi and Okhrati (2023),
 https://arxiv.org/abs/2305.02882; IQM and probability of improvement are those of Agarwal et al.
 (2021), https://arxiv.org/abs/2108.13264.
 """
@@ -22,19 +22,30 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+import pandas as pd
 import tyro
 
+from analysis.choice import read_choice
+from analysis.comparisons import as_chosen, compare_all
 from analysis.errors import fail, take_over_terminal
 from analysis.figures import figures, write_figure
-from analysis.folders import is_phase, is_run
+from analysis.folders import CONFIRMATION, RETURN, SUCCESS, is_phase, is_run
 from analysis.formatting import WHOLE_WORDS, text_table, write_table
-from analysis.paper import read_paper
 from analysis.report import Results, write_report
 from analysis.robustness import analyse_robustness, read_robustness
-from analysis.runs import SUCCESS, left_out, make_studies, read_choice, read_runs, version_notes
-from analysis.tables import all_equal_notes, family_notes, make_tables, success_table, table_of
+from analysis.runs import KEYS, MORE_TO_COME, finished, in_short, left_out, read_runs
+from analysis.studies import make_studies, version_notes
+from analysis.tables import (
+    all_equal_notes,
+    family_notes,
+    lopsided_notes,
+    make_tables,
+    success_table,
+    table_of,
+)
 from analysis.verdicts import POINTS, clear_first, headlines, in_sentences, tally
 
+MOST_ROWS = 15  # of the first table in a terminal; the report has all
 # Columns that a terminal may have room for, the most important ones first
 MISSING_IN_SHORT = ["status", "reason", "seeds", "environment", "noise", "noise_rate", "run"]
 
@@ -47,12 +58,13 @@ class Args:
     """the folder that holds the run folders"""
     out: Path | None = None
     """where the tables, the figures and report.html go; by default RUNS_DIR/results"""
-    compare: Path | None = None
-    """a folder with the paper's tables as csv (results/paper): adds compare_* tables"""
     latex: bool = False
     """also write the tables as Markdown and LaTeX, and the figures as pdf"""
-    metric: Literal["return", "success_rate"] = "return"
+    metric: Literal["return", "success_rate"] = RETURN
     """what the verdicts judge by: final test returns, or rates of success in percent"""
+    smallest_gain: float | None = None
+    """the smallest gain that matters, in percent (of success: in percentage points): a noise whose
+    interval excludes it has the verdict "no such gain\""""
 
 
 def no_finished_run(runs_dir):
@@ -74,17 +86,19 @@ def verdicts_in_short(results):
     yield from results.clear["sentence"]
     if len(results.clear) and len(results.others):
         yield f"Not shown here, but in the report: {tally(results.others['verdict'])}."
+    if len(results.rates):
+        yield f"Single rates (secondary, in the report): {tally(results.rates['verdict'])}."
     yield from results.robustness
 
 
-def overview_of(runs, studies):
+def overview_of(entries, studies):
     """Say in words what was analysed."""
-    overview = f"Finished runs: {(runs['status'] == 'finished').sum():,}."
+    overview = f"Finished runs: {len(finished(entries)):,}."
     for study in studies:
         overview += (
             f" {study.name}: {study.steps[-1]:,} steps, seeds: {len(study.seeds)}, "
             f"environments: {len(study.environments)}, "
-            f"noise configurations: {len(study.returns) - 1}."
+            f"noise configurations: {len(study.finals) - 1}."
         )
     return overview
 
@@ -115,7 +129,8 @@ def terminal_width():
 
 def print_left_out(missing, width):
     """Print the first of the runs that were left out."""
-    print(text_table(replace(missing, frame=missing.frame[MISSING_IN_SHORT][:20]), width))
+    view = missing.view[MISSING_IN_SHORT][:20]
+    print(text_table(replace(missing, view=view), width))
 
 
 def print_results(out, results):
@@ -128,6 +143,10 @@ def print_results(out, results):
     for line in verdicts_in_short(results):
         say(line)
     print()
+    first = tables["noises"]
+    if 0 < len(first.frame) <= MOST_ROWS:
+        say("Does a noise help at all? Its rates together, against no noise:")
+        print(f"\n{text_table(first, width)}\n")
     if len(tables["best"].frame):
         say("The best noise in each environment, which may still be worse than no noise:")
         print(f"\n{text_table(tables['best'], width)}\n")
@@ -142,50 +161,97 @@ def print_results(out, results):
     print(f"\nOpen {out / 'report.html'}")
 
 
-def analyse(args, runs, paper, choice):
-    """Compute everything that is told of a frame of runs (read_runs); see main."""
+def analyse(args, entries, choice):
+    """Compute everything that is told of the runs of a folder (read_runs); see main."""
     metric = args.metric
-    missing, number = left_out(runs)
-    studies, notes = make_studies(runs, metric)
-    if not studies and make_studies(runs)[0]:
+    missing = missing_table(left_out(entries))
+    studies, notes = make_studies(entries, metric)
+    if not studies and finished(entries):
         fail("--metric success_rate: no environment here tells it, in `is_success` or `success`")
     if not studies:
-        if len(missing):
-            print_left_out(table_of("missing", missing), terminal_width())
+        if len(missing.frame):
+            print_left_out(missing, terminal_width())
         no_finished_run(args.runs_dir)
-    tests, unreadable = read_robustness(args.runs_dir, runs, metric)
+    compared = as_chosen(compare_all(studies, args.smallest_gain), choice)
+    tests, unreadable = read_robustness(finished(entries), metric)
     robustness_tables, robustness = analyse_robustness(tests, metric)
-    tables = make_tables(studies, paper) | robustness_tables
+    tables = make_tables(studies, compared) | robustness_tables
     if metric == SUCCESS:
         told = {environment for study in studies for environment in study.environments}
-        silent = sorted({*runs.loc[runs["status"] == "finished", "environment"]} - told)
+        silent = sorted({run.environment for run in finished(entries)} - told)
         if silent:
             notes.append(f"left out, because they never tell success: {', '.join(silent)}")
         for name, table in tables.items():
             tables[name] = replace(table, caption=table.caption.replace("return", metric))
     else:
-        of_success, notes_on_success = make_studies(runs, SUCCESS)
+        of_success, notes_on_success = make_studies(entries, SUCCESS)
         tables |= success_table(of_success)
         notes += [note for note in notes_on_success if note not in notes]
-    tables["missing"] = table_of("missing", missing)
+    tables["missing"] = missing
     if choice is not None:
         tables["choice"] = table_of("choice", choice)
-    statistics = tables["statistics"].frame
+    if any(study.phase == CONFIRMATION for study in studies):
+        notes.append(
+            "verdicts on confirmations are those of ./benchmark.sh choose, which looks several "
+            "times, at levels of its own; one that it has not judged yet has none"
+        )
     unit = POINTS if metric == SUCCESS else ""
-    clear, others = clear_first(in_sentences(statistics, unit))
+    of_noises = pd.concat([compared.noises_together, compared.noises])
+    said = [
+        in_sentences(rows, unit, args.smallest_gain)
+        for rows in (compared.noises_together, compared.noises)
+    ]
+    clear, others = clear_first(pd.concat(said, ignore_index=True))
+    number = missing.frame["status"].value_counts(sort=False)
     counts = ", ".join(f"{n} {status}" for status, n in number.items())
     return Results(
         studies=studies,
         tables=tables,
-        headlines=headlines(statistics, tables["best"].frame),
+        headlines=headlines(of_noises, tables["best"].frame),
         clear=clear,
         others=others,
+        rates=sentences_on_rates(compared, unit, args.smallest_gain),
         robustness=robustness,
-        overview=overview_of(runs, studies),
-        problems=f"Runs left out: {sum(number.values())} ({counts})." if number else "",
-        notes=all_equal_notes(studies) + family_notes(statistics) + notes + unreadable,
-        versions=version_notes(runs),
+        overview=overview_of(entries, studies),
+        problems=f"Runs left out: {number.sum()} ({counts})." if len(number) else "",
+        notes=[
+            *incomplete_note(number),
+            *all_equal_notes(studies),
+            *family_notes(compared.noises),
+            *lopsided_notes(compared),
+            *notes,
+            *unreadable,
+        ],
+        versions=version_notes(entries),
     )
+
+
+def missing_table(missing):
+    """Return the table of all runs that were left out, which people read in short."""
+    return table_of("missing", missing, view=in_short(missing))
+
+
+def sentences_on_rates(compared, unit, smallest_gain):
+    """Return the sentences on single rates, but on those of noises that have no other."""
+    parts = []
+    for rates, noises in (
+        (compared.rates_together, compared.noises_together),
+        (compared.rates, compared.noises),
+    ):
+        alone = pd.MultiIndex.from_frame(rates[KEYS]).isin(pd.MultiIndex.from_frame(noises[KEYS]))
+        parts.append(in_sentences(rates[~alone], unit, smallest_gain))
+    return pd.concat(parts, ignore_index=True)
+
+
+def incomplete_note(number):
+    """Yield a note where a sweep is not complete; number: of the runs left out, by status."""
+    due = {status: n for status, n in number.items() if status in MORE_TO_COME}
+    if due:
+        counts = ", ".join(f"{n} {status}" for status, n in due.items())
+        yield (
+            f"this sweep is not complete ({counts}): more runs are due, and a verdict now is an "
+            "extra look at the data, which makes false claims more frequent than 5 %"
+        )
 
 
 def main(args):
@@ -193,34 +259,37 @@ def main(args):
 
     Return the exit status: 1 where a run's files are damaged.
     """
-    paths = {name: getattr(args, name) for name in ("runs_dir", "out", "compare")}
+    paths = {name: getattr(args, name) for name in ("runs_dir", "out")}
     args = replace(
         args, **{name: path and Path(os.path.expanduser(path)) for name, path in paths.items()}
     )
     args = replace(args, metric=args.metric.replace("_", " "))
+    if args.smallest_gain is not None and not args.smallest_gain > 0:
+        fail(f"--smallest-gain must be above 0, not {args.smallest_gain}")
     if not args.runs_dir.is_dir():
         fail(f"no folder {args.runs_dir}")
     if is_phase(args.runs_dir.resolve()):  # alone it would be corrected for too few comparisons
         whole = f"--runs-dir {args.runs_dir.resolve().parent}"
         fail(f"{args.runs_dir} is one phase of a choice: analyse all of it with {whole}")
     try:
-        paper = read_paper(args.compare) if args.compare else None
         choice = read_choice(args.runs_dir, args.metric)
     except ValueError as error:
         fail(error)
     out = args.out or args.runs_dir / "results"
     if out.resolve() == args.runs_dir.resolve() or is_run(out):  # where other tables may be
         fail("--out must be a folder of its own, not that of the runs or of one of them")
-    runs = read_runs(args.runs_dir)
-    results = analyse(args, runs, paper, choice)
+    entries = read_runs(args.runs_dir)
+    results = analyse(args, entries, choice)
     try:
         write_results(out, results, args.latex)
     except OSError as error:
         fail(f"--out: {error}")
     print_results(out, results)
-    return int((runs["status"] == "corrupt").any())
+    return int(any(entry.status == "corrupt" for entry in entries))
 
 
 if __name__ == "__main__":
     take_over_terminal()
+    if any(word.partition("=")[0] == "--compare" for word in sys.argv):
+        fail("--compare has moved: python -m results.study.paper RUNS_DIR OUT")
     sys.exit(main(tyro.cli(Args, description=__doc__)))

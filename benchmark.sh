@@ -24,9 +24,14 @@ Every preset includes the baselines.
 
 Grid options replace a preset's values
   --algos sac td3 ppo
+             an algorithm of your own, redq, is the file redq_continuous_noisy.py in the project's or
+             in the current folder
   --envs Hopper-v5 my_envs:MyEnv-v0
              your own environment, from my_envs.py in the current folder
   --seeds 1-5 7
+  --baseline-seeds 1-13
+             seeds without noise. By default those of --seeds; in custom n sqrt(k) for n seeds of
+             each of k noises and rates, at most 2.6 n
   --noises "RandomNormalNoisyReward(1.0)" "RandomEarlyTermination(50)+RandomMixupObservation(0.5)"
              noises joined by + are combined
   --noise-rates 0.05 1.0 1.0:0.0
@@ -39,13 +44,15 @@ Grid options replace a preset's values
              runs/demo)
 
 Options of choose
-  --noises paper           the paper's 15 noises at 6 rates: 318 runs. The default is 10 noises at
-                           rates 0.05 and 1.0, 105 runs if all can act (see docs/sweeps.md). Both confirm
-                           a true gain of 1.5 standard deviations in 9 of 10 cases
+  --noises paper           the paper's 15 noises at 6 rates: 318 runs at most. The default is 11 noises
+                           at rates 0.05 and 1.0, 110 runs at most if all can act (docs/sweeps.md). Both
+                           confirm a true gain of 1.5 standard deviations in nearly 9 of 10 cases
   --exclude "NOISE@RATE"   noises to leave out, for example because they always fail
-  --budget N               about how many runs the search may take (default: 3 for each noise, at
-                           least 1); even with the least it takes about two for each noise
-  --confirm N              fresh seeds for the final comparison (default: 25)
+  --budget N               about how many runs the search may take (default: 3 for each noise and
+                           rate, at least 1); even with the least it takes about two for each
+  --confirm N              fresh seeds for the final comparison, at most (default: 25)
+  --looks N                how often the comparison is looked at, and may end (default: after each
+                           fifth of the seeds; 1: at the end)
   --metric success_rate    choose by the rate of success (default: return), where the info of an
                            episode's last step has is_success or success
 
@@ -63,7 +70,8 @@ Executor options
   --slurm-args "..."    options for sbatch, e.g. "--partition=cpu --time=24:00:00"
   --wait                slurm: wait for the jobs and report (choose always waits)
 
-Put options of the training scripts, such as --eval-episodes 20, at the end, after "--".
+Put options of the training scripts, such as --eval-episodes 20, at the end, after "--"; also
+--exp-name, which keeps runs with other options or of another version apart.
 
 Examples
   ./benchmark.sh choose --algos ppo --envs Pusher-v5 --noise-rates 1.0
@@ -91,7 +99,7 @@ cd "$(dirname -- "$(readlink -f -- "${BASH_SOURCE[0]}")")" # it may be called th
 case ${1:-} in # how the executors call this script: run-one SWEEP FOLDER COMMAND
   run-one) # on a machine whose connection may break: the run must outlive its reader
     trap : TERM INT USR1
-    run_one "$3" "$4" | { trap '' TERM INT USR1 && { cat || cat >/dev/null; }; } || exit 1
+    run_one "$2" "$3" "$4" | { trap '' TERM INT USR1 && { cat || cat >/dev/null; }; } || exit 1
     exit ;;
   slurm-task) slurm_task "$2" "$3" ;;
   "" | -h | --help) usage || true; exit ;;
@@ -132,7 +140,7 @@ path=''
 while IFS= read -rd : folder; do
   case $folder in '' | /*) ;; *) folder=$caller/$folder ;; esac
   path+=${path:+:}$folder
-done <<<"${PYTHONPATH:+$PYTHONPATH:}"
+done < <(printf %s "${PYTHONPATH:+$PYTHONPATH:}") # a here-string would need room in /tmp
 # A module of the user's lies there, too. It is not looked for where none is named: a file of this
 # folder, such as types.py, may have the name of a module of Python's.
 own='(^| )[^ ]*[A-Za-z_][A-Za-z0-9_.]*:'
@@ -158,7 +166,8 @@ list_todo() {
   todo=$(show "${dry_run:-list}") || status=$?
   [ "$status" -lt 131 ] || fail "Python was ended by signal $((status - 128)), as by an environment"
   [ "$status" -eq 0 ] || exit "$status"
-  todo=$(LC_ALL=C grep -vxFf <(printf '%s\n' "$tried") <<<"$todo" || true)
+  todo=$(printf '%s\n' "$todo" | LC_ALL=C grep -vxFf <(printf '%s\n' "$tried")) ||
+    [ $? -eq 1 ] || fail "cannot take the runs that were tried from the list"
 }
 tried=''
 list_todo
@@ -171,25 +180,31 @@ if [ -n "$dry_run" ]; then printf %s "$todo" | cut -f2 || true; exit; fi
 
 case $executor in
   parallel)
-    parallel --version 2>/dev/null | grep -q "GNU parallel" ||
+    parallel --plain --version 2>/dev/null | grep -q "GNU parallel" ||
       fail "--executor parallel needs GNU parallel (Debian: apt-get install parallel)"
     export PARALLEL_SSH=${PARALLEL_SSH:-ssh -o BatchMode=yes}
-    parallel_options=(--will-cite --workdir "${remote_dir:-$PWD}" --sshlogin "${sshlogin:-:}")
+    # --plain: nothing of the user's settings, such as --halt, changes what a sweep does
+    parallel_options=(--plain --will-cite --workdir "${remote_dir:-$PWD}" --sshlogin "${sshlogin:-:}")
     [ -z "$sshlogin" ] || parallel "${parallel_options[@]}" --nonall --tag \
       "$(quoted "$PYTHON")" -c "'import mujoco, torch, tyro, noisy_wrappers'" "&&" test -x benchmark.sh >&2 ||
       fail "a machine of --sshlogin cannot run the project in ${remote_dir:-$PWD} with $PYTHON" ;;
   slurm)
     command -v sbatch >/dev/null || fail "--executor slurm needs sbatch, on a Slurm cluster"
-    words=$(xargs -rn1 printf '%s\n' <<<"$slurm_args" 2>/dev/null) ||
+    words=$(printf '%s\n' "$slurm_args" | xargs -rn1 printf '%s\n' 2>/dev/null) ||
       fail "--slurm-args has a quote that does not end: $slurm_args"
-    [ -z "$words" ] || mapfile -t slurm_options <<<"$words" ;;
+    [ -z "$words" ] || mapfile -t slurm_options < <(printf '%s\n' "$words") ;;
 esac
 command -v flock >/dev/null || fail "benchmark.sh needs flock (Debian: apt-get install util-linux)"
 command -v ps >/dev/null || fail "benchmark.sh needs ps (Debian: apt-get install procps)"
 
 sweep=$HOSTNAME-$$-$(date +%Y%m%d%H%M%S)
 logs=${first%/*}/logs list=${first%/*}/logs/lines-$sweep.tsv
-trap 'rm -f "$list"' EXIT
+folders=() # of the logs
+trap 'rm -f "$list"; forget_refusals' EXIT
+forget_refusals() { # of scripts that were refused: the same command may try them again
+  local folder
+  for folder in ${folders[@]+"${folders[@]}"}; do rm -f "$folder/.refused-$sweep-"*; done
+}
 
 # Were this command killed, the executor would start run after run: the guard stops it then
 guard() { # a killed command may stay as a zombie: it is dead when the guard has another parent
@@ -214,9 +229,9 @@ stop() { # EXIT_STATUS
 # The executor and its guard have process groups of their own, so that one signal to the executor's
 # reaches every run once.
 run_todo() {
-  local folders reason guard watch # the folders of the logs
+  local reason guard watch
   [ "$executor" != slurm ] || ask_slurm
-  mapfile -t folders < <(cut -f1 <<<"$todo" | LC_ALL=C sed 's,/[^/]*$,/logs,' | LC_ALL=C sort -u)
+  mapfile -t folders < <(printf '%s\n' "$todo" | cut -f1 | LC_ALL=C sed 's,/[^/]*$,/logs,' | LC_ALL=C sort -u)
   reason=$( (mkdir -p "${folders[@]}" && printf '%s\n' "$todo" >"$list") 2>&1) ||
     fail "--runs-dir: cannot write to $logs: ${reason##*: }"
   locks_work "$list" || fail "--runs-dir: $(no_locks "$logs")"
@@ -243,7 +258,9 @@ run_todo() {
   kill -- "-$guard" 2>/dev/null || true
   kill "$watch" 2>/dev/null && { [ ! -t 2 ] || echo >&2; } || true
   group='' ids=()
+  forget_refusals
   tried+=$'\n'$todo
+  export SWEEP_WAITED=1 # results of other machines may be seen a little later
 }
 
 trap 'stop 130' INT

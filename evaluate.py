@@ -11,17 +11,21 @@ reset(seed = --seed + i), which also seeds the noise: all policies and condition
 initial states. Returns are the environment's own, before noise on the reward. They are stored in
 robustness.csv in the run's folder, and what is stored there is not played again. That file has no
 column for the seed: with any --seed but the default, everything is played and nothing is stored.
+An unfinished run that is named itself plays its latest policy, and nothing of it is stored.
 
-The module of an environment or of a noise, as in my_envs:MyEnv-v0, is imported from your own path,
-never from a folder of runs. Runs that cannot be tested are listed; the exit status is 1 then, and
-2 if there are no others.
+A policy is played by the script that trained it, which config.json names: the file of that name in
+the current folder, or else in this one. The script, and the module of an environment or of a noise,
+as in my_envs:MyEnv-v0, are imported from your own path, never from a folder of runs. Runs that
+cannot be tested are listed; the exit status is 1 then, and 2 if there are no others.
 """
 
 import csv
-import importlib
+import hashlib
+import importlib.util
 import itertools
 import multiprocessing
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -34,7 +38,6 @@ from dataclasses import dataclass, replace
 from importlib.machinery import PathFinder
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pandas as pd
 import tyro
@@ -45,11 +48,20 @@ from tqdm import tqdm
 import noisy_wrappers as noisy
 from analysis import folders
 from analysis.errors import fail, in_words, take_over_terminal, with_place
-from analysis.folders import PHASES, DamageError
-from analysis.formatting import slug
-from analysis.runs import ROBUSTNESS_COLUMNS, script_name, study_name, usual_settings, where_tested
+from analysis.folders import NOT_SETTINGS, PHASES, DamageError
+from analysis.formatting import rounded, slug
+from analysis.runs import (
+    ROBUSTNESS_COLUMNS,
+    study_name,
+    study_of,
+    usual_config,
+    where_tested,
+)
 from analysis.statistics import mean_std
 
+PROJECT = Path(__file__).resolve().parent
+SCRIPTS = {}  # path -> the module, and the SHA-256 of its text
+UNFINISHED_VIDEOS = set()  # folders that an end of the program deletes
 DISPLAY = "import glfw; assert glfw.init() and glfw.get_primary_monitor()"
 
 
@@ -81,34 +93,27 @@ class Args:
         """How episodes are drawn, a mode of Gymnasium, or None."""
         return "human" if self.render else "rgb_array" if self.video else None
 
-    @property
-    def storing(self):
-        """Whether episodes are stored: robustness.csv has no column for the seed."""
-        return self.seed == Args.seed and not self.drawing
+    def stores(self, player):
+        """Tell whether episodes are stored: robustness.csv has no column for seed and step."""
+        return self.seed == Args.seed and not self.drawing and player.run.finished
 
 
 @dataclass(frozen=True, eq=False)
-class FinishedRun:
-    """A finished run: what its config.json says of it."""
+class Player:
+    """A run whose policy plays, and where."""
 
-    folder: Path
-    algorithm: str
-    exp_name: str
-    environment: str
-    configuration: noisy.Configuration
-    settings: dict  # the other arguments
-    elsewhere: str = ""  # another environment to be tested in
+    run: folders.Run
+    elsewhere: str = ""  # another environment to play in than that of the training
 
     @property
-    def tested_in(self):
+    def folder(self):
+        """The run's folder."""
+        return self.run.folder
+
+    @property
+    def environment(self):
         """The environment that the policy plays in."""
-        return self.elsewhere or self.environment
-
-    @property
-    def study(self):
-        """What its study's name is made of: the algorithm, the exp_name, the phase of a choice."""
-        phase = self.folder.resolve().parent.name
-        return self.algorithm, self.exp_name, phase if phase in PHASES else ""
+        return self.elsewhere or self.run.environment
 
     @property
     def runs_dir(self):
@@ -121,33 +126,44 @@ class FinishedRun:
         return *condition.columns, self.elsewhere
 
 
-def find_runs(paths):
-    """Return the finished runs that the paths name, each once; a folder stands for its runs.
+def find_players(paths):
+    """Return the runs that the paths name, each once; a folder stands for its finished runs.
 
     Also return {run folder: what is damaged in it}, and print how many runs are not finished.
     """
     if not paths:
         fail("name the runs to test, for example: python evaluate.py runs/*Hopper-v5*")
-    named = {}
+    named = {}  # folder -> whether it was named itself
     for path in map(Path, map(os.path.expanduser, paths)):
-        found = [path] if folders.is_run(path) else folders.runs_of(path)
+        is_run = folders.is_run(path)
+        found = [path] if is_run else folders.runs_of(path)
         if not os.path.lexists(path) or (len(paths) == 1 and not found):
             fail(f"{path} is neither a run nor a folder of runs")
         for folder in found:
-            named.setdefault(folder.resolve(), folder.absolute())
-    runs, damaged = [], {}
-    for folder in named.values():
+            named[folder.resolve()] = named.get(folder.resolve(), False) or is_run
+    players, damaged, unfinished = [], {}, 0
+    for folder, is_named in named.items():
+        phase = folder.parent.name if folders.is_phase(folder.parent) else ""
         try:
-            config = folders.read_config(folder) if folders.has_begun(folder) else None
-            if config and folders.read_result(folder, config):
-                names = "algorithm", "exp_name", "environment", "configuration", "settings"
-                runs.append(FinishedRun(folder, *(config[name] for name in names)))
+            run = None
+            if folders.has_begun(folder):
+                run = folders.read_run(folder, phase, with_curve=False)
         except DamageError as error:
             damaged[folder] = str(error)
-    unfinished = len(named) - len(runs) - len(damaged)
+            continue
+        if run and (run.finished or (is_named and os.path.exists(folder / "policy.pt"))):
+            players.append(Player(run))
+        else:
+            unfinished += 1
     if unfinished:
         print(f"unfinished runs are left out: {unfinished}")
-    return runs, damaged
+    return players, damaged
+
+
+def step_of(player):
+    """Return the step of an unfinished run's latest test, which policy.pt is of."""
+    lines = (player.folder / "eval.csv").read_text("utf-8").splitlines()
+    return int(lines[-1].partition(",")[0])
 
 
 def read_conditions(args):
@@ -160,57 +176,75 @@ def read_conditions(args):
     conditions = [noisy.BASELINE]
     for noise, rate in itertools.product(args.noises, args.noise_rates):
         configuration = noisy.Configuration.read(noisy.split_noises(noise), [rate])
-        if any(start != end for start, end in configuration.rates):
-            raise ValueError(f"--noise-rates {rate}: policies are tested at constant rates")
-        conditions.append(configuration)
+        conditions.append(configuration.for_tests())
     return list(dict.fromkeys(conditions))  # each once, in order; a rate of 0 is clean
 
 
+def import_script(player):
+    """Return the script that trained a policy, as a module, and whether its text is the same.
+
+    Raises ValueError if it is not there.
+    """
+    name = player.run.script
+    for folder in dict.fromkeys([Path.cwd(), PROJECT]):
+        path = folder / name
+        is_a_run = folder.resolve().is_relative_to(player.runs_dir) and folder != PROJECT
+        if path.is_file() and path.name == name and not is_a_run:
+            if path not in SCRIPTS:
+                spec = importlib.util.spec_from_file_location(path.stem, path)
+                script = importlib.util.module_from_spec(spec)
+                sys.modules[path.stem] = script
+                spec.loader.exec_module(script)
+                SCRIPTS[path] = script, hashlib.sha256(path.read_bytes()).hexdigest()
+            script, sha256 = SCRIPTS[path]
+            return script, sha256 in player.run.config.get("script_sha256", sha256)
+    raise ValueError(f"its script {name} is neither in the current folder nor in {PROJECT}")
+
+
 @contextmanager
-def load(run, render_mode=None):
+def load(player, render_mode=None):
     """Yield a run's clean environment, closed at the end, and its policy, NumPy to NumPy.
 
     Raises ValueError if a run cannot be tested, besides what its environment raises.
     """
-    script = importlib.import_module(script_name(run.algorithm))
-
-    def make_env(env_id, **kwargs):
-        """Make a clean environment as the script does."""
-        try:
-            env = gym.make(env_id, disable_env_checker=True, max_episode_steps=steps, **kwargs)
-            return noisy.make_flat(env, script.STEP_LIMIT)
-        except noisy.refusals(env_id) as error:
-            raise ValueError(noisy.reason(error)) from error
-
-    for environment in (run.environment, run.tested_in):
-        noisy.canonical_env_id(environment)  # imports its module
-    steps = run.settings.get("max_episode_steps")
+    script, _ = import_script(player)
+    run = player.run
+    steps = {"max_episode_steps": run.args.get("max_episode_steps")}
+    kwargs = noisy.parse_env_kwargs(run.args.get("env_kwargs", []))
     drawn = {"render_mode": render_mode} if render_mode else {}  # not every class takes it
+    for environment in (run.environment, player.environment):
+        noisy.canonical_env_id(environment)  # imports its module
     noisy.seed_globals(Args.seed)  # as every episode does: the constructor may draw, too
-    with make_env(run.tested_in, **drawn) as env:
-        if run.elsewhere:
-            with make_env(run.environment) as trained_in:
-                check_spaces(run, trained_in, env)
+    own = {} if player.elsewhere else kwargs
+    with script.make_env(player.environment, **steps, **own, **drawn) as env:
+        if run.release != "0.3":
+            check_spaces(player, noisy.Spaces(run.config), env)
+        elif player.elsewhere:  # config.json does not tell the spaces of the training
+            with script.make_env(run.environment, **steps, **kwargs) as trained_in:
+                check_spaces(player, trained_in, env)
         try:
-            policy = script.load_policy(run.folder, env)
+            policy = script.load_policy(player.folder, env if run.release == "0.3" else None)
         except Exception as error:  # a damaged file may raise anything
-            text = f"policy.pt is not a policy for {run.tested_in}: {in_words(error)}"
+            text = f"policy.pt is not a policy for {player.environment}: {in_words(error)}"
             raise ValueError(text) from None
         yield env, policy
 
 
-def check_spaces(run, trained_in, env):
-    """Raise ValueError unless both environments have the same spaces."""
-    for name in ("observation_space", "action_space"):
-        here, there = getattr(trained_in, name), getattr(env, name)
-        if here != there:
+def check_spaces(player, trained_in, env):
+    """Raise ValueError unless a policy fits an environment; noise may have widened observations."""
+    spaces = [
+        ("observation space", trained_in.observation_space, env.observation_space),
+        ("action space", trained_in.action_space, env.action_space),
+    ]
+    for name, trained, here in spaces:
+        if trained.shape != here.shape or (name == "action space" and trained != here):
             raise ValueError(
-                f"--env-id {run.elsewhere}: its {name} is {there}, that of {run.environment} is "
-                f"{here}; a policy needs the same"
+                f"policy.pt is not a policy for {player.environment}: its {name} is {here}, that "
+                f"of the training was {trained}"
             )
 
 
-def refuse_foreign_module(run, name):
+def refuse_foreign_module(player, name):
     """Raise ValueError if an environment or a noise would be imported from a folder of runs.
 
     Whoever made a folder of runs that somebody downloads chose its modules and their names, too.
@@ -218,13 +252,13 @@ def refuse_foreign_module(run, name):
     module, colon, _ = name.partition("(")[0].rpartition(":")
     first, *rest = module.strip().split(".")
     spec = PathFinder.find_spec(first, noisy.module_path()) if colon else None  # executes nothing
-    here, project, folder = Path.cwd(), Path(__file__).resolve().parent, run.folder.resolve()
+    here, folder = Path.cwd(), player.folder.resolve()
     for found in (spec.submodule_search_locations or [spec.origin]) if spec else ():
         entry, top = Path(found).parent.resolve(), Path(found).resolve()
         place = Path(top, *rest).resolve()
         # the project's folder may hold the runs, and packages that are on the module path
-        is_own = entry.is_relative_to(run.runs_dir) and (entry != here or entry == project)
-        forbidden = folder if is_own else run.runs_dir
+        is_own = entry.is_relative_to(player.runs_dir) and (entry != here or entry == PROJECT)
+        forbidden = folder if is_own else player.runs_dir
         if place.is_relative_to(forbidden) or folder.is_relative_to(top):
             raise ValueError(
                 f"{name} would be imported from {place}, in a folder of runs; "
@@ -232,31 +266,41 @@ def refuse_foreign_module(run, name):
             )
 
 
-def check_runs(runs, conditions, bad, storing):
-    """Return {run: what is stored of it} of the runs that can be tested.
+def check_players(players, conditions, bad, args):
+    """Return {player: what is stored of it} of those that can play.
 
     Add the others to `bad`, {run folder: why}.
 
     The policy must fit its environment, and every noise must be able to act on it.
     """
     stored, told = {}, {}
-    for run in runs:
+    for player in players:
         try:
-            refuse_foreign_module(run, run.environment)
-            with load(run) as (env, _), warnings.catch_warnings(record=True) as notes:
+            refuse_foreign_module(player, player.run.environment)
+            script, is_same = import_script(player)
+            if not is_same:
+                text = f"{player.run.script} has changed since some of these runs were trained"
+                told[f"{text}: what plays may differ from what was trained"] = None
+            with load(player) as (env, _), warnings.catch_warnings(record=True) as notes:
+                if args.drawing and args.drawing not in env.metadata.get("render_modes", []):
+                    modes = env.metadata.get("render_modes", [])
+                    raise ValueError(f"{args.drawing} is not among its render_modes, {modes}")
                 for condition in conditions:
                     condition.wrap(env)
             told |= dict.fromkeys(str(note.message) for note in notes)
-            stored[run] = read_stored(run) if storing else {}
+            if not player.run.finished:
+                step = step_of(player)
+                print(f"{player.folder.name} is not finished: its policy of step {step} is tested")
+            stored[player] = read_stored(player) if args.stores(player) else {}
         except Exception as error:  # any but a ValueError is of the user's environment
-            bad[run.folder] = with_place(error, ValueError)
+            bad[player.folder] = with_place(error, ValueError)
     for note in told:
         print(note, file=sys.stderr)
     return stored
 
 
 def tell(bad):
-    """Print each reason why runs cannot be tested, with the first of them; bad: see check_runs."""
+    """Print each reason why runs cannot play, with the first of them; bad: see check_players."""
     folders_of = {}
     for folder, text in bad.items():
         folders_of.setdefault(text, []).append(folder)
@@ -265,55 +309,55 @@ def tell(bad):
         print(f"error: {first}{more}: {text}", file=sys.stderr)
 
 
-def play(run, condition, args):
-    """Play episodes, and store them; or draw one. Return what play_episodes does."""
-    with load(run, args.drawing) as (env, policy):
-        with warnings.catch_warnings(action="ignore"):  # check_runs has told them
+def play(player, condition, args):
+    """Play episodes, and store them; or draw one. Return [(return, length, success), ...].
+
+    Success is 1 or 0, or NaN where the environment does not tell it.
+    """
+    with load(player, args.drawing) as (env, policy):
+        with warnings.catch_warnings(action="ignore"):  # check_players has told them
             noisy_env = condition.wrap(env)
         if args.video:
-            place = f"__{slug(run.elsewhere)}" if run.elsewhere else ""
-            name = f"{run.folder.name}__{condition.slug or 'clean'}{place}.mp4"
+            place = f"__{slug(player.elsewhere)}" if player.elsewhere else ""
+            name = f"{player.folder.name}__{condition.slug or 'clean'}{place}.mp4"
             return record(noisy_env, policy, args.seed, args.video / name)
-        results = play_episodes(noisy_env, policy, 1 if args.render else args.episodes, args.seed)
-    if args.storing:
-        store(run, run.key(condition), results)
+        results = played(noisy_env, policy, 1 if args.render else args.episodes, args.seed)
+    if args.stores(player):
+        store(player, player.key(condition), results)
     return results
 
 
 def record(env, policy, seed, path):
-    """Play an episode into a video; return what play_episodes does."""
+    """Play an episode into a video; return what `play` does."""
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".") as temporary:
+        UNFINISHED_VIDEOS.add(temporary)
         folder = Path(temporary, "video")  # a new one: RecordVideo warns of one that exists
         video = RecordVideo(env, str(folder))  # of the first episode
         try:
-            results = play_episodes(video, policy, 1, seed)
+            results = played(video, policy, 1, seed)
         finally:
             if video.recording:
                 video.stop_recording()
         (folder / "rl-video-episode-0.mp4").replace(path)
+    UNFINISHED_VIDEOS.discard(temporary)
     return results
 
 
-def play_episodes(env, policy, number, seed):
-    """Play episodes; return [(true return, length, success), ...].
+def played(env, policy, episodes, seed):
+    """Return what `play` does of some episodes."""
+    results = noisy.play(env, policy, episodes, seed).tolist()
+    return [(value, int(length), success) for value, length, success in results]
 
-    Success is 1 or 0, or NaN where the environment does not tell it.
-    """
-    results = []
-    with noisy.kept_generators(env):
-        for episode in range(number):
-            noisy.seed_globals(seed + episode)
-            observation, _ = env.reset(seed=seed + episode)
-            terminated = truncated = False
-            while not (terminated or truncated):
-                observation, _, terminated, truncated, info = env.step(policy(observation))
-            record = info["episode"]  # the return is a sum of numbers or of arrays
-            results.append((np.asarray(record["r"]).item(), int(record["l"]), noisy.outcome(info)))
-    return results
+
+def exit_now(status):
+    """End at once: an ordinary exit would wait for what the processes of --jobs play."""
+    for folder in UNFINISHED_VIDEOS:
+        shutil.rmtree(folder, ignore_errors=True)
+    os._exit(status)
 
 
 def attempt(task, args):
-    """Return what `play` returns of a task, (run, condition), or in words why it cannot."""
+    """Return what `play` returns of a task, (player, condition), or in words why it cannot."""
     try:
         return play(*task, args)
     except Exception as error:  # of the environment, or of any library that draws
@@ -321,7 +365,7 @@ def attempt(task, args):
 
 
 def play_all(tasks, args):
-    """Yield all tasks, (run, condition), in their order, with what `attempt` returns of each."""
+    """Yield all tasks, (player, condition), in order, with what `attempt` returns of each."""
     with tqdm(tasks, unit="condition", disable=None) as bar:
         everything = attempt, tasks, itertools.repeat(args)
         if args.jobs == 1 or args.render:
@@ -340,18 +384,18 @@ def end_with_program():
 
     def wait():
         multiprocessing.parent_process().join()
-        os._exit(1)
+        exit_now(1)
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=wait, daemon=True).start()
 
 
-def read_stored(run):
-    """Read robustness.csv: {(noise, noise rate, environment): what play_episodes returns}.
+def read_stored(player):
+    """Read robustness.csv: {(noise, noise rate, environment): (return, length, success) of each}.
 
     The environment is empty for that of the training. Raises DamageError.
     """
-    path = run.folder / "robustness.csv"
+    path = player.folder / "robustness.csv"
     stored = {}
     try:
         text = path.read_text("utf-8") if path.exists() else ""
@@ -366,12 +410,12 @@ def read_stored(run):
     return stored
 
 
-def store(run, key, results):
+def store(player, key, results):
     """Add a condition to robustness.csv, beside what other processes have stored meanwhile."""
-    path = run.folder / "robustness.csv"
+    path = player.folder / "robustness.csv"
     try:
         with folders.rewritten(path) as file:
-            stored = read_stored(run)
+            stored = read_stored(player)
             stored[key] = max(stored.get(key, []), results, key=len)
             rows = [
                 (*condition, i, *result, environment or None)
@@ -385,27 +429,28 @@ def store(run, key, results):
         fail(f"cannot write {path}: {error}", code=1)
 
 
-def names_of(runs):
+def names_of(players):
     """Name each run's study as analyze.py does, and in which arguments the run differs from it."""
     studies = {}
-    for run in runs:
-        studies.setdefault(run.study, []).append(run.settings)
-    usual = {key: usual_settings(settings) for key, settings in studies.items()}
-    for run in runs:
-        key = run.study
-        differing = folders.difference(run.settings, usual[key])
-        own = [f"{name}={run.settings[name]}" for name in differing]
+    for player in players:
+        studies.setdefault(study_of(player.run), []).append(player.run.config)
+    usual = {key: usual_config(configs) for key, configs in studies.items()}
+    for player in players:
+        key = study_of(player.run)
+        differing = noisy.different_arguments(player.run.config, usual[key], NOT_SETTINGS)
+        own = [f"{name}={value}" for name, (value, _) in sorted(differing.items())]
         yield ", ".join([study_name(*key), *own])
 
 
-def print_table(runs, conditions, stored, episodes):
+def print_table(players, conditions, stored, episodes):
     """Print mean and sample standard deviation over seeds: one table for each noise of the test."""
     trained = {}
-    for run, name in zip(runs, names_of(runs), strict=True):
+    for player, name in zip(players, names_of(players), strict=True):
+        run = player.run
+        where = where_tested(run.environment, player.elsewhere)
         noise = run.configuration.noise or "no noise"
-        where = where_tested(run.environment, run.elsewhere)
         row = where, name, noise, run.configuration.noise_rate
-        trained.setdefault(row, []).append(run)
+        trained.setdefault(row, []).append(player)
     noises = dict.fromkeys(condition.noise for condition in conditions if condition.noise)
     for noise in noises or [""]:
         columns = [condition for condition in conditions if condition.noise in ("", noise)]
@@ -413,7 +458,7 @@ def print_table(runs, conditions, stored, episodes):
         headers += [f"at {column.columns[1]}" if column.noise else "clean" for column in columns]
         rows = []
         for row, seeds in trained.items():
-            played = [[stored[run][run.key(column)] for run in seeds] for column in columns]
+            played = [[stored[one][one.key(column)] for one in seeds] for column in columns]
             rows.append([*row, len(seeds), *(mean_return(results, episodes) for results in played)])
         if noise:
             print(f"\nMean return, tested with {noise}")
@@ -423,13 +468,13 @@ def print_table(runs, conditions, stored, episodes):
 def mean_return(played, episodes):
     """Return the text of a cell: the mean return, its standard deviation, the rate of success.
 
-    played: what play_episodes returns, for each run.
+    played: (return, length, success) of each episode, for each run.
     """
     results = np.array([results[:episodes] for results in played])
     mean, spread, n = mean_std(results[..., 0].mean(axis=1))
-    text = noisy.rounded(mean, spread)
+    text = rounded(mean, spread)
     if n > 1:
-        text += f" ± {noisy.rounded(spread, spread)}"
+        text += f" ± {rounded(spread, spread)}"
     success = results[..., 2]
     return text if np.isnan(success).all() else f"{text}, {100 * (success > 0).mean():.0f} % solved"
 
@@ -464,20 +509,24 @@ def main(args):
         fail("--render needs a display; --video FOLDER makes videos without one")
     os.environ["OMP_NUM_THREADS"] = "1"  # before the scripts import PyTorch; processes inherit it
     try:
-        noisy.check_numbers(vars(args))
-        runs, bad = find_runs(args.runs)
+        for name in ("episodes", "jobs"):
+            if getattr(args, name) < 1:
+                raise ValueError(f"--{name} must be at least 1, not {getattr(args, name)}")
+        if args.seed < 0:
+            raise ValueError(f"--seed must be at least 0, not {args.seed}")
+        players, bad = find_players(args.runs)
         named = [name for text in args.noises for name in noisy.split_noises(text)]
-        for run, name in itertools.product(runs, [*named, args.env_id or ""]):
-            refuse_foreign_module(run, name)
+        for player, name in itertools.product(players, [*named, args.env_id or ""]):
+            refuse_foreign_module(player, name)
         conditions = read_conditions(args)
     except ValueError as error:
         fail(error)
     here = Path.cwd()  # for what the module of my_envs:MyEnv-v0 imports
-    if not any(here.is_relative_to(run.runs_dir) for run in runs):
+    if not any(here.is_relative_to(player.runs_dir) for player in players):
         sys.path.append(str(here))
     if args.video:
         args.video = Path(os.path.expanduser(args.video))
-        if len({run.folder.name for run in runs}) < len(runs):
+        if len({player.folder.name for player in players}) < len(players):
             fail("--video: two of these runs have the same name, and so would their videos")
         draw_without_display()
     if args.env_id:
@@ -485,11 +534,13 @@ def main(args):
             env_id = noisy.canonical_env_id(args.env_id)
         except ValueError as error:
             fail(f"--env-id: {error}")
-        runs = [replace(run, elsewhere=env_id * (env_id != run.environment)) for run in runs]
-    stored = check_runs(runs, conditions, bad, args.storing)
-    runs = list(stored)
+        for i, player in enumerate(players):
+            if env_id != player.run.environment:
+                players[i] = replace(player, elsewhere=env_id)
+    stored = check_players(players, conditions, bad, args)
+    players = list(stored)
     tell(bad)
-    if not runs:
+    if not players:
         return 2 if bad else fail(f"there is no finished run in {', '.join(map(str, args.runs))}")
     if args.video:
         try:
@@ -497,36 +548,35 @@ def main(args):
             tempfile.TemporaryFile(dir=args.video).close()
         except OSError as error:
             fail(f"--video: cannot write to {args.video}: {error}")
-    if not (args.storing or args.drawing):
+    if args.seed != Args.seed and not args.drawing:
         print(f"--seed {args.seed} is not the default: everything is played, nothing is stored")
     tasks = [
-        (run, condition)
-        for run, condition in itertools.product(runs, conditions)
-        if args.drawing or len(stored[run].get(run.key(condition), [])) < args.episodes
+        (player, condition)
+        for player, condition in itertools.product(players, conditions)
+        if args.drawing or len(stored[player].get(player.key(condition), [])) < args.episodes
     ]
     failed = {}
-    for (run, condition), results in play_all(tasks, args):
+    for (player, condition), results in play_all(tasks, args):
         name = condition.slug or "clean"
-        stored[run][run.key(condition)] = results
+        stored[player][player.key(condition)] = results
         if isinstance(results, str):
-            failed[run.folder] = f"{name}: {results}"
+            failed[player.folder] = f"{name}: {results}"
             if args.drawing:
-                text = f"cannot draw {run.folder.name}, {failed[run.folder]}"
+                text = f"cannot draw {player.folder.name}, {failed[player.folder]}"
                 print(f"error: {text}", file=sys.stderr)
         elif args.drawing:
             [(drawn, steps, _)] = results
-            print(f"{run.folder.name}, {name}: return {noisy.rounded(drawn)}, {steps} steps")
+            print(f"{player.folder.name}, {name}: return {rounded(drawn)}, {steps} steps")
     if not args.drawing:
         tell(failed)
-        if runs := [run for run in runs if run.folder not in failed]:
-            print_table(runs, conditions, stored, args.episodes)
+        if players := [player for player in players if player.folder not in failed]:
+            print_table(players, conditions, stored, args.episodes)
     return bool(bad or failed)
 
 
 if __name__ == "__main__":
     take_over_terminal()
-    # at once: an ordinary exit would wait for what the processes of --jobs play
-    signal.signal(signal.SIGTERM, lambda number, frame: os._exit(128 + number))
+    signal.signal(signal.SIGTERM, lambda number, frame: exit_now(128 + number))
     try:
         sys.exit(main(tyro.cli(Args, description=__doc__)))
     except KeyboardInterrupt:

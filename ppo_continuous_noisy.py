@@ -248,8 +248,9 @@ def learn(args, env, test_env, stop):
 
     # CHECK: in NumPy the agent acts as in PyTorch it learns, so log-probabilities are those of eps
     act, std = agent.acting()
-    eps = torch.randn(8, *env.action_space.shape)
-    inputs = torch.randn(8, *env.observation_space.shape)
+    generator = torch.Generator().manual_seed(0)
+    eps = torch.randn(8, *env.action_space.shape, generator=generator)
+    inputs = torch.randn(8, *env.observation_space.shape, generator=generator)
     actions = np.stack([act(x) for x in inputs.numpy()]) + std * eps.numpy()
     log_probs, _, _ = agent(inputs.to(device), torch.from_numpy(actions).to(device))
     expected = (-0.5 * eps.square() - 0.5 * math.log(2 * math.pi)).sum(1) - np.log(std).sum()
@@ -712,7 +713,7 @@ def read_state(file):
     numpy, types = np._core.multiarray, {type(np.dtype(code)) for code in np.typecodes["All"]}
     types |= {np.ndarray, np.dtype, numpy._reconstruct, numpy.scalar, bytes}
     with torch.serialization.safe_globals(list(types)):
-        return torch.load(file, weights_only=True)
+        return torch.load(file, "cpu", weights_only=True)  # from a GPU, too
 
 
 def stop_at_signals():

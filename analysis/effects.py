@@ -9,9 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from analysis import style
-from analysis.formatting import WHOLE_WORDS
-from analysis.runs import SUCCESS
-from analysis.verdicts import seeds_of
+from analysis.folders import SUCCESS
+from analysis.formatting import WHOLE_WORDS, seeds_of
 from noisy_wrappers import rate_order
 
 MOST_IN_FOREST = 25  # configurations of a forest plot; more of them are a heatmap

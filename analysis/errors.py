@@ -7,14 +7,12 @@ import sysconfig
 import traceback
 from pathlib import Path
 
-from noisy_wrappers import reason
-
 CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")  # all but tab and the ends of lines
 
 PROJECT = Path(__file__).resolve().parents[1]
 # These call what users write, and are not the place of its errors
 PROGRAMS = {PROJECT / name for name in ("evaluate.py", "noisy_wrappers.py", "sweep/environment.py")}
-PROGRAMS |= {PROJECT / f"{name}_continuous_noisy.py" for name in ("sac", "td3", "ppo")}
+PROGRAMS |= set(PROJECT.glob("*_continuous_noisy.py"))
 LIBRARIES = ("site-packages", "dist-packages", sysconfig.get_path("stdlib"))
 
 
@@ -36,7 +34,7 @@ def with_place(error, plain=()):
     That is the last place in the code of a user, if there is one.
     """
     if isinstance(error, plain):
-        return reason(error)
+        return " ".join(str(error).split()) or type(error).__name__
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if not any(part in frame.filename for part in LIBRARIES)]
     place = frames[-1] if Path(own[-1].filename).resolve() in PROGRAMS else own[-1]

@@ -13,13 +13,13 @@ from matplotlib.patches import Rectangle
 
 from analysis import style
 from analysis.effects import effects_caption, effects_figure, heatmap
-from analysis.formatting import slug
-from analysis.runs import KEYS, STUDY, SUCCESS, rows_of, study_name
-from analysis.verdicts import percent, seeds_of
-from noisy_wrappers import BASELINE, rate_order, rounded
+from analysis.folders import RETURN, SUCCESS
+from analysis.formatting import percent, rounded, seeds_of, slug
+from analysis.runs import KEYS, STUDY, rows_of, study_name
+from noisy_wrappers import BASELINE, rate_order
 
 ONE_STD = "\u00b1 one standard deviation"
-RETURN_LABELS = {"return": "test return\n(sum of rewards per episode)"}
+RETURN_LABELS = {RETURN: "test return\n(sum of rewards per episode)"}
 RETURN_LABELS[SUCCESS] = "test success rate (%)"
 
 
@@ -43,11 +43,11 @@ def figures(studies, tables):
     drawings, used = [], set()
     for study in studies:
         drawings += comparison_figures(study, tables["statistics"].frame, tables["best"].frame)
-        for noise in sorted({config.noise for config in study.returns} - {""}) or [""]:
+        for noise in study.noises or [""]:
             title = f"{study.name}, {noise or 'no noise'}"
             caption = f"{title}: learning curves, mean over n seeds, shaded {ONE_STD}."
             drawings.append(Drawing("curves", title, caption, partial(curves_figure, study, noise)))
-        drawings += ablation_figures(study, tables[f"summary_{study.algorithm}"].frame)
+        drawings += ablation_figures(study, tables[f"summary_{slug(study.algorithm)}"].frame)
     if "robustness" in tables:
         drawings += robustness_figures(tables["robustness"].frame, studies[0].metric)
     for drawing in drawings:
@@ -59,12 +59,12 @@ def figures(studies, tables):
 
 def comparison_figures(study, statistics, best):
     """Yield the Drawing of a study's effects, and that of the curves of its best noises."""
-    compared = statistics["verdict"].notna() & (statistics["scope"] == "environment")
-    compared = statistics[rows_of(statistics, study.key) & compared]
+    has_comparison = statistics["difference"].notna()
+    compared = statistics[rows_of(statistics, study.key) & has_comparison]
     if len(compared):
         draw = partial(effects_figure, compared, study.metric)
         yield Drawing("effects", study.name, effects_caption(study, compared), draw)
-    if len(compared) and len(study.returns) > 2:
+    if len(compared) and len(study.finals) > 2:
         caption = (
             f"{study.name}: test {study.metric} without noise (black) and with the best noise of "
             f"each environment, mean over n seeds, shaded {ONE_STD}. "
@@ -77,7 +77,7 @@ def comparison_figures(study, statistics, best):
 def span(numbers):
     """Write the numbers of seeds or environments behind a line or a panel: "5", or "3 to 5"."""
     low, high = min(numbers, default=0), max(numbers, default=0)
-    return f"{low}" if low == high else f"{low} to {high}"
+    return f"{low:.0f}" if low == high else f"{low:.0f} to {high:.0f}"
 
 
 def panels(environments, labels, metric, below):
@@ -120,15 +120,16 @@ def best_curves_figure(study, best):
     fig, axes, _ = panels(list(best["environment"]), labels, study.metric, below)
     # Three lines of title above each panel
     fig.subplots_adjust(top=1 - 0.6 / fig.get_figheight(), hspace=0.75)
-    configs = {(config.noise, config.noise_rate): config for config in study.returns}
+    configs = {(config.noise, config.noise_rate): config for config in study.finals}
     for ax, row in zip(axes, best.itertuples(), strict=True):
         e = study.environments.index(row.environment)
         color = style.COLORS.get(row.verdict, style.UNCLEAR)
-        pair = {"black": BASELINE, color: configs[row.noise, row.noise_rate]}
-        for color, config in pair.items():
-            curve(ax, steps, study.returns[config][:, :, e], 0.12, color=color, linewidth=1.6)
+        pairs = (BASELINE, "black"), (configs[row.noise, row.noise_rate], color)
+        for config, look in pairs:
+            curve(ax, steps, study.curves[config][:, :, e], 0.12, color=look, linewidth=1.6)
         noise = row.noise if len(row.noise) < 50 else f"{row.noise[:47]}..."
-        lines = f"{noise}, {row.noise_rate}\n{row.verdict} (n = {seeds_of(row.n, row.n_baseline)})"
+        verdict = row.verdict if isinstance(row.verdict, str) else "not judged"
+        lines = f"{noise}, {row.noise_rate}\n{verdict} (n = {seeds_of(row.n, row.n_baseline)})"
         style.set_title(ax, row.environment, style.WIDTH / 3, f"\n{lines}")
     handles = [axes[0].lines[0], Rectangle((0, 0), 1, 1, color=style.UNCLEAR)]
     fig.legend(handles, labels, loc="lower center", ncols=2, frameon=False)
@@ -154,9 +155,9 @@ def curves_figure(study, noise):
 
     There is a panel for each environment in which this noise was tried.
     """
-    configs = [config for config in study.returns if config.noise in ("", noise)]
+    configs = [config for config in study.finals if config.noise in ("", noise)]
     noisy = [config.noise == noise for config in configs]
-    counts = np.stack([np.isfinite(study.final(config)).sum(axis=0) for config in configs])
+    counts = np.stack([np.isfinite(study.finals[config]).sum(axis=0) for config in configs])
     tried = np.flatnonzero(counts[noisy].any(axis=0))
     labels = {}  # by the number of the configuration
     for i, n in enumerate(counts[:, tried]):
@@ -171,7 +172,7 @@ def curves_figure(study, noise):
     for (e, ax), (i, label) in product(zip(tried, axes, strict=True), labels.items()):
         look = style.line_style(i, len(configs)) | {"linewidth": 1.1 if i else 1.8}
         look |= {"markevery": (min(i, every - 1), every), "markersize": 4.5, "label": label}
-        curve(ax, steps, study.returns[configs[i]][:, :, e], **look)
+        curve(ax, steps, study.curves[configs[i]][:, :, e], **look)
     add_legend()
     return fig
 
@@ -181,7 +182,7 @@ def ablation_figures(study, summary):
     summary = summary[rows_of(summary, study.key)]
     has_baseline = (summary["noise"] == "").any()  # a search has none
     dotted = "; dotted: no noise" if has_baseline else ""
-    single = [config for config in study.returns if len(config.noises) == 1]  # sorted by noise
+    single = [config for config in study.finals if len(config.noises) == 1]  # sorted by noise
     for wrapper, configs in groupby(single, lambda config: config.wrappers[0]):
         noises = sorted({config.noise for config in configs})
         if len(noises) > 1:
@@ -230,7 +231,7 @@ def bars(ax, place, rows, width, **look):
     ax.bar(place, rows["mean"], width, **whiskers, **look)
 
 
-def robustness_figures(table, metric="return"):
+def robustness_figures(table, metric=RETURN):
     """Yield a heatmap of robustness for every environment of a study."""
     for (*study, environment), rows in table.groupby([*STUDY, "environment"]):
         clean = rows[(rows["noise"] == "") & (rows["test_noise"] == "")]["mean"]

@@ -1,6 +1,7 @@
-"""A run's folder, lock and log, read without trust: which folders are runs, and what is damaged.
+"""Run folders, read without trust: which folders are runs, what a run was, and what is damaged.
 
-Nothing here waits for pandas, so a sweep of 9,100 runs is listed in a moment.
+Everything that reads a run reads it here, once: read_run returns a Run. Nothing here waits for
+pandas, so a sweep of 9,100 runs is listed in a moment.
 """
 
 import fcntl
@@ -9,27 +10,98 @@ import math
 import os
 import re
 import shlex
-import struct
-import time
+from collections.abc import Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
+
+import numpy as np
 
 from analysis.errors import fail
-from noisy_wrappers import MAY_DIFFER_IN_A_TABLE, Configuration
+from analysis.logs import STOPPED, Log, is_locked, read_log  # noqa: F401  until sweep/ has moved
+from noisy_wrappers import BASELINE, MAY_DIFFER_IN_A_TABLE, Configuration, release
 
-ALGORITHMS = ("SAC", "TD3", "PPO")
 SEARCH, CONFIRMATION = PHASES = ("search", "confirmation")  # the folders of a choice
-# Arguments that have columns of their own, or may differ; the steps of tests are intersected.
+RETURN, SUCCESS = "return", "success rate"  # the metrics: what runs are compared by
+# Arguments that have a column of their own in tables, or may differ there
 NOT_SETTINGS = {"env_id", "exp_name", "seed", "noise", "noise_rate"} | MAY_DIFFER_IN_A_TABLE
 ENV_ID = re.compile(r"(?:\w+(?:\.\w+)*:)?[\w./-]+")  # a module, and what Gymnasium takes for an id
-STOPPED = (129, 130, 138, 143)  # exit statuses of a run that was told to stop, by signal
-END = re.compile(r"# .* exit=(\d+)")  # the last line of run_one in sweep/executors.sh
-PROGRESS = re.compile(r"step=(\d+)/\d+ sps=(\d+)")  # the line of Run.log in the scripts
+ALGORITHM = re.compile(r"[\w .+()-]+")  # it names files
+EVAL_COLUMNS = ["step", "episode", "episodic_return", "episodic_length"]
 
 
 class DamageError(ValueError):
-    """A file of a run cannot be used; the text begins with its name."""
+    """A file of a run cannot be used; the text begins with its name.
+
+    `run` is what could be read of it all the same, or None.
+    """
+
+    run = None
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """The tests of a run, in the order of its training."""
+
+    steps: np.ndarray  # at which it was tested
+    returns: np.ndarray  # of each test, the mean over its episodes
+    success_rates: np.ndarray | None  # in percent of the episodes; None if none tells success
+
+    def of(self, metric):
+        """Return what the tests found by a metric; None where that is success and is not told."""
+        return self.success_rates if metric == SUCCESS else self.returns
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A run, as its folder tells it."""
+
+    folder: Path
+    phase: str  # of a choice, or ""
+    config: Mapping[str, Any]  # config.json: "args", "defaults", "versions" and more
+    algorithm: str
+    script: str  # the name of its file
+    environment: str
+    exp_name: str
+    configuration: Configuration
+    tested_under: Configuration  # BASELINE: it was tested without noise
+    seed: int
+    total_timesteps: int  # as they were planned: a run may end by itself before
+    release: str  # of noisy_wrappers, "0.4"
+    result: Mapping[str, Any] | None = None  # result.json of a finished run
+    curve: Curve | None = None  # of a finished run, if it was asked for
+
+    @property
+    def args(self):
+        """The arguments that it was started with."""
+        return self.config["args"]
+
+    @property
+    def finished(self):
+        """Whether it has ended well."""
+        return self.result is not None
+
+    @property
+    def versions(self):
+        """What made it: {name: version}, with the first digits of the commit and of the script."""
+        commit = str(self.config.get("git_commit"))  # 40 digits, perhaps with "-dirty"
+        scripts = str(self.config.get("script_sha256", "unknown")).split(", ")
+        more = {"matmul precision": self.config.get("matmul_precision")}
+        more["git commit"] = commit[:10] + commit[40:]
+        more["script"] = ", ".join(script[:10] for script in scripts)
+        return {**self.config.get("versions", {}), **more}
+
+    @property
+    def tested(self):
+        """Where it was tested, if that is not the clean environment as its id makes it."""
+        told = [f"under {self.tested_under}"] if self.tested_under != BASELINE else []
+        if kwargs := self.args.get("env_kwargs"):
+            told.append(f"with {', '.join(map(str, kwargs))}")
+        return " ".join(["tested", *told]) if told else ""
+
+
+# --------------------------------------------------------------------------- which folders are runs
 
 
 def is_run(folder):
@@ -74,19 +146,7 @@ def logged(runs_dir):
     return [place / log.stem for place in places for log in sorted(place.glob("logs/*__*.log"))]
 
 
-def flat_choice(runs_dir):
-    """Say how to sort the runs of a choice that an earlier version left side by side."""
-    fresh = "*_s1[0-9][0-9][0-9]_*"  # the seeds of its confirmation
-    steps = [f"cd {shlex.quote(str(runs_dir))}", f"mkdir {SEARCH} {CONFIRMATION}"]
-    steps += [f"mv {fresh} {CONFIRMATION}/"] if any(runs_dir.glob(fresh)) else []
-    steps += [f"mv *__*__* {SEARCH}/"]
-    return (
-        f"{runs_dir} holds the runs of a choice side by side, as earlier versions left them. They "
-        f"have two folders now: {' && '.join(steps)}"
-    )
-
-
-# ------------------------------------------------------------------------------------- the contents
+# ----------------------------------------------------------------------------------- their contents
 
 
 @contextmanager
@@ -112,13 +172,22 @@ def read_json(path):
     return value
 
 
-def read_config(folder):
-    """Read config.json: what identifies a run. Raises DamageError.
+def read_run(folder, phase="", *, with_curve=True):
+    """Read a run folder that has begun; a Run. Raises DamageError.
 
-    The result has the arguments under "args"; "algorithm", "environment", "configuration" (a
-    Configuration), "exp_name", "seed", "episodes" (of a test), "total" (steps), "settings" (the
-    arguments that a study shares) and "versions".
+    with_curve: read eval.csv of a finished run, too.
     """
+    run = read_identity(folder, phase)
+    try:
+        run = replace(run, result=read_result_of(run))
+        return replace(run, curve=read_curve(run)) if run.finished and with_curve else run
+    except DamageError as error:
+        error.run = run
+        raise
+
+
+def read_identity(folder, phase=""):
+    """Read config.json: what a run is, finished or not. Raises DamageError."""
     config = read_json(folder / "config.json")
 
     def get(values, name, is_good, default=None):
@@ -133,70 +202,108 @@ def read_config(folder):
     def text(is_good):
         return lambda value: isinstance(value, str) and is_good(value)
 
+    def is_list_of_text(value):
+        return isinstance(value, list) and all(isinstance(item, str) for item in value)
+
+    def configuration(noise, noise_rate, default=None):
+        noises, rates = args.get(noise, default), args.get(noise_rate, default)
+        try:
+            return Configuration.read(noises, rates, stored=True)
+        except (ValueError, TypeError, KeyError) as error:
+            reason = str(error).partition("\n")[0]
+            named = f"{noise} {shortened(noises)} at {shortened(rates)}"
+            raise DamageError(f"config.json: {named}: {reason}") from None
+
     args = get(config, "args", lambda value: isinstance(value, dict))
-    versions = get(config, "versions", lambda value: isinstance(value, dict), default={})
-    for name in args:
-        get(args, name, is_flat)
+    get(config, "defaults", lambda value: isinstance(value, dict), default={})
+    get(config, "versions", lambda value: isinstance(value, dict), default={})
     get(args, "max_episode_steps", lambda value: value is None or number(1)(value))
-    noises, rates = args.get("noise"), args.get("noise_rate")
-    try:
-        configuration = Configuration.read(noises, rates, stored=True)
-    except (ValueError, TypeError, KeyError) as error:
-        reason = str(error).partition("\n")[0]
-        named = f"noise {shortened(noises)} at {shortened(rates)}"
-        raise DamageError(f"config.json: {named}: {reason}") from None
-    commit = str(config.get("git_commit"))  # 40 digits, perhaps with "-dirty"
-    more = {"matmul precision": config.get("matmul_precision")}
-    more["git commit"] = commit[:10] + commit[40:]
-    return {
-        "algorithm": get(config, "algorithm", ALGORITHMS.__contains__),
-        "environment": get(args, "env_id", text(ENV_ID.fullmatch)),
-        "exp_name": get(args, "exp_name", text(str.isprintable)),
-        "configuration": configuration,
-        "seed": get(args, "seed", number(0)),
-        "episodes": get(args, "eval_episodes", number(1)),
-        "total": get(args, "total_timesteps", number(1)),
-        "args": args,
-        "settings": {name: args[name] for name in args if name not in NOT_SETTINGS},
-        "versions": versions | more,
-    }
+    get(args, "eval_episodes", number(1))
+    get(args, "env_kwargs", is_list_of_text, default=[])
+    algorithm = get(config, "algorithm", text(ALGORITHM.fullmatch))
+    return Run(
+        folder=folder,
+        phase=phase,
+        config=config,
+        algorithm=algorithm,
+        script=get(config, "script", text(str.isprintable), default=f"{script_name(algorithm)}.py"),
+        environment=get(args, "env_id", text(ENV_ID.fullmatch)),
+        exp_name=get(args, "exp_name", text(str.isprintable)),
+        configuration=configuration("noise", "noise_rate"),
+        tested_under=configuration("test_noise", "test_noise_rate", default=[]),
+        seed=get(args, "seed", number(0)),
+        total_timesteps=get(args, "total_timesteps", number(1)),
+        release=release(config),
+    )
 
 
-def read_result(folder, config):
-    """Read result.json of a finished run, or return None where there is none.
+def script_name(algorithm):
+    """Return the name of an algorithm's script: the exp_name that it gives its runs by default."""
+    return f"{algorithm.lower()}_continuous_noisy"
 
-    config: from read_config. Raises DamageError.
-    """
-    if not os.path.exists(folder / "result.json"):
+
+def read_result_of(run):
+    """Read result.json of a finished run, or return None where there is none."""
+    path = run.folder / "result.json"
+    if not os.path.exists(path):
         return None
-    result = read_json(folder / "result.json")
+    result = read_json(path)
     mean = result.get("final_return_mean")
-    with naming(folder / "result.json"):  # an integer may be too large
+    with naming(path):  # an integer may be too large
         if type(mean) not in (int, float) or not math.isfinite(mean):
-            raise DamageError(f"result.json: final_return_mean is {shortened(mean)}")
-    steps = result.get("total_timesteps", config["total"])
-    if steps != config["total"]:
-        said = f"total_timesteps is {shortened(steps)}, in config.json {config['total']}"
+            raise ValueError(f"final_return_mean is {shortened(mean)}")
+    steps = result.get("total_timesteps", run.total_timesteps)
+    if steps != run.total_timesteps:
+        said = f"total_timesteps is {shortened(steps)}, in config.json {run.total_timesteps}"
         raise DamageError(f"result.json: {said}")
     return result
 
 
-def is_flat(value):
-    """Tell whether a value is what an argument may be: a single value, or a list of such."""
-    items = value if isinstance(value, list) else [value]
-    return not any(isinstance(item, list | dict) for item in items)
+def read_curve(run):
+    """Read eval.csv of a finished run. Raises DamageError unless every test is whole, in order.
+
+    The last one must have the return of result.json. It may be earlier than was planned, and tests
+    may be at any steps: then the run ended by itself, or was tested more often.
+    """
+    episodes = run.args["eval_episodes"]
+    path = run.folder / "eval.csv"
+    with naming(path):
+        text = path.read_text("utf-8")
+        header, _, body = text.partition("\n")
+        names = header.rstrip("\r").split(",")
+        tells_success = names == [*EVAL_COLUMNS, "success"]
+        if not tells_success and names != EVAL_COLUMNS:
+            raise ValueError("unexpected header")
+        if not text.endswith("\n"):
+            raise ValueError("the last line is half-written")
+        if not body:
+            raise ValueError("no evaluation")
+        if tells_success:  # empty cells where the environment tells nothing
+            body = body.replace("\r\n", "\n").replace(",\n", ",nan\n")
+        numbers = np.loadtxt(body.splitlines(), delimiter=",", ndmin=2, comments=None)
+        whole = numbers.shape[1] == len(names) and len(numbers) % episodes == 0
+        if not whole or not np.isfinite(numbers[:, :4]).all():
+            raise ValueError("incomplete or non-numeric lines")
+        tests = numbers.reshape(-1, episodes, len(names))
+        step, episode, returns = tests[..., 0], tests[..., 1], tests[..., 2]
+        if (episode != np.arange(episodes)).any() or (step != step[:, :1]).any():
+            raise ValueError("an evaluation is incomplete")
+        if (np.diff(step[:, 0]) <= 0).any():
+            raise ValueError("steps do not ascend")
+    returns = returns.mean(axis=1)
+    last = run.result["final_return_mean"]
+    if not math.isclose(returns[-1], last, rel_tol=1e-3, abs_tol=1e-3):
+        raise DamageError("eval.csv and result.json disagree on the final return")
+    rates = None
+    if tells_success and not np.isnan(tests[..., 4]).all():
+        rates = 100 * np.nan_to_num(tests[..., 4]).mean(axis=1)  # what is not told was no success
+    return Curve(step[:, 0].astype(int), returns, rates)
 
 
 def shortened(value):
     """Return a value of a damaged file as a part of a line."""
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def difference(settings, reference):
-    """Return the names of the settings that both have, with different values, in order."""
-    shared = sorted(settings.keys() & reference.keys())
-    return [name for name in shared if settings[name] != reference[name]]
 
 
 @contextmanager
@@ -215,50 +322,39 @@ def rewritten(path):
             new.unlink(missing_ok=True)
 
 
-# -------------------------------------------------------------------------------- the lock, the log
+# ------------------------------------------------------------------------- until sweep/ has moved
 
 
-def is_locked(folder):
-    """Tell whether a process holds a run's lock, as a script does from its start to its end.
-
-    F_GETLK only asks. To take the lock, even for a moment, would end a run that starts just then.
-    """
-    layout = "hhqqi"  # of Linux; the type comes first
-    question = struct.pack(layout, fcntl.F_RDLCK, 0, 0, 0, 0)
-    try:
-        with open(os.open(folder / ".lock", os.O_RDONLY | os.O_NONBLOCK), "rb") as lock:
-            answer = fcntl.fcntl(lock, fcntl.F_GETLK, question)
-    except OSError:  # there is none, or the file system has no locks
-        return False
-    return struct.unpack(layout, answer)[0] != fcntl.F_UNLCK
-
-
-class Log(NamedTuple):
-    """What the end of a run's log says."""
-
-    path: Path
-    age: float  # seconds since the last line, infinite where there is no log
-    step: int
-    steps_per_second: int
-    exit_status: int | None  # None while the run is not over, or where there is no log
-    last_line: str  # of what the run itself wrote
+def read_config(folder):
+    """Read config.json as sweep/ did before there was read_run."""
+    run = read_identity(folder)
+    return {
+        "algorithm": run.algorithm,
+        "environment": run.environment,
+        "exp_name": run.exp_name,
+        "configuration": run.configuration,
+        "seed": run.seed,
+        "episodes": run.args["eval_episodes"],
+        "total": run.total_timesteps,
+        "args": run.args,
+        "settings": {name: run.args[name] for name in run.args if name not in NOT_SETTINGS},
+        "versions": run.versions,
+        "run": run,
+    }
 
 
-def read_log(folder):
-    """Read the end of the log that a sweep keeps of a run."""
-    path = folder.parent / "logs" / f"{folder.name}.log"
-    try:
-        with open(path, "rb") as file:
-            status = os.fstat(file.fileno())
-            file.seek(max(0, status.st_size - 8192))
-            lines = file.read().decode(errors="replace").splitlines()
-    except OSError:  # there is none, or it is somebody else's
-        return Log(path, math.inf, 0, 0, None, "")
-    end = END.fullmatch(lines[-1]) if lines else None
-    steps = [found.groups() for found in map(PROGRESS.match, lines) if found]
-    step, steps_per_second = map(int, steps[-1]) if steps else (0, 0)
-    # "(" begins the notes that the scripts leave below a traceback
-    own = [line for line in lines if re.search(r"\w", line) and not line.startswith(("# ", "("))]
-    age = time.time() - status.st_mtime
-    last_line = own[-1].strip() if own else ""
-    return Log(path, age, step, steps_per_second, int(end[1]) if end else None, last_line)
+def read_result(folder, config):
+    """Read result.json as sweep/ did; config: from read_config."""
+    return read_result_of(config["run"])
+
+
+def flat_choice(runs_dir):
+    """Say how to sort the runs of a choice that an earlier version left side by side."""
+    fresh = "*_s1[0-9][0-9][0-9]_*"  # the seeds of its confirmation
+    steps = [f"cd {shlex.quote(str(runs_dir))}", f"mkdir {SEARCH} {CONFIRMATION}"]
+    steps += [f"mv {fresh} {CONFIRMATION}/"] if any(runs_dir.glob(fresh)) else []
+    steps += [f"mv *__*__* {SEARCH}/"]
+    return (
+        f"{runs_dir} holds the runs of a choice side by side, as earlier versions left them. They "
+        f"have two folders now: {' && '.join(steps)}"
+    )

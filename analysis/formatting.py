@@ -1,5 +1,6 @@
 """How results look as text: numbers, and tables in a terminal, in Markdown and in LaTeX."""
 
+import math
 import re
 import zlib
 from dataclasses import dataclass
@@ -9,23 +10,105 @@ import numpy as np
 import pandas as pd
 from tabulate import tabulate
 
-from analysis.runs import script_name
-from analysis.verdicts import not_zero, percent, two_digits
-from noisy_wrappers import rate_order, rounded
+from analysis.folders import script_name
+from analysis.power import LEVEL
+from noisy_wrappers import rate_order
 
+LATEX = {character: f"\\{character}" for character in "&%$#_{}"}
+LATEX |= {"^": r"\^{}", "~": r"\textasciitilde{}", "\\": r"\textbackslash{}"}
+LATEX |= {sign: rf"\ensuremath{{{sign}}}" for sign in "<>"}
 WHOLE_WORDS = {"break_long_words": False, "break_on_hyphens": False}  # when text is wrapped
 DASH = "\u2013"  # of what does not exist
-TENTH = "z,.1f"  # z: no "-0"
 _COLUMNS_WITH = {  # a format of numbers that have no spread
-    "z,.0f": """n n_baseline n_baseline_most environments conditions chosen_from seeds seeds_needed
+    "z,.0f": """n n_baseline n_baseline_most environments conditions chosen_from seeds
         steps_to_baseline percent_of_environments""",
     "z.2f": "probability_of_improvement probability_low probability_high effect_size t",
-    TENTH: "difference_se",
     "g": "steps_millions",
 }
-P_VALUES = ["p", "p_adjusted", "p_holm", "p_luck", "paper_p_luck", "smallest_p"]
+P_VALUES = ["p", "p_adjusted", "p_holm", "p_luck", "smallest_p"]
 P_VALUES += ["smallest_p_adjusted"]
+SELDOM = ["exp_name", "phase", "tested", "without_percent"]  # columns that may be empty as a whole
+PERCENTS = ["difference_percent", "percent_low", "percent_high"]
 FORMATS = {name: form for form, names in _COLUMNS_WITH.items() for name in names.split()}
+
+
+# ------------------------------------------------------------------------------ numbers for people
+
+
+def rounded(value, spread=None):
+    """Return a number as text, with two significant digits of its spread.
+
+    ``spread`` is what the number may be off by, in its own units: a standard deviation, or half the
+    width of an interval. The whole part is never cut. Without a spread (none, NaN, zero, or within
+    the rounding errors of floating point) the text has four significant digits.
+
+    >>> rounded(9512.34, 210.0), rounded(0.8712, 0.0342), rounded(-40.0, 8.165)
+    ('9,512', '0.871', '-40.0')
+    >>> rounded(0.8712345), rounded(1234567.8), rounded(0.0, 0.0), rounded(3.2e-7, 1.1e-8)
+    ('0.8712', '1,234,568', '0', '3.20e-07')
+    """
+    if not abs(value) < 1e15:  # beyond the precision of floats, infinite, or NaN
+        return f"{value:.3e}"
+    known = spread is not None and math.isfinite(spread) and spread > 1e-9 * abs(value)
+    digits, scale = (2, spread) if known else (4, abs(value))
+    if not scale:
+        return "0"
+    # "e" rounds first: 0.0996 has the two significant digits of 0.10, not of 0.09
+    decimals = max(0, digits - 1 - int(f"{scale:.{digits - 1}e}".partition("e")[2]))
+    if decimals <= 6:
+        return f"{value:z,.{decimals}f}"
+    if abs(value) < 0.5 * 10.0**-decimals:
+        return "0"
+    exponent = int(f"{value:e}".partition("e")[2])
+    return f"{value:.{max(0, exponent + decimals)}e}"
+
+
+def percent(value, sign="+"):
+    """Write a percentage: whole from 10 on, with a decimal below, without a sign if that is 0.0."""
+    if abs(value) < 0.05:
+        return "0.0 %"
+    return f"{value:{sign},.{0 if abs(value) >= 10 else 1}f} %"
+
+
+def counted(number, word):
+    """Write how many there are: "1 seed", "5 seeds"."""
+    return f"{number:.0f} {word}" + ("" if number == 1 else "s")
+
+
+def seeds_of(n, n_baseline):
+    """Write the seeds with and without noise: "5", or "5/10" where they differ."""
+    return f"{n:.0f}" if n == n_baseline else f"{n:.0f}/{n_baseline:.0f}"
+
+
+def two_digits(p):
+    """Write a p-value with two significant digits, with more if it would look like LEVEL."""
+    text = f"{p:.2g}"
+    return f"{p:.4g}" if float(text) <= LEVEL < p else text
+
+
+def p_value(p):
+    """Write a p-value for a sentence: "= 0.04", or "< 0.001"."""
+    return f"= {two_digits(p)}" if p >= 0.001 else "< 0.001"
+
+
+def is_zero(text):
+    """Tell whether a number looks like zero as it is written."""
+    return not float(text.replace(",", ""))
+
+
+def not_zero(value, spread):
+    """Write a number as `rounded` does, with more digits if it would look like zero and is not."""
+    text = rounded(value, spread)
+    is_rounding_error = not abs(value) > 1e-9 * spread
+    return rounded(value, abs(value)) if is_zero(text) and not is_rounding_error else text
+
+
+def listed(names):
+    """Join names for a sentence: "A, B and C"."""
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+# ------------------------------------------------------------------------------------------ tables
 
 
 @dataclass(frozen=True)
@@ -55,13 +138,10 @@ MERGED = {
     "with noise": "{noisy_mean} ± {noisy_std}",
     "mean": "{mean} ± {std}",
     "average improvement %": "{average_improvement_percent} ± {std_improvement_percent}",
-    "paper: mean": "{paper_mean} ± {paper_std}",
-    "paper: average improvement %": (
-        "{paper_average_improvement_percent} ± {paper_std_improvement_percent}"
-    ),
     "IQM": "{iqm} [{iqm_low}, {iqm_high}]",
     "IQM change %": "{iqm_change_percent} [{iqm_change_low}, {iqm_change_high}]",
     "difference": "{difference} [{difference_low}, {difference_high}]",
+    "difference %": "{difference_percent} [{percent_low}, {percent_high}]",
     "P(improvement)": "{probability_of_improvement} [{probability_low}, {probability_high}]",
     "luck 95 % (p)": "{luck_95} ({p_luck})",
     "score % (baseline)": "{score_percent} ({baseline_score_percent})",
@@ -94,8 +174,7 @@ def spreads(frame):
 def text_of(name, value, spread=None):
     """Return one value of the column `name` as text; a value that does not exist is a dash.
 
-    The paper's numbers have the paper's one decimal, all others the digits that their spread
-    deserves.
+    Numbers have the digits that their spread deserves.
     """
     if pd.isna(value):
         return DASH
@@ -105,9 +184,9 @@ def text_of(name, value, spread=None):
         return two_digits(value)
     if name in ("difference_low", "difference_high") and spread is not None:
         return not_zero(value, spread)
-    if name in FORMATS or name.startswith("paper_"):
-        return f"{value:{FORMATS.get(name, TENTH)}}"
-    if name.endswith("_percent") and spread is None:
+    if name in FORMATS:
+        return f"{value:{FORMATS[name]}}"
+    if name in PERCENTS or (name.endswith("_percent") and spread is None):
         return percent(value, sign="").removesuffix(" %")
     return rounded(value, spread)
 
@@ -131,19 +210,17 @@ def title(column):
 def shown(table):
     """Return a table as a person reads it: all text, related columns in one.
 
-    The phase and environments without percent are shown where a row has any, and exp_name where one
-    is not its script's; a row of all environments says so.
+    Columns that only some tables need are shown where a row has something there, exp_name where one
+    is not its script's.
     """
     frame = (table.frame if table.view is None else table.view).reset_index(drop=True)
     known = spreads(frame)
-    frame = frame.drop(columns=list(table.only_csv))
-    if "scope" in frame:
-        frame["environment"] = frame["environment"].mask(frame.pop("scope") == "all", "all")
+    frame = frame.drop(columns=list(table.only_csv), errors="ignore")
     if "exp_name" in frame:
         names = [script_name(str(algorithm)) for algorithm in frame["algorithm"]]
         frame["exp_name"] = frame["exp_name"].mask(frame["exp_name"] == names, "")
     empty = frame.columns[(frame.isna() | frame.eq("")).all()]
-    frame = frame.drop(columns=empty.intersection(["exp_name", "phase", "without_percent"]))
+    frame = frame.drop(columns=empty.intersection(SELDOM))
     cells = {}
     for name in frame:
         pairs = zip(frame[name], known.get(name, [None] * len(frame)), strict=True)
@@ -193,11 +270,15 @@ def write_table(out, table, latex=False):
     note = f"\n{table.note}\n" if table.note else ""
     (out / f"{table.name}.md").write_text(f"{table.caption}\n\n{markdown}\n{note}", "utf-8")
     lines = tabulate(text.values, text.columns, tablefmt="latex_longtable", disable_numparse=True)
-    caption, note = (re.sub(r"([%&_#$])", r"\\\1", text) for text in (table.caption, note))
     columns = len(text.columns) * "l"
     lines = lines.replace("{longtable}{}", f"{{longtable}}{{{columns}}}", 1)  # if it has no rows
-    lines = lines.replace("\n", f"\n\\caption{{{caption}}}\\\\\n", 1)
-    lines = f"{lines}\n{note}"
-    for sign, command in (("\u00b1", r"$\pm$"), ("\u2013", "--"), (" < ", " $<$ ")):
+    lines = lines.replace("\n", f"\n\\caption{{{in_latex(table.caption)}}}\\\\\n", 1)
+    lines = f"{lines}\n{in_latex(note)}"
+    for sign, command in (("\u00b1", r"$\pm$"), (DASH, "--")):
         lines = lines.replace(sign, command)
     (out / f"{table.name}.tex").write_text(lines, "utf-8")
+
+
+def in_latex(text):
+    """Escape a text for LaTeX, as tabulate does in cells."""
+    return "".join(LATEX.get(character, character) for character in text)

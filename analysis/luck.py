@@ -7,6 +7,7 @@ returns. Keeping the baseline fixed would not do: a baseline that was unlucky is
 
 import numpy as np
 
+from analysis.runs import STUDY
 from analysis.statistics import contrast, pooled_std
 
 DRAWS = 10_000
@@ -51,7 +52,7 @@ def luck_of_studies(studies):
     for study in studies:
         rng = np.random.default_rng(0)
         for e, environment in enumerate(study.environments):
-            samples = [study.sample(config, e) for config in study.returns]
+            samples = [study.sample(config, e) for config in study.finals]
             best = max(filter(len, samples[1:]), key=np.mean, default=None)
             std, df = pooled_std(
                 [s for s in samples if s is best or not clearly_worse(s, samples[0])]
@@ -91,7 +92,7 @@ def add_luck(best, lucks):
     """
     best = best.assign(luck_median=np.nan, luck_95=np.nan, p_luck=np.nan)
     for row in best.itertuples():
-        draws = lucks[row.algorithm, row.exp_name, row.phase, row.environment]
+        draws = lucks[tuple(getattr(row, name) for name in (*STUDY, "environment"))]
         found = np.median(draws), np.quantile(draws, 0.95), p_of_luck(draws, row.difference)
         best.loc[row.Index, ["luck_median", "luck_95", "p_luck"]] = found
     return best

@@ -19,12 +19,13 @@ from analysis.verdicts import tally
 
 SECTIONS = {
     "choice": "Choice of a noise",
+    "noises": "Does a noise help at all?",
     "best": "Best noise tried (may be worse than none)",
     "early_performance": "Learning curves",
     "consistent": "Consistent noise",
     "consistently_worse": "Consistently worse",
     "success": "Success",
-    "statistics": "Statistics",
+    "statistics": "Single rates (secondary)",
     "parameters": "Parameters",
     "robustness": "Robustness",
     "summary": "All results",
@@ -42,8 +43,9 @@ class Results:
     studies: list
     tables: dict  # name -> Table
     headlines: list  # see verdicts.headlines
-    clear: pd.DataFrame  # see verdicts.clear_first
+    clear: pd.DataFrame  # of noises with their rates together: see verdicts.clear_first
     others: pd.DataFrame
+    rates: pd.DataFrame  # sentences on single rates, which are secondary
     robustness: list  # sentences
     overview: str
     problems: str  # runs that were left out, or ""

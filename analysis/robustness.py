@@ -16,31 +16,34 @@ import numpy as np
 import pandas as pd
 
 from analysis import verdicts
-from analysis.runs import KEYS, ROBUSTNESS_COLUMNS, STUDY, SUCCESS, study_name, where_tested
+from analysis.folders import RETURN, SUCCESS
+from analysis.formatting import p_value, percent
+from analysis.runs import KEYS, ROBUSTNESS_COLUMNS, STUDY, study_name, study_of, where_tested
 from analysis.statistics import compare, holm, mean_std, percent_of
 from analysis.tables import table_of
-from noisy_wrappers import BASELINE, WRAPPERS, Configuration, rounded
+from noisy_wrappers import BASELINE, WRAPPERS, Configuration
 
+EPISODES = 100  # of a condition, as evaluate.py plays by default
 CLEAN = BASELINE  # a condition of a test is a Configuration, too
-RUN_COLUMNS = [*KEYS, "configuration", "seed", "elsewhere", "condition", "mean"]
+RUN_COLUMNS = [*STUDY, "environment", "configuration", "seed", "elsewhere", "condition", "mean"]
 COLUMNS = [*KEYS, "test_noise", "test_rate", "tested_on", "n", "mean", "std", "difference"]
 COLUMNS += ["change_percent", "score_percent"]
-SCORE_COLUMNS = """scope environment noise noise_rate n n_baseline conditions difference
+SCORE_COLUMNS = """environment noise noise_rate n n_baseline conditions difference
     difference_low difference_high difference_percent effect_size p p_holm detectable score_percent
     baseline_score_percent clean_change_percent t pooled_std smallest_p"""
 SCORE_COLUMNS = [*STUDY, *SCORE_COLUMNS.split()]
 
 
-def read_robustness(runs_dir, runs, metric="return"):
-    """Read robustness.csv (or .csv.gz) of every finished run: one row per run and condition.
+def read_robustness(runs, metric=RETURN):
+    """Read robustness.csv (or .csv.gz) of runs that count: one row per run and condition.
 
-    metric: what `mean` is of, "return" or "success rate" (in percent); of the latter, only
-    conditions in which the environment tells it, to some run; the others had none there. Return the
-    frame (RUN_COLUMNS) and notes on the files that could not be read.
+    metric: what `mean` is of; of success (in percent), only conditions in which the environment
+    tells it, to some run; the others had none there. Return the frame (RUN_COLUMNS) and notes on
+    the files that could not be read.
     """
     rows, notes = [], []
-    for run in runs[runs["status"] == "finished"].itertuples():
-        path = runs_dir / run.run / "robustness.csv"
+    for run in runs:
+        path = run.folder / "robustness.csv"
         if not path.exists():
             path = path.with_suffix(".csv.gz")
         if not path.exists():
@@ -48,9 +51,12 @@ def read_robustness(runs_dir, runs, metric="return"):
         try:
             tests = read_episodes(path, metric)
         except (OSError, ValueError, EOFError, zlib.error) as error:
-            notes.append(f"{run.run}: {path.name} is left out: {' '.join(str(error).split())}")
+            notes.append(
+                f"{run.folder.name}: {path.name} is left out: {' '.join(str(error).split())}"
+            )
             continue
-        row = {name: getattr(run, name) for name in (*KEYS, "configuration", "seed")}
+        row = dict(zip(STUDY, study_of(run), strict=True))
+        row |= {"configuration": run.configuration, "seed": run.seed}
         for (condition, elsewhere), results in tests.items():
             row |= {"condition": condition, "elsewhere": elsewhere}
             row["environment"] = where_tested(run.environment, elsewhere)
@@ -98,7 +104,7 @@ def incomplete_notes(runs):
     return notes
 
 
-def read_episodes(path, metric="return"):
+def read_episodes(path, metric=RETURN):
     """Read one file: {(Configuration, environment): results of its episodes}.
 
     The environment is empty for that of the training. A result is a return, or of success 100 or 0,
@@ -150,24 +156,32 @@ def by_run(runs, config):
     return mine.pivot(index="seed", columns="condition", values="mean")
 
 
+def row_keys(runs, config):
+    """Return the columns KEYS of the results of one configuration in one environment."""
+    names = [*STUDY, "environment"]
+    return runs.iloc[0][names].to_dict() | {"noise": config.noise, "noise_rate": config.noise_rate}
+
+
 def condition_rows(runs):
     """Yield one row per training configuration and test condition, in each environment."""
     for _, group in runs.groupby([*STUDY, "environment"]):
         baseline = by_run(group, BASELINE)
         for (config, condition), tests in group.groupby(["configuration", "condition"]):
             mean, std, n = mean_std(tests["mean"])
-            row = tests.iloc[0][KEYS].to_dict()
+            row = row_keys(tests, config)
             row |= {"test_noise": condition.noise, "test_rate": condition.noise_rate}
             row |= {"tested_on": tested_on(condition, config), "n": n, "mean": mean, "std": std}
             if config != BASELINE and condition in baseline:
                 row["difference"] = mean - baseline[condition].mean()
-                row["change_percent"] = percent_of(row["difference"], baseline[condition])
+                values = baseline[condition]
+                row["change_percent"] = percent_of(row["difference"], values, tests["mean"])
             if CLEAN in baseline:
-                row["score_percent"] = percent_of(mean - baseline[CLEAN].mean(), baseline[CLEAN])
+                clean = baseline[CLEAN]
+                row["score_percent"] = percent_of(mean - clean.mean(), clean, tests["mean"])
             yield row
 
 
-def score_rows(runs):
+def score_rows(runs, metric=RETURN):
     """Yield the score of every configuration with noise: over all environments, then in each.
 
     `primary` are those over all environments that have two seeds of both kinds, or in the only one.
@@ -175,7 +189,9 @@ def score_rows(runs):
     """
     for _, group in runs.groupby(STUDY):
         for config in sorted({*group["configuration"]} - {BASELINE}):
-            scores = [environment_score(same, config) for _, same in group.groupby("environment")]
+            scores = [
+                environment_score(same, config, metric) for _, same in group.groupby("environment")
+            ]
             scores = [score for score in scores if score]
             at_home = [score for score in scores if not score["elsewhere"]]
             counting = [score for score in at_home if min(score["n"], score["n_baseline"]) >= 2]
@@ -183,13 +199,13 @@ def score_rows(runs):
             if len(counting) > 1:
                 of = f"{len(counting)} of {len(at_home)}" if len(counting) < len(at_home) else "all"
                 where = f"{of} environments together"
-                yield average_score(counting) | {"primary": True, "where": where}
+                yield average_score(counting, metric) | {"primary": True, "where": where}
             for score in scores:
                 is_only = len(counting) == 1 and score is counting[0]
                 yield score | {"primary": bool(score["elsewhere"]) or is_only}
 
 
-def environment_score(runs, config):
+def environment_score(runs, config, metric=RETURN):
     """Score a configuration against the baseline in one environment, or return None.
 
     runs: those of one study and environment. The result is a row of SCORE_COLUMNS with `x` (seeds)
@@ -208,35 +224,42 @@ def environment_score(runs, config):
     ]
     if not conditions:
         return None
-    clean, percent = y[CLEAN].mean(), percent_of(1.0, y[CLEAN])
-    clean_change = (x[CLEAN].mean() - clean) * percent
+    clean, clean_x = y[CLEAN], x[CLEAN]
     x, y = (side[conditions].mean(axis=1).to_numpy() for side in (x, y))
-    row = runs[runs["configuration"] == config].iloc[0][[*KEYS, "elsewhere"]].to_dict()
-    row |= compare(x, y)._asdict() | {
-        "difference_percent": (x.mean() - y.mean()) * percent,
-        "score_percent": (x.mean() - clean) * percent,
-        "baseline_score_percent": (y.mean() - clean) * percent,
-        "clean_change_percent": clean_change,
+    everything = np.concatenate([x, y, clean_x])
+
+    def in_percent(difference):
+        return percent_of(difference, clean, everything)
+
+    row = row_keys(runs, config) | {"elsewhere": runs["elsewhere"].iloc[0]}
+    row |= compare(x, y, episodes=EPISODES if metric == SUCCESS else None)._asdict()
+    row |= {
+        "difference_percent": in_percent(x.mean() - y.mean()),
+        "percent_low": np.nan,  # of the clean return, so it has no interval
+        "percent_high": np.nan,
+        "score_percent": in_percent(x.mean() - clean.mean()),
+        "baseline_score_percent": in_percent(y.mean() - clean.mean()),
+        "clean_change_percent": in_percent(clean_x.mean() - clean.mean()),
     }
-    return row | {"scope": "environment", "x": x, "y": y, "conditions": len(conditions)}
+    return row | {"x": x, "y": y, "conditions": len(conditions)}
 
 
-def average_score(scores):
+def average_score(scores, metric=RETURN):
     """Return the row of all environments; they count equally, whatever their number of seeds."""
     table = pd.DataFrame(scores)
     x, y = (np.array([*zip_longest(*table[name], fillvalue=np.nan)]) for name in ("x", "y"))
-    row = scores[0] | compare(x, y)._asdict()
-    row |= {"scope": "all", "environment": "", "conditions": table["conditions"].min()}
+    row = scores[0] | compare(x, y, episodes=EPISODES if metric == SUCCESS else None)._asdict()
+    row |= {"environment": "", "conditions": table["conditions"].min()}
     return row | table.filter(like="percent").mean(skipna=False).to_dict()
 
 
-def analyse_robustness(runs, metric="return"):
+def analyse_robustness(runs, metric=RETURN):
     """Return the tables of read_robustness's frame, by name, and the sentences on its scores."""
     if runs.empty:
         return {}, []
     table = pd.DataFrame(condition_rows(runs), columns=COLUMNS)
-    more = ["primary", "elsewhere", "where"]
-    scores = pd.DataFrame(score_rows(runs), columns=[*SCORE_COLUMNS, *more])
+    more = ["percent_low", "percent_high", "n_baseline_most", "primary", "elsewhere", "where"]
+    scores = pd.DataFrame(score_rows(runs, metric), columns=[*SCORE_COLUMNS, *more])
     primary = scores[scores["primary"].astype(bool)]
     for _, family in primary[primary["p"].notna()].groupby([*STUDY, "elsewhere"]):
         scores.loc[family.index, "p_holm"] = holm(family["p"].to_numpy(float))
@@ -248,9 +271,14 @@ def analyse_robustness(runs, metric="return"):
             frame[frame.filter(regex="_percent$").columns] = np.nan
     sentences = robustness_sentences(scores.loc[primary.index], metric)
     more = {"section": "robustness", "only_csv": ("t", "pooled_std", "smallest_p")}
-    score = table_of("robustness_score", scores[SCORE_COLUMNS], note=score_note, **more)
-    conditions = table_of("robustness", table, note=note, only_csv=("score_percent",))
-    return {"robustness_score": score, "robustness": conditions}, list(sentences)
+    tables, is_alone = {}, scores["environment"] != ""
+    for name, rows in (("robustness_together", ~is_alone), ("robustness_score", is_alone)):
+        part = scores.loc[rows, SCORE_COLUMNS]
+        if name == "robustness_together":
+            part = part.drop(columns="environment")
+        tables[name] = table_of(name, part, note=score_note, **more)
+    tables["robustness"] = table_of("robustness", table, note=note, only_csv=("score_percent",))
+    return tables, list(sentences)
 
 
 def robustness_sentences(scores, metric):
@@ -258,23 +286,19 @@ def robustness_sentences(scores, metric):
     unit = verdicts.POINTS if metric == SUCCESS else ""
     for row in scores.itertuples():
         where = row.environment or row.where
-        study = study_name(row.algorithm, row.exp_name, row.phase)
+        study = study_name(*(getattr(row, name) for name in STUDY))
         start = f"{study} on {where}, trained with {row.noise} at rate {row.noise_rate}"
         shown, limit = "no clear difference in robustness to new noise", ""
-        evidence = verdicts.difference(row, unit)
+        evidence = verdicts.difference_in_words(row, unit)
         if pd.isna(row.p):
             shown = "too few seeds for a test of robustness to new noise"
         else:
-            corrected = verdicts.p_value(row.p_holm).removeprefix("= ")
-            evidence += f", p {verdicts.p_value(row.p)}, Holm {corrected}"
-        if verdicts.significant(row.p):
-            perhaps = "" if verdicts.significant(row.p_holm) else "perhaps "
-            shown = f"{perhaps}{'more' if row.t > 0 else 'less'} robust to new noise"
-        if not verdicts.significant(row.smallest_p):
-            limit = f"; {verdicts.counted(row.n, 'seed')} against {row.n_baseline} cannot show any"
-        elif not verdicts.significant(row.p) and row.detectable > 0:
-            found = rounded(row.detectable, verdicts.spread_of(row)) + unit
-            limit = f"; a difference of {found} could have been seen (80 % power before Holm)"
+            corrected = p_value(row.p_holm).removeprefix("= ")
+            evidence += f", p {p_value(row.p)}, Holm {corrected}"
+            limit = verdicts.excluded(row, unit) + verdicts.cannot_show(row)
+        if verdicts.significant(row.p_holm):
+            shown = f"{'more' if row.t > 0 else 'less'} robust to new noise"
+            limit = ""
         if pd.notna(row.clean_change_percent):
-            evidence += f"; clean return {verdicts.percent(row.clean_change_percent)}"
+            evidence += f"; clean return {percent(row.clean_change_percent)}"
         yield f"{start}: {shown} ({evidence}){limit}.{verdicts.borderline(row)}"

@@ -1,45 +1,34 @@
-"""Reading a folder of runs for analyze.py: which runs count, and which may be compared.
+"""Which runs of a folder count, which are left out and why.
 
 Runs that may be compared are a study: those of one algorithm and one exp_name, with the same
-arguments. The two phases of a choice are the folders search/ and confirmation/. Only finished runs
-(those with a result.json) count.
+arguments and of the same release. The two phases of a choice are the folders search/ and
+confirmation/. Only finished runs (those with a result.json) count.
 """
 
 import json
 from collections import Counter, defaultdict
-from dataclasses import dataclass
-from functools import reduce
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 
 from analysis import folders
-from analysis.folders import PHASES, SEARCH, DamageError
-from noisy_wrappers import BASELINE, Configuration
+from analysis.choice import CHOICE_COLUMNS, choice_file  # noqa: F401  until sweep/ has moved
+from analysis.folders import NOT_SETTINGS, SEARCH, SUCCESS, DamageError, Run, script_name  # noqa
+from analysis.logs import STOPPED, read_log
+from noisy_wrappers import BASELINE, different_arguments
 
-STUDY = ["algorithm", "exp_name", "phase"]  # the columns that name a study: see study_name
+STUDY = ["algorithm", "exp_name", "phase", "tested"]  # the columns that name a study: study_name
 KEYS = [*STUDY, "environment", "noise", "noise_rate"]
-SUCCESS = "success rate"  # what a Study may have in place of returns
-EVAL_COLUMNS = ["step", "episode", "episodic_return", "episodic_length"]
-RUN_COLUMNS = ["run", "status", "reason", *KEYS, "configuration", "seed", "settings", "versions"]
-RUN_COLUMNS += ["steps", "returns", "success_rates"]
-CHOICE_COLUMNS = ["algorithm", "environment", "phase", "round", "noise", "noise_rate"]
-CHOICE_COLUMNS += ["seeds", "score", "survives"]
+LEFT_OUT_COLUMNS = ["status", *KEYS, "seed", "run", "reason"]
 ROBUSTNESS_COLUMNS = ["noise", "noise_rate", "episode", "episodic_return", "episodic_length"]
-VERSION = r"(?P<name>.*?)(?:-v(?P<version>\d{1,9}))?$"  # of an environment's id, if it has one
-OLDER = "environments"  # before their version, in `phase`: see read_runs
+MORE_TO_COME = {"missing", "unfinished", "failed"}  # statuses of runs that a sweep still owes
 
 
-def study_name(algorithm, exp_name="", phase=""):
+def study_name(algorithm, exp_name="", phase="", tested=""):
     """Name a study for people: "SAC", or "SAC [my_experiment, search]"."""
-    parts = [part for part in (exp_name, phase) if part and part != script_name(algorithm)]
+    parts = [part for part in (exp_name, phase, tested) if part and part != script_name(algorithm)]
     return f"{algorithm} [{', '.join(parts)}]" if parts else algorithm
-
-
-def script_name(algorithm):
-    """Return the exp_name that a training script gives its runs by default."""
-    return f"{algorithm.lower()}_continuous_noisy"
 
 
 def where_tested(environment, elsewhere):
@@ -52,202 +41,210 @@ def rows_of(table, key):
     return pd.MultiIndex.from_frame(table[STUDY]).isin([tuple(key)])
 
 
-def read_evaluations(folder, episodes, total):
-    """Read eval.csv: the steps of the tests, their mean returns, and their rates of success.
-
-    Rates are in percent of the episodes, or None for an environment that does not tell success.
-    Raises DamageError unless every evaluation is whole, in order, and the last is at step `total`.
-    """
-    with folders.naming(folder / "eval.csv"):
-        text = (folder / "eval.csv").read_text("utf-8")
-        header, *lines = text.splitlines() or [""]
-        names = header.split(",")
-        if names not in (EVAL_COLUMNS, [*EVAL_COLUMNS, "success"]):
-            raise ValueError("unexpected header")
-        if not text.endswith("\n"):
-            raise ValueError("the last line is half-written")
-        if not lines:
-            raise ValueError("no evaluation")
-        numbers = np.loadtxt(lines, delimiter=",", ndmin=2, comments=None)
-        whole = numbers.shape[1] == len(names) and len(numbers) % episodes == 0
-        if not whole or not np.isfinite(numbers).all():
-            raise ValueError("incomplete or non-numeric lines")
-        table = np.moveaxis(numbers.reshape(-1, episodes, len(names)), 2, 0)
-        step, episode, episodic_return, _, *success = table
-        if (episode != np.arange(episodes)).any() or (step != step[:, :1]).any():
-            raise ValueError("an evaluation is incomplete")
-        if (np.diff(step[:, 0]) <= 0).any() or step[-1, 0] != total:
-            raise ValueError(f"steps do not ascend to {total}")
-    rates = 100 * success[0].mean(axis=1) if success else None
-    return step[:, 0].astype(int), episodic_return.mean(axis=1), rates
+def study_of(run):
+    """Return the values of STUDY of a run."""
+    return run.algorithm, run.exp_name, run.phase, run.tested
 
 
-def read_run(folder):
-    """Read one run folder: a dict with some of RUN_COLUMNS."""
-    if not folders.has_begun(folder):
-        return {"status": "unfinished", "reason": "no config.json yet"}
-    row = {}
-    try:
-        config = folders.read_config(folder)
-        row = {name: config[name] for name in RUN_COLUMNS if name in config}
-        row["noise"] = config["configuration"].noise
-        row["noise_rate"] = config["configuration"].noise_rate
-        result = folders.read_result(folder, config)
-        if result is None:
-            return row | {"status": "unfinished", "reason": "no result.json"}
-        steps, returns, rates = read_evaluations(folder, config["episodes"], config["total"])
-        if not np.isclose(returns[-1], result["final_return_mean"], rtol=1e-3, atol=1e-3):
-            raise DamageError("eval.csv and result.json disagree on the final return")
-        values = {"steps": steps, "returns": returns, "success_rates": rates}
-        return row | {"status": "finished"} | values
-    except DamageError as error:
-        return row | {"status": "corrupt", "reason": str(error)}
+def by_study(runs):
+    """Return {values of STUDY: runs}, sorted."""
+    found = defaultdict(list)
+    for run in runs:
+        found[study_of(run)].append(run)
+    return dict(sorted(found.items()))
+
+
+@dataclass
+class Entry:
+    """A folder of a run, or the place of one that should be there, and whether it counts."""
+
+    folder: str  # relative to that of all runs; empty where it is missing
+    status: str  # finished (it counts), unfinished, corrupt, different, duplicate, failed, missing
+    reason: str = ""
+    run: Run | None = None  # what could be read
+
+
+def finished(entries):
+    """Return the runs that count."""
+    return [entry.run for entry in entries if entry.status == "finished"]
 
 
 def read_runs(runs_dir):
-    """Read all run folders: a frame with RUN_COLUMNS.
-
-    `status` is finished, unfinished, corrupt, different (from its study), duplicate or failed.
-    `phase` is search or confirmation for the runs of `./benchmark.sh choose`, "environments v4",
-    say, where their study has a newer version of an environment, and empty for all others.
-    """
-    runs_dir, rows = Path(runs_dir), []
-    found = {folder: read_run(folder) for folder in folders.runs_of(runs_dir)}
-    for folder, row in (found | failed_without_a_folder(runs_dir)).items():
+    """Read all run folders: a list of Entry."""
+    runs_dir, entries = Path(runs_dir), []
+    for folder in folders.runs_of(runs_dir):
         phase = "" if folder.parent == runs_dir else folder.parent.name
-        rows.append(row | {"run": str(folder.relative_to(runs_dir)), "phase": phase})
-    runs = pd.DataFrame(rows, columns=RUN_COLUMNS, dtype=object)
-    leave_out_different(runs)
-    set_older_versions_apart(runs)
-    finished = runs[runs["status"] == "finished"]
-    counted = finished.groupby([*KEYS, "seed"])["run"].transform("first")
-    copies = counted[counted != finished["run"]]
-    runs.loc[copies.index, "status"] = "duplicate"
-    runs.loc[copies.index, "reason"] = "same configuration and seed as " + copies + ", which counts"
-    return runs
+        entry = read_entry(folder, phase)
+        entry.folder = str(folder.relative_to(runs_dir))
+        entries.append(entry)
+    entries += failed_without_a_folder(runs_dir)
+    leave_out_different(entries)
+    leave_out_duplicates(entries)
+    return entries
 
 
-def leave_out_different(runs):
-    """Mark the finished runs whose arguments are not those of most runs of their exp_name."""
-    finished = runs[runs["status"] == "finished"]
-    for (_, exp_name), group in finished.groupby(["algorithm", "exp_name"]):
-        usual = usual_settings(group["settings"])
-        for index, own in group["settings"].items():
-            differing = folders.difference(own, usual)
-            said = ", ".join(f"{name} is {own[name]}, not {usual[name]}" for name in differing)
-            said += f" as in the runs of {exp_name} that count: give such runs another --exp-name"
-            if differing:
-                runs.loc[index, ["status", "reason"]] = ["different", said]
+def read_entry(folder, phase):
+    """Read one run folder."""
+    if not folders.has_begun(folder):
+        return Entry("", "unfinished", "no config.json yet")
+    try:
+        run = folders.read_run(folder, phase)
+    except DamageError as error:
+        return Entry("", "corrupt", str(error), error.run)
+    if not run.finished:
+        return Entry("", "unfinished", "no result.json", run)
+    return Entry("", "finished", "", run)
 
 
-def usual_settings(settings):
-    """Return the most frequent arguments of a study.
+def leave_out_different(entries):
+    """Mark the finished runs whose release or arguments are not those of most of their study."""
+    groups = defaultdict(list)
+    for entry in entries:
+        if entry.status == "finished":
+            groups[entry.run.algorithm, entry.run.exp_name].append(entry)
+    for (_, exp_name), group in groups.items():
+        usual = Counter(entry.run.release for entry in group)
+        release = max(usual, key=lambda name: (usual[name], name))
+        others = [entry for entry in group if entry.run.release != release]
+        for entry in others:
+            entry.status = "different"
+            entry.reason = (
+                f"of release {entry.run.release}, whose numbers differ from those of {release}, "
+                f"as the runs of {exp_name} that count: finish a study with one release, or give "
+                "its runs another --exp-name"
+            )
+        same = [entry for entry in group if entry.run.release == release]
+        reference = usual_config([entry.run.config for entry in same])
+        reasons = {}  # most runs have one of a few sets of arguments
+        for entry in same:
+            text = json.dumps(settings_of(entry.run.config), sort_keys=True)
+            if text not in reasons:
+                reasons[text] = what_differs(entry.run.config, reference)
+            if reasons[text]:
+                entry.status = "different"
+                entry.reason = (
+                    f"{reasons[text]} as in the runs of {exp_name} that count: give such runs "
+                    "another --exp-name"
+                )
 
-    settings: a dict for each run. An argument that a run lacks, because an older version made it,
-    is no difference: it has that argument's most frequent value. Of equally frequent ones, those of
-    the longest runs are taken.
+
+def settings_of(config):
+    """Return the arguments that the runs of a study share."""
+    return {name: value for name, value in config["args"].items() if name not in NOT_SETTINGS}
+
+
+def what_differs(config, reference):
+    """Say in which arguments a run differs from the reference of its study, or ""."""
+    differing = different_arguments(config, reference, NOT_SETTINGS)
+    return ", ".join(f"{name} is {ours}, not {usual}" for name, (ours, usual) in differing.items())
+
+
+def usual_config(configs):
+    """Return what most runs of a study have, as a config with "args" and "defaults".
+
+    An argument that a config lacks, because a script has it since then, had the default that the
+    others name, or, of runs of version 0.3, the value that most have. Of equally frequent sets of
+    arguments, that of the longest runs is taken.
     """
-    longest_first = sorted(settings, key=lambda run: -run.get("total_timesteps", 0))
-    values = defaultdict(Counter)  # argument -> how many runs have a value, as text
-    for run in longest_first:
-        for name, value in run.items():
+    longest_first = sorted(configs, key=lambda c: -c["args"].get("total_timesteps", 0))
+    values, defaults = defaultdict(Counter), defaultdict(Counter)
+    for config in longest_first:
+        for name, value in settings_of(config).items():
             values[name][json.dumps(value)] += 1
-    usual = {name: json.loads(counts.most_common(1)[0][0]) for name, counts in values.items()}
-    whole = Counter(json.dumps(usual | run) for run in longest_first)
-    return json.loads(whole.most_common(1)[0][0])  # of equals, the first one counted
+        for name, value in config.get("defaults", {}).items():
+            defaults[name][json.dumps(value)] += 1
+    lacking = {name: json.loads(counts.most_common(1)[0][0]) for name, counts in values.items()}
+    for name, counts in defaults.items():
+        lacking[name] = json.loads(counts.most_common(1)[0][0])
+    named = {name: lacking[name] for name in values}
+    complete = Counter(json.dumps(named | settings_of(config)) for config in longest_first)
+    args = json.loads(complete.most_common(1)[0][0])  # of equals, the first one counted
+    return {"args": args, "defaults": lacking}
 
 
-def set_older_versions_apart(runs):
-    """Write into `phase` where there is a newer version of a run's environment in its study.
-
-    So an average over environments has one version of each.
-    """
-    ours = runs[(runs["phase"] == "") & runs["environment"].notna()]
-    parts = ours["environment"].str.extract(VERSION)
-    version = parts["version"].fillna(-1).astype(int)
-    finished = version.where(ours["status"] == "finished")  # NaN if it is not
-    newest = finished.groupby([*(ours[name] for name in STUDY), parts["name"]]).transform("max")
-    older = parts.loc[version < newest, "version"]
-    runs.loc[older.index, "phase"] = f"{OLDER} " + ("v" + older).fillna("without version")
+def leave_out_duplicates(entries):
+    """Mark all but the first of finished runs with the same configuration and seed."""
+    first = {}
+    for entry in entries:
+        if entry.status != "finished":
+            continue
+        run = entry.run
+        key = (*study_of(run), run.environment, run.configuration, run.seed)
+        if key in first:
+            entry.status = "duplicate"
+            entry.reason = f"same configuration and seed as {first[key]}, which counts"
+        first.setdefault(key, entry.folder)
 
 
 def failed_without_a_folder(runs_dir):
-    """Return {folder: row} of the runs of a sweep of which only their logs tell that they failed.
+    """Return an Entry for each run of which only the log of a sweep tells that it failed.
 
     A run that ended well or was stopped, and has no folder, was moved or deleted by somebody.
     """
-    logs = {path: folders.read_log(path) for path in folders.logged(runs_dir) if not path.exists()}
-    return {
-        path: {"status": "failed", "reason": log.last_line}
+    logs = {path: read_log(path) for path in folders.logged(runs_dir) if not path.exists()}
+    return [
+        Entry(str(path.relative_to(runs_dir)), "failed", log.last_line)
         for path, log in logs.items()
-        if log.exit_status not in (None, 0, *folders.STOPPED)
-    }
+        if log.exit_status not in (None, 0, *STOPPED)
+    ]
 
 
-def choice_file(metric="return"):
-    """Name the file of what was chosen by a metric: scores of two do not compare."""
-    return "choice_by_success.csv" if metric == SUCCESS else "choice.csv"
+def missing_runs(entries):
+    """Return an Entry for each seed that a configuration lacks in an environment.
 
-
-def read_choice(runs_dir, metric="return"):
-    """Read the choice_file of `./benchmark.sh choose`, or return None where there is none.
-
-    Raises ValueError for a damaged file, and where an earlier version kept all runs in one folder.
+    Expected are the seeds that at least half of a study's configurations with noise have, each
+    environment counted apart. An environment in which anything was run should have the baseline
+    with these seeds. The search of `./benchmark.sh choose` gives few noises many seeds: nothing is
+    missing there.
     """
-    path = Path(runs_dir) / choice_file(metric)
-    if not path.exists():
-        return None
-    if not any((path.parent / phase).exists() for phase in PHASES):
-        raise ValueError(folders.flat_choice(path.parent))
-    text = dict.fromkeys(("round", "noise", "noise_rate", "survives"), str)
-    with folders.naming(path):
-        choice = pd.read_csv(path, dtype=text, keep_default_na=False)
-    if list(choice.columns) != CHOICE_COLUMNS:
-        raise ValueError(f"{path} does not have the columns {','.join(CHOICE_COLUMNS)}")
-    pairs = zip(choice["noise"], choice["noise_rate"], strict=True)
-    choice["noise_rate"] = [Configuration.parse(*pair).noise_rate for pair in pairs]
-    return choice
-
-
-def missing_runs(runs):
-    """List seeds that a configuration lacks in an environment: those that most others have.
-
-    That is, at least half of the algorithm's configurations with noise have them, each environment
-    counted apart. An environment in which anything was run should have the baseline with these
-    seeds. The search of `./benchmark.sh choose` gives few noises many seeds: nothing is missing.
-    """
-    rows = []
-    runs = runs[runs["algorithm"].notna() & (runs["status"] != "different")]
-    for study, group in runs[runs["phase"] != SEARCH].groupby(STUDY):
-        found = group.groupby(["environment", "configuration"])["seed"].agg(set).to_dict()
+    missing = []
+    runs = [e.run for e in entries if e.run is not None and e.status != "different"]
+    for study in by_study(run for run in runs if run.phase != SEARCH).values():
+        found, example = defaultdict(set), {}
+        for run in study:
+            found[run.environment, run.configuration].add(run.seed)
+            example[run.environment] = run
         baselines = {(environment, BASELINE) for environment, _ in found}
         usual = [seeds for key, seeds in found.items() if key not in baselines]
         usual = usual or list(found.values())
         counts = Counter(seed for seeds in usual for seed in seeds)
         expected = {seed for seed, n in counts.items() if 2 * n >= len(usual)}
-        for environment, config in sorted(found.keys() | baselines):
-            keys = (*study, environment, config.noise, config.noise_rate)
-            for seed in sorted(expected - found.get((environment, config), set())):
-                rows.append((*keys, int(seed), "missing", "no run folder"))
-    return pd.DataFrame(rows, columns=[*KEYS, "seed", "status", "reason"])
+        for environment, configuration in sorted(found.keys() | baselines):
+            for seed in sorted(expected - found.get((environment, configuration), set())):
+                run = replace(example[environment], configuration=configuration, seed=seed)
+                missing.append(Entry("", "missing", "no run folder", run))
+    return missing
 
 
-def left_out(runs):
-    """List all runs that are in no table: one row per configuration and status.
+def left_out(entries):
+    """List all runs that are in no table: a frame with LEFT_OUT_COLUMNS, a row for each."""
+    rows = []
+    for entry in [e for e in entries if e.status != "finished"] + missing_runs(entries):
+        row = {"status": entry.status, "run": entry.folder, "reason": entry.reason}
+        if run := entry.run:
+            columns = run.environment, run.configuration.noise, run.configuration.noise_rate
+            row |= zip(KEYS, (*study_of(run), *columns), strict=True)
+            row["seed"] = run.seed
+        rows.append(row)
+    return pd.DataFrame(rows, columns=LEFT_OUT_COLUMNS, dtype=object)
 
-    Also return a Counter with the number of these runs by status. Seeds are ranges ("1-5, 7"). A
-    run whose config.json cannot be read has a row of its own.
+
+def in_short(missing):
+    """Return a frame of left_out for people: a row for each configuration, status and reason.
+
+    Seeds are ranges ("1-5, 7"). A run whose config.json cannot be read has a row of its own.
     """
-    out = pd.concat([runs[runs["status"] != "finished"], missing_runs(runs)], ignore_index=True)
-    out["nameless"] = out["run"].where(out["algorithm"].isna(), "")
-    groups = out.groupby(["status", *KEYS, "nameless"], sort=False, dropna=False)
+    if missing.empty:
+        return missing.rename(columns={"seed": "seeds"})
+    missing = missing.assign(nameless=missing["run"].where(missing["algorithm"].isna(), ""))
+    groups = missing.groupby(["status", *KEYS, "nameless"], sort=False, dropna=False)
     table = groups.agg(seeds=("seed", ranges), run=("run", few), reason=("reason", few))
-    return table.droplevel("nameless").reset_index(), Counter(out["status"])
+    return table.droplevel("nameless").reset_index()
 
 
 def few(texts):
     """Join one or two different texts; of more, give the first and the number of the others."""
-    different = list(texts.dropna().unique())
+    different = [text for text in texts.dropna().unique() if text]
     if len(different) > 2:
         return f"{different[0]} and {len(different) - 1} more"
     return "; ".join(different)
@@ -264,106 +261,15 @@ def ranges(numbers):
     return ", ".join(f"{low}" if low == high else f"{low}-{high}" for low, high in parts)
 
 
-@dataclass
-class Study:
-    """The finished runs that may be compared: those of one algorithm and one exp_name."""
-
-    algorithm: str
-    exp_name: str
-    phase: str  # as in read_runs
-    environments: list
-    seeds: list
-    steps: np.ndarray  # the evaluation steps that all runs share
-    returns: dict  # Configuration, the baseline first -> (steps x seeds x envs), NaN without a run
-    metric: str = "return"  # or "success rate": then `returns` has rates of success in percent
-
-    @property
-    def key(self):
-        """What tells it from other studies, as the columns STUDY do."""
-        return self.algorithm, self.exp_name, self.phase
-
-    @property
-    def name(self):
-        """Its name for people."""
-        return study_name(*self.key)
-
-    def all_equal(self):
-        """Return the environments where all tests of two or more runs are equal: {name: value}."""
-        found = {}
-        for e, env in enumerate(self.environments):
-            tests = np.concatenate([values[..., e] for values in self.returns.values()], axis=1)
-            tests = tests[:, np.isfinite(tests[-1])]
-            if tests.shape[1] > 1 and np.ptp(tests) <= 1e-12 * abs(tests).max():
-                found[env] = tests[0, 0]
-        return found
-
-    def sample(self, config, e):
-        """Return the final test returns (seeds,) in one environment, of the runs that exist."""
-        returns = self.final(config)[:, e]
-        return returns[np.isfinite(returns)]
-
-    def final(self, config):
-        """Return the (seeds x envs) array of final test returns."""
-        return self.returns[config][-1]
+# ------------------------------------------------------------------------- until sweep/ has moved
 
 
-def make_studies(runs, metric="return"):
-    """Arrange the finished runs into a list of Study, and list in words what had to be cut.
-
-    metric: what is compared, "return" or "success rate"; of the latter, only environments that tell
-    it. A run there that never does was never successful, and a note says so.
-    """
-    studies, notes = [], []
-    column = "success_rates" if metric == SUCCESS else "returns"
-    finished = runs[runs["status"] == "finished"]
-    told = finished[column].notna()
-    others_tell = told.groupby(finished["environment"]).transform("any")
-    silent = finished.loc[others_tell & ~told, "environment"]
-    for env, n in silent.value_counts(sort=False).items():
-        notes.append(
-            f"runs on {env} that never tell success, as others do, count as 0 %: {n} (version "
-            "0.2 noted no success: leave its runs out)"
-        )
-    for key, group in finished[others_tell].groupby(STUDY):
-        name = study_name(*key)
-        steps, longest = reduce(np.intersect1d, group["steps"]), group["steps"].map(len).max()
-        if len(steps) < longest:
-            notes.append(
-                f"{name}: runs differ in their evaluation steps; curves are cut to "
-                f"those that all share, {len(steps)} of up to {longest}"
-            )
-        envs, seeds = sorted(set(group["environment"])), sorted(set(group["seed"]))
-        shape = (len(steps), len(seeds), len(envs))
-        configs = sorted({*group["configuration"], BASELINE})
-        returns = {config: np.full(shape, np.nan) for config in configs}
-        for run in group.itertuples():
-            place = seeds.index(run.seed), envs.index(run.environment)
-            tests, shared = getattr(run, column), np.isin(run.steps, steps)
-            returns[run.configuration][:, *place] = 0 if tests is None else tests[shared]
-        study = Study(*key, envs, seeds, steps, returns, metric)
-        for e, env in enumerate(envs):
-            if study.phase != SEARCH and len(study.sample(BASELINE, e)) == 0:
-                notes.append(f"{name}: no finished baseline on {env}, so no comparison there")
-        if study.phase.startswith(OLDER):
-            notes.append(
-                f"{name} is apart, because averages over environments take the newest version of "
-                f"each: {', '.join(envs)}"
-            )
-        studies.append(study)
-    return studies, notes
-
-
-def version_notes(runs):
-    """Say in words where finished runs of one study differ in versions of code or libraries."""
-    notes = []
-    for key, group in runs[runs["status"] == "finished"].groupby(STUDY):
-        for library in sorted(set().union(*group["versions"])):
-            used = group["versions"].map(lambda versions, name=library: str(versions.get(name)))
-            mixed = used.groupby(group["environment"]).transform("nunique") > 1
-            if mixed.any():
-                counts = Counter(used[mixed])
-                found = ", ".join(f"{version} (n = {n})" for version, n in sorted(counts.items()))
-                code = library == "git commit"
-                what = "of different code versions" if code else f"with different {library}"
-                notes.append(f"{study_name(*key)}: some rows average runs {what}: {found}")
-    return notes
+def read_run(folder):
+    """Read one run folder as sweep/choose.py did before there was folders.read_run."""
+    entry = read_entry(Path(folder), "")
+    row = {"status": entry.status, "reason": entry.reason}
+    if entry.status == "finished":
+        curve = entry.run.curve
+        row |= {"steps": curve.steps, "returns": curve.returns}
+        row["success_rates"] = curve.success_rates
+    return row

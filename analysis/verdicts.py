@@ -1,34 +1,55 @@
-"""One plain sentence for each environment and noise: is it better than no noise?"""
+"""One plain sentence for each comparison: is this noise better than no noise?
+
+A comparison is a row of a frame of analysis/comparisons.py.
+"""
 
 from math import nan
 
 import pandas as pd
 
-from analysis.runs import STUDY, SUCCESS, rows_of, study_name
-from analysis.statistics import LEVEL, SEEDS_FOR_INTERVAL, holm
-from noisy_wrappers import rounded
+from analysis.folders import SUCCESS
+from analysis.formatting import (
+    counted,
+    is_zero,
+    listed,
+    not_zero,
+    p_value,
+    percent,
+    rounded,
+    two_digits,
+)
+from analysis.power import LEVEL
+from analysis.runs import STUDY, rows_of, study_name
+from analysis.statistics import SEEDS_FOR_INTERVAL, holm
 
+BETTER, WORSE = CLEAR = ["better", "worse"]
+NO_SUCH_GAIN = "no such gain"  # as --smallest-gain asks for
 UNCLEAR = "no clear difference"
 TOO_FEW = "too few seeds"
 ALL_EQUAL = "all equal"  # all tests of all runs
-CLEAR = ["better", "worse"]
-VERDICTS = [*CLEAR, "perhaps better", "perhaps worse", UNCLEAR, TOO_FEW, ALL_EQUAL]  # in this order
+VERDICTS = [BETTER, WORSE, NO_SUCH_GAIN, UNCLEAR, TOO_FEW, ALL_EQUAL]  # in this order
 POINTS = " percentage points of success"
-MAX_SEEDS = 1000  # a difference that would take more seeds is said to take more than these
+# With more times the seeds on one side, and few on the other, a test may be wrong too often where
+# noise changes the spread of lopsided returns: docs/statistics.md. Comparisons of noises are noted,
+# those of single rates have no verdict.
+MOST_RATIO, MOST_RATIO_OF_RATES, SEEDS_FOR_ANY_RATIO = 2.6, 1.6, 20
 
 
-def verdict(row):
-    """Name the verdict of a row of statistics: one of VERDICTS, or NaN without a baseline."""
+def verdict(row, smallest_gain=None, metric=None):
+    """Name the verdict of a comparison: one of VERDICTS, or NaN where nothing is to be judged."""
     if pd.isna(row["smallest_p"]):
         return nan
     if row.get("verdict") == ALL_EQUAL:
         return ALL_EQUAL
     if pd.isna(row["p"]):
         return TOO_FEW
-    if not significant(row["p"]):
-        return UNCLEAR
-    direction = "better" if row["t"] > 0 else "worse"
-    return direction if significant(row["p_adjusted"]) else f"perhaps {direction}"
+    if significant(row["p_adjusted"]):
+        return BETTER if row["t"] > 0 else WORSE
+    if smallest_gain is not None:
+        limit = row["difference_high"] if metric == SUCCESS else row["percent_high"]
+        if limit < smallest_gain:
+            return NO_SUCH_GAIN
+    return UNCLEAR
 
 
 def significant(p):
@@ -36,35 +57,13 @@ def significant(p):
     return round(p, 12) <= LEVEL
 
 
-# ---------------------------------------------------------------------------- numbers in a sentence
+def is_lopsided(n, n_baseline, most=MOST_RATIO):
+    """Tell whether the numbers of seeds differ so much that a test may be wrong too often."""
+    few, many = sorted((n, n_baseline))
+    return few < SEEDS_FOR_ANY_RATIO and many > most * few
 
 
-def percent(value, sign="+"):
-    """Write a percentage: whole from 10 on, with a decimal below, without a sign if that is 0.0."""
-    if abs(value) < 0.05:
-        return "0.0 %"
-    return f"{value:{sign},.{0 if abs(value) >= 10 else 1}f} %"
-
-
-def counted(number, word):
-    """Write how many there are: "1 seed", "5 seeds"."""
-    return f"{number:.0f} {word}" + ("" if number == 1 else "s")
-
-
-def seeds_of(n, n_baseline):
-    """Write the seeds with and without noise: "5", or "5/10" where they differ."""
-    return f"{n:.0f}" if n == n_baseline else f"{n:.0f}/{n_baseline:.0f}"
-
-
-def two_digits(p):
-    """Write a p-value with two significant digits, with more if it would look like LEVEL."""
-    text = f"{p:.2g}"
-    return f"{p:.4g}" if float(text) <= LEVEL < p else text
-
-
-def p_value(p):
-    """Write a p-value for a sentence: "= 0.04", or "< 0.001"."""
-    return f"= {two_digits(p)}" if p >= 0.001 else "< 0.001"
+# ------------------------------------------------------------------------------- parts of sentences
 
 
 def spread_of(row):
@@ -73,22 +72,10 @@ def spread_of(row):
     return row.pooled_std if pd.isna(half) else half
 
 
-def is_zero(text):
-    """Tell whether a number looks like zero as it is written."""
-    return not float(text.replace(",", ""))
+def difference_in_words(row, unit=""):
+    """Write what a comparison found: "+11.8 [8.4, 15.3] (+21 % [15, 28])".
 
-
-def not_zero(value, spread):
-    """Write a number as `rounded` does, with more digits if it would look like zero and is not."""
-    text = rounded(value, spread)
-    is_rounding_error = not abs(value) > 1e-9 * spread
-    return rounded(value, abs(value)) if is_zero(text) and not is_rounding_error else text
-
-
-def difference(row, unit=""):
-    """Write what a comparison found: "+11.8 [8.4, 15.3] (+21 %)", of several environments in sd.
-
-    unit: of the difference, such as POINTS.
+    Of several environments in standard deviations. unit: of the difference, such as POINTS.
     """
     if pd.isna(row.difference):
         text = f"{row.effect_size:+z.2f} standard deviations in the median environment"
@@ -104,8 +91,35 @@ def difference(row, unit=""):
         text += unit
     if pd.notna(row.difference_percent):
         average = " on average" if pd.isna(row.difference) else ""
-        text += f" ({percent(row.difference_percent)}{average})"
+        text += f" ({percent(row.difference_percent)}{percent_interval(row)}{average})"
     return text
+
+
+def percent_interval(row):
+    """Write the interval of a change in percent: " [15, 28]", or ""."""
+    low, high = getattr(row, "percent_low", nan), getattr(row, "percent_high", nan)
+    if pd.isna(low):
+        return ""
+    return f" [{', '.join(percent(end, sign='').removesuffix(' %') for end in (low, high))}]"
+
+
+def excluded(row, unit=""):
+    """Say which gains and losses the interval of a comparison excludes, or ""."""
+    if pd.isna(row.difference_low):
+        return ""
+    low, high = row.difference_low, row.difference_high
+    in_percent = pd.notna(getattr(row, "percent_high", nan))
+
+    def size(end, end_in_percent):
+        if in_percent:
+            return percent(abs(end_in_percent), sign="")
+        return not_zero(abs(end), spread_of(row)) + unit
+
+    gain = "any gain" if high <= 0 else ""
+    loss = "any loss" if low >= 0 else ""
+    gain = gain or f"a gain of more than {size(high, row.percent_high if in_percent else nan)}"
+    loss = loss or f"a loss of more than {size(low, row.percent_low if in_percent else nan)}"
+    return f"; excluded: {gain}, {loss}"
 
 
 def corrected(p, number, what):
@@ -131,26 +145,65 @@ def smallest(row):
     return f" (smallest possible: {row.smallest_p:.2g})" if few else ""
 
 
+def cannot_show(row):
+    """Say where the seeds of a comparison cannot show any difference, or ""."""
+    if significant(row.smallest_p):
+        return ""
+    n, m, most = int(row.n), int(row.n_baseline), int(row.n_baseline_most)
+    seeds = counted(n, "seed")
+    if m < most:
+        seeds += f" against {m} to {most}"
+    elif n != m:
+        seeds += f" against {m}"
+    return f"; {seeds} cannot show any (smallest possible p: {two_digits(row.smallest_p)})"
+
+
 # ---------------------------------------------------------------------------------------- sentences
 
 
-def sentence(row, unit=""):
-    """Say in one sentence what a row of statistics shows; unit: of the difference."""
-    where = row["environment"]
-    if row["scope"] == "all":
-        where = f"{row['environments']:.0f} environments together"
-    study = study_name(*row[STUDY])
-    start = f"{study} on {where} with {row['noise']} at rate {row['noise_rate']}"
+def sentence(row, unit="", smallest_gain=None):
+    """Say in one sentence what a comparison shows; unit: of the difference."""
+    where = row["environment"] or f"{row['environments']:.0f} environments together"
+    rate = row["noise_rate"]
+    at = f"at rate {rate}" if "," not in rate else f"at {rate.count(',') + 1} rates together"
+    start = f"{study_name(*row[STUDY])} on {where} with {row['noise']} {at}"
     if row["verdict"] == ALL_EQUAL:
         return f"{start} cannot be judged: all tests of all runs have the same result."
     if row["verdict"] == TOO_FEW:
-        return f"{start} has too few seeds for a test: {difference(row, unit)}."
-    evidence = f"{difference(row, unit)}, p {p_value(row['p'])}{smallest(row)}"
-    if row["verdict"] == UNCLEAR:
-        return f"{start} shows {UNCLEAR}: {evidence}{power(row)}.{borderline(row)}"
+        return f"{start} has too few seeds for a test: {difference_in_words(row, unit)}."
+    evidence = f"{difference_in_words(row, unit)}, p {p_value(row['p'])}{smallest(row)}"
     several = corrected(row["p_adjusted"], row["comparisons"], "comparison")
-    evidence += several or ", the only comparison there"
-    return f"{start} is {row['verdict']} than no noise: {evidence}.{borderline(row)}"
+    if row["verdict"] in CLEAR:
+        evidence += several or ", the only comparison there"
+        return f"{start} is {row['verdict']} than no noise: {evidence}.{borderline(row)}"
+    shows = UNCLEAR
+    if row["verdict"] == NO_SUCH_GAIN:
+        shows = f"no gain of {smallest_gain:g}{unit or ' %'}"
+    evidence += several if significant(row["p"]) else ""
+    evidence += excluded(row, unit) + cannot_show(row)
+    return f"{start} shows {shows}: {evidence}.{borderline(row)}"
+
+
+def in_sentences(compared, unit="", smallest_gain=None):
+    """Return a frame with a verdict and a sentence for all comparisons that have one.
+
+    Clear differences come before others. unit: behind each difference, such as POINTS.
+    """
+    compared = compared[compared["verdict"].notna()]
+    sentences = [sentence(row, unit, smallest_gain) for _, row in compared.iterrows()]
+    rank = compared["verdict"].map(VERDICTS.index)
+    compared = compared.assign(sentence=sentences, rank=rank)
+    compared = compared.sort_values([*STUDY, "environment", "rank", "p"], kind="stable")
+    return compared[[*STUDY, "environment", "verdict", "sentence"]].reset_index(drop=True)
+
+
+def clear_first(judged, number=10):
+    """Split a frame of sentences: the first clear ones, at most `number`, and all others.
+
+    What is better comes before what is worse.
+    """
+    clear = judged[judged["verdict"].isin(CLEAR)].sort_values("verdict", kind="stable")
+    return clear[:number], judged.drop(clear.index[:number])
 
 
 def what_all_runs_do(value, metric):
@@ -161,37 +214,8 @@ def what_all_runs_do(value, metric):
     return always.get(value, f"all tests of all runs have a success rate of {value:.0f} %")
 
 
-def power(row):
-    """Say what the seeds of a row without a clear difference could have shown, or ""."""
-    n, m, most = int(row["n"]), int(row["n_baseline"]), int(row["n_baseline_most"])
-    seeds = counted(n, "seed")
-    if m < most:
-        seeds += f" against {m} to {most}"
-    elif n != m:
-        seeds += f" against {m}"
-    parts = []
-    if not significant(row["smallest_p"]):
-        parts.append(
-            f"{seeds} cannot show any (smallest possible p: {two_digits(row['smallest_p'])})"
-        )
-    elif row["detectable"] > 0:
-        before, number = "80 % power", row["comparisons"]
-        if number > 1:
-            before += f" before the correction for {number:.0f} comparisons"
-            if not significant(row["smallest_p_adjusted"]):
-                before += ", which no noise can pass alone"
-        found = rounded(row["detectable"], spread_of(row))
-        parts.append(f"{seeds} could have shown {found} ({before})")
-    needed = row["seeds_needed"]
-    if needed > max(n, m) and row["difference"]:
-        needed = f"about {needed:.0f}" if needed <= MAX_SEEDS else f"more than {MAX_SEEDS:,}"
-        observed = not_zero(abs(row["difference"]), spread_of(row))
-        parts.append(f"{observed} would take {needed} seeds each")
-    return "; " + ", and ".join(parts) if parts else ""
-
-
 def tally(verdicts):
-    """Count verdicts in words: "3 comparisons: 1 perhaps better, 2 no clear difference"."""
+    """Count verdicts in words: "3 comparisons: 1 better, 2 no clear difference"."""
     counts = verdicts.value_counts()
     parts = [f"{counts[name]} {name}" for name in VERDICTS if name in counts]
     return f"{counted(len(verdicts), 'comparison')}: {', '.join(parts)}"
@@ -224,21 +248,16 @@ def luck_sentence(best):
     return f"On {listed(where)} the best noise looks better than {rivals}{elsewhere}."
 
 
-def listed(names):
-    """Join names for a sentence: "A, B and C"."""
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
-
-
-def headlines(statistics, best):
+def headlines(by_noise, best):
     """Return for each study its name, its comparisons in words, its counts of verdicts, its luck.
 
-    statistics, best: the frames of these tables.
+    by_noise: the comparisons of noises, in one environment and in several; best: the table's frame.
     """
     lines = []
-    judged = statistics[statistics["verdict"].notna()]
+    judged = by_noise[by_noise["verdict"].notna()]
     for key, rows in judged.groupby(STUDY, sort=False):
-        alone, together = rows[rows["scope"] != "all"], (rows["scope"] == "all").sum()
-        noises = counted(len(rows.drop_duplicates(["noise", "noise_rate"])), "noise")
+        alone, together = rows[rows["environment"] != ""], (rows["environment"] == "").sum()
+        noises = counted(rows["noise"].nunique(), "noise")
         tried = f"{noises} in {counted(alone['environment'].nunique(), 'environment')}"
         if together:
             tried += f", {together} in several environments together"
@@ -247,32 +266,11 @@ def headlines(statistics, best):
         found = rows["verdict"].value_counts()
         said = [word for word in VERDICTS if word in CLEAR or word in found]
         counts = [(word, found.get(word, 0)) for word in said]
-        luck = (
-            "" if set(rows["verdict"]) == {ALL_EQUAL} else luck_sentence(best[rows_of(best, key)])
-        )
+        luck = ""
+        if set(rows["verdict"]) != {ALL_EQUAL}:
+            luck = luck_sentence(best[rows_of(best, key)])
         lines.append({"name": study_name(*key), "tried": tried, "counts": counts, "luck": luck})
     return lines
 
 
-def clear_first(judged, number=10):
-    """Split a frame of sentences: the first clear ones, at most `number`, and all others.
-
-    What is better comes before what is worse.
-    """
-    clear = judged[judged["verdict"].isin(CLEAR)].sort_values("verdict", kind="stable")
-    return clear[:number], judged.drop(clear.index[:number])
-
-
-def in_sentences(statistics, unit=""):
-    """Return a frame with a verdict and a sentence for all that was compared.
-
-    unit: behind each difference, such as POINTS.
-    All environments together come before each alone, and clear differences before others.
-    """
-    compared = statistics[statistics["verdict"].notna()]
-    sentences = [sentence(row, unit) for _, row in compared.iterrows()]
-    rank = compared["verdict"].map(VERDICTS.index)
-    compared = compared.assign(sentence=sentences, apart=compared["scope"] != "all", rank=rank)
-    compared = compared.sort_values([*STUDY, "apart", "environment", "rank", "p"], kind="stable")
-    columns = [*STUDY, "scope", "environment", "verdict", "sentence"]
-    return compared[columns].reset_index(drop=True)
+difference = difference_in_words  # until sweep/ has moved

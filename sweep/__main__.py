@@ -23,11 +23,14 @@ from statistics import harmonic_mean
 from typing import NamedTuple
 
 from analysis.errors import take_over_terminal
-from analysis.folders import STOPPED, Log, is_locked, read_log
+from analysis.logs import STOPPED, Log, is_locked, read_log
 from sweep.environment import cost
-from sweep.grid import PlannedRun, command_line, grid, result, runs_in
+from sweep.found import look, refuse_others, remarks, runs_in
+from sweep.grid import PlannedRun, command_line, grid
 from sweep.options import from_caller, parse_args
+from sweep.words import counted
 
+PATIENCE = 60  # seconds until another machine's results are seen, or taken for lost
 YOUNG = 120  # seconds: a run writes a line at least every ten, except in a test or in compiling
 RUNNING, PROBABLY = "running", "probably running"
 STATES = ("done", RUNNING, PROBABLY, "failed", "to do")
@@ -45,11 +48,15 @@ class Progress(NamedTuple):
 def progress_of(run, over):
     """Return a run's progress; where its sweep is over, no young log means that it is running."""
     log = read_log(run.folder)
-    done, damage = result(run)
-    if done:
+    found = look(run)
+    if found.finished:
         return Progress(run, log, "done")
-    if damage:
-        return Progress(run, log._replace(last_line=damage), "failed", "damaged")
+    if found.damage:
+        return Progress(run, log._replace(last_line=found.damage), "failed", "damaged")
+    if found.differences:
+        said = f"it has {' and '.join(found.differences)}"
+        return Progress(run, log._replace(last_line=said, step=0), "to do", "other arguments")
+    is_young = abs(log.age) < YOUNG  # a log that is dated in the future is not
     if is_locked(run.folder):
         is_silent = YOUNG <= log.age < float("inf")
         reason = f"running, silent for {log.age / 60:.0f} min" if is_silent else ""
@@ -62,7 +69,7 @@ def progress_of(run, over):
     if status is not None:
         ended = f"signal {status - 128}" if status > 128 else f"exit {status}"
         return Progress(run, log, "failed", ended)
-    if log.age < YOUNG and not over:
+    if is_young and not over:
         return Progress(run, log, PROBABLY)
     return Progress(run, log, "to do", "lost" if log.age < float("inf") else "")
 
@@ -71,7 +78,9 @@ def summary(progresses):
     """Return one line: how many runs are in which state, how fast it goes, how long it takes."""
     count = Counter(progress.state for progress in progresses)
     states = [state for state in STATES if state != PROBABLY or count[state]]
-    text = f"{len(progresses)} runs: " + ", ".join(f"{count[state]} {state}" for state in states)
+    text = f"{counted(len(progresses), 'run')}: " + ", ".join(
+        f"{count[state]} {state}" for state in states
+    )
     speeds = {}
     for progress in progresses:
         if progress.log.steps_per_second:
@@ -110,23 +119,22 @@ def show_list(args, runs, choices):
     A dry run also says what they will take; a choice says it of each of its batches.
     """
     done, todo = [], []
-    for run in runs:
-        finished, damage = result(run)
-        if damage:
-            print(f"warning: {damage}", file=sys.stderr)
+    for run, found in zip(runs, refuse_others(runs, from_caller(args, args.runs_dir)), strict=True):
+        if found.damage:
+            print(f"warning: {found.damage}", file=sys.stderr)
         else:
-            (done if finished else todo).append(run)
+            (done if found.finished else todo).append(run)
     for run in todo:
         folder = f"{run.folder.parent}/{run.folder.name}"  # with a slash, for --runs-dir . too
         print(folder, command_line(run), sep="\t")
-    plan = [f"{len(runs)} runs, {len(todo)} to do"]
+    lines = [f"{counted(len(runs), 'run')}{with_baselines(runs)}, {len(todo)} to do"]
     if choices:
-        from sweep import choose
+        from sweep import telling
 
-        plan = choose.plan(choices, args)
+        lines = telling.before_a_batch(choices, args)
     elif args.view == "dry-run" and todo:
-        plan[0] += "; " + cost(args, done, todo)
-    for line in plan:
+        lines[0] += "; " + cost(args, done, todo)
+    for line in lines:
         print(line, file=sys.stderr)
 
 
@@ -154,12 +162,15 @@ def watch(args, runs, choices):
 def show_status(args, runs, choices):
     """Print how far a sweep is; the exit status is 1 where a run's files are damaged."""
     progresses = show_progress(args, runs, over=False)
+    hindrances, notes = remarks(map(look, runs), from_caller(args, args.runs_dir))
+    for line in [*hindrances, *notes]:
+        print(f"note: {line}")
     silent = [p for p in progresses if p.state == RUNNING and p.reason]
     table("running, but silent:", silent, args)
     if choices:
-        from sweep import choose
+        from sweep import telling
 
-        print(*choose.standing(choices, args), sep="\n")
+        print(*telling.standing(choices, args), sep="\n")
     return int(any(p.reason == "damaged" for p in progresses))
 
 
@@ -174,10 +185,13 @@ def show_report(args, runs, choices):
     unfinished = any(p.state != "done" for p in progresses)
     if unfinished:
         check_disk(runs[0].folder.parent / "logs")
+    refused = {p.run.script.file: p.log.last_line for p in progresses if p.reason == "exit 2"}
+    for script, reason in refused.items():
+        print(f"{script} refused its arguments, so no more of its runs were started: {reason}")
     if choices:
-        from sweep import choose
+        from sweep import telling
 
-        choose.report(choices, args)
+        telling.report(choices, args)
     if any(p.state == "done" for p in progresses):
         place = shlex.quote(from_caller(args, args.runs_dir))
         program = shlex.quote(from_caller(args, "analyze.py"))
@@ -196,6 +210,15 @@ def show_progress(args, runs, over, everything=False):
     named = [p for p in progresses if p.state == "failed" or (everything and p.reason)]
     table("not finished:" if everything else "failed:", named, args)
     return progresses
+
+
+def with_baselines(runs):
+    """Say how many runs have no noise, where these have other seeds than those with noise."""
+    kinds = {True: set(), False: set()}
+    for run in runs:
+        kinds["--noise" in run.command].add((run.kind, run.seed))
+    number = len(kinds[False])
+    return f" ({number} of them without noise)" if kinds[True] not in (set(), kinds[False]) else ""
 
 
 def check_disk(folder):
@@ -223,20 +246,50 @@ VIEWS = {
 
 def main(view, caller, argv):
     """Print one view of the grid; returns the exit status."""
-    choices = []
     with contextlib.redirect_stdout(sys.stderr):  # what a user's module prints is no run
         args = parse_args(view, caller, argv)
-        if not args.names_grid:
-            runs = runs_in(args.runs_dir)
-        elif args.preset == "choose":
-            from sweep import choose  # and with it pandas: no other preset should wait for that
-
-            choices = choose.choices(args)
-            runs = [run for choice in choices for run in choice.runs.values()]
-        else:
-            runs = grid(args)
+        runs, choices = planned(args)
+        if os.environ.get("SWEEP_WAITED") and view in ("list", "report") and are_seen(runs):
+            runs, choices = planned(args)
     runs.sort(key=lambda run: run.seed)  # the first seed of everything first
     return VIEWS[view](args, runs, choices) or 0
+
+
+def planned(args):
+    """Return the runs of a grid, and, if they are those of choices, these."""
+    if not args.names_grid:
+        return runs_in(args.runs_dir, args.caller), []
+    if args.preset != "choose":
+        return grid(args), []
+    from sweep import choose  # and with it pandas: no other preset should wait for that
+
+    choices = choose.choices(args)
+    return [run for choice in choices for run in choice.runs.values()], choices
+
+
+def are_seen(runs):
+    """Wait until the results can be seen of runs that have just ended well on other machines.
+
+    A network's file system may show them seconds after the log says exit=0. Returns whether there
+    were any to wait for.
+    """
+    deadline, waited = time.monotonic() + PATIENCE, False
+    while late := [run for run in runs if is_late(run)]:
+        if time.monotonic() > deadline:
+            break
+        waited = True
+        time.sleep(1)
+        for folder in {run.folder.parent for run in late}:
+            os.listdir(folder)  # makes the file system look again
+    return waited
+
+
+def is_late(run):
+    """Tell whether a run has just ended well, and its result is not to be seen."""
+    if os.path.exists(run.folder / "result.json"):
+        return False
+    log = read_log(run.folder)
+    return log.exit_status == 0 and abs(log.age) < YOUNG + PATIENCE
 
 
 if __name__ == "__main__":

@@ -5,11 +5,9 @@ takes until finished runs tell. `remember` keeps the answer, because `status` ma
 """
 
 import contextlib
-import functools
 import heapq
 import json
 import math
-import re
 import sys
 import time
 import warnings
@@ -22,8 +20,9 @@ import numpy as np
 
 import noisy_wrappers as noisy
 from analysis.errors import fail, with_place
-from analysis.folders import read_json
-from sweep.grid import PROJECT
+from analysis.folders import DamageError, read_json
+from sweep.scripts import number
+from sweep.words import counted
 
 # Seconds of learning for each step, without the environment's own, and what each number of an
 # observation adds to them: docs/sweeps.md says on which machine
@@ -31,6 +30,8 @@ LEARNING = {"sac": (6.8e-3, 22e-6), "td3": (5.1e-3, 13e-6), "ppo": (0.103e-3, 0.
 START_UP = 10  # seconds, with compilation
 STEPS, SECONDS = 200, 1  # an environment is timed for at least so many steps, and so long
 PATIENCE = 30  # seconds until it is timed by fewer steps
+STEP_LIMIT = 10_000  # of an episode, where neither the environment nor the user sets one
+MANY = 10  # different rewards: with fewer, noise on them is mostly larger than what they tell
 
 
 class Environment(NamedTuple):
@@ -42,24 +43,26 @@ class Environment(NamedTuple):
     observed: int  # numbers in an observation
     bounded: bool  # are its actions? SAC and TD3 need that
     tried: dict[str, str]  # noises: why each cannot act here, or ""; by Configuration.noise
-    remark: str = ""  # on the bounds of actions, for PPO
+    rewards: int = MANY  # how many different rewards the timed steps had; MANY: as many or more
 
 
 # ------------------------------------------------------------------------------------- the question
 
 
-def ask(env_id, configurations=(), max_episode_steps=None):
+def ask(env_id, configurations=(), max_episode_steps=None, env_kwargs=()):
     """Make an environment as the scripts do, time it, and try configurations of noise on it.
 
     What it raises if it cannot be made or played passes through.
     """
     deadline = time.perf_counter() + PATIENCE
     with contextlib.redirect_stdout(sys.stderr):
-        made = gym.make(env_id, disable_env_checker=True, max_episode_steps=max_episode_steps)
+        options = noisy.parse_env_kwargs(env_kwargs) | {"max_episode_steps": max_episode_steps}
+        made = gym.make(env_id, disable_env_checker=True, **options)
         declared = made.spec.max_episode_steps
-        with noisy.make_flat(made, constant("sac_continuous_noisy.py", "STEP_LIMIT")) as env:
+        with noisy.make_flat(made, STEP_LIMIT) as env:
             limit = env.spec.max_episode_steps
-            seconds, steps, length = time_steps(env, limit, deadline, declared is None)
+            timed = RewardCounter(env)
+            seconds, steps, length = time_steps(timed, limit, deadline, declared is None)
             env.reset()  # a failure after this one is the noise's
             tried = {}
             for n in configurations:  # at every rate: it may fail at one of them
@@ -71,8 +74,24 @@ def ask(env_id, configurations=(), max_episode_steps=None):
                 observed=math.prod(env.observation_space.shape),
                 bounded=bool(np.isfinite([env.action_space.low, env.action_space.high]).all()),
                 tried=tried,
-                remark=noisy.remark_on_bounds(env_id, env.action_space),
+                rewards=len(timed.rewards) if steps >= STEPS else MANY,
             )
+
+
+class RewardCounter(gym.Wrapper):
+    """Collects the different rewards of an environment, until there are many."""
+
+    def __init__(self, env):
+        """Begin with none."""
+        super().__init__(env)
+        self.rewards = set()
+
+    def step(self, action):
+        """Make a step; remember its reward."""
+        result = self.env.step(action)
+        if len(self.rewards) < MANY:
+            self.rewards.add(float(result[1]))
+        return result
 
 
 def time_steps(env, time_limit, deadline, whole=False):
@@ -126,10 +145,10 @@ def why_unfit(env, configuration, time_limit, deadline):
         with warnings.catch_warnings(action="ignore"):  # of what is said below
             noisy_env = configuration.wrap(env)
     except ValueError as error:
-        return noisy.reason(error)
+        return with_place(error, ValueError)
     for wrapper in noisy.noise_wrappers(noisy_env).values():
         ends = isinstance(wrapper, noisy.RandomEarlyTermination) and not wrapper.each_step
-        if ends and wrapper.low + wrapper.truncate > time_limit:  # which truncates there anyway
+        if ends and wrapper.low >= time_limit:  # its last step ends the episode anyway
             return f"an episode has at most {time_limit} steps"
     try:
         if time.perf_counter() < deadline:
@@ -149,24 +168,24 @@ def ask_all(args, configurations):
     configurations: {env_id: [Configuration]}. Exits with a line for each environment that cannot
     be trained in, and for each algorithm that cannot act there.
     """
-    steps = args.options[args.algos[0]]["max_episode_steps"]
+    given = args.given_words[args.algos[0]]
+    steps, env_kwargs = number(given.get("max_episode_steps")), given.get("env_kwargs", [])
     answers, reasons = {}, []
     for env_id, noises in configurations.items():
         try:
-            answer = ask(env_id, noises, steps)
+            answer = ask(env_id, noises, steps, env_kwargs)
         except (Exception, SystemExit) as error:  # others may be wrong, too
-            reason = with_place(error, (*noisy.refusals(env_id), noisy.NotFiniteError))
+            plain = (gym.error.Error, noisy.SpaceError, noisy.NotFiniteError, SystemExit)
+            reason = with_place(error, plain)
             reasons.append(f"no algorithm can be trained in {env_id}: {reason}")
             continue
         speed = f"{env_id}: {float(f'{1000 * answer.step_seconds:.2g}'):g} ms a step"
         if answer.timed_steps < STEPS:
             speed += f" (only {answer.timed_steps} steps were timed: it is slow)"
         print(speed, file=sys.stderr, flush=True)
-        if answer.remark and "ppo" in args.algos:
-            print(answer.remark, file=sys.stderr, flush=True)
         answers[env_id] = answer
         for algorithm in args.algos:
-            if algorithm != "ppo" and not answer.bounded:
+            if algorithm in ("sac", "td3") and not answer.bounded:
                 name = algorithm.upper()
                 reasons.append(f"{name} needs bounded actions; some actions of {env_id} are not")
     if reasons:
@@ -178,23 +197,21 @@ def ask_all(args, configurations):
 
 
 def run_seconds(run, environment):
-    """Return about how many seconds a run takes: learning, the environment's steps, tests."""
-    steps, frequency = run.total_timesteps, run.options["eval_frequency"]
+    """Return about how many seconds a run takes: learning, the environment's steps, tests.
+
+    None for an algorithm that was never measured.
+    """
+    if run.kind[0] not in LEARNING:
+        return None
+    steps, frequency = run.total_timesteps, run.number("eval_frequency")
     if frequency is None:
-        frequency = max(1, min(constant(run.command[0], "EVAL_FREQUENCY"), steps // 10))
+        frequency = max(1, min(run.script.constants.get("EVAL_FREQUENCY", steps), steps // 10))
     tests = math.ceil(steps / frequency) if frequency else 1
-    test_steps = tests * run.options["eval_episodes"] * environment.episode_steps
-    learned = max(0, steps - run.options.get("learning_starts", 0))
+    test_steps = tests * run.number("eval_episodes", 10) * environment.episode_steps
+    learned = max(0, steps - run.number("learning_starts", 0))
     base, for_each = LEARNING[run.kind[0]]
     learning = learned * (base + for_each * environment.observed)
     return START_UP + learning + (steps + test_steps) * environment.step_seconds
-
-
-@functools.cache
-def constant(script, name):
-    """Return a whole number that a script defines, from its text: importing it takes seconds."""
-    text = (PROJECT / script).read_text()
-    return int(re.search(rf"^{name} = ([\d_]+)", text, re.MULTILINE)[1])
 
 
 def cost(args, done, todo):
@@ -203,18 +220,36 @@ def cost(args, done, todo):
     The others are estimated, and their environments asked for that.
     """
     kinds = {run.kind: run for run in todo}
-    seconds = {kind: wall_time([run for run in done if run.kind == kind]) for kind in kinds}
+    seconds = {kind: mean_seconds([run for run in done if run.kind == kind]) for kind in kinds}
     new = [kind for kind in kinds if seconds[kind] is None]
     answers = ask_all(args, {env_id: [] for _, env_id in new})
     for kind in new:
         seconds[kind] = run_seconds(kinds[kind], answers[kind[1]])
-    return time_left([[seconds[run.kind] for run in todo]], args.jobs, args.elsewhere and new)
+    known = [seconds[run.kind] for run in todo if seconds[run.kind] is not None]
+    text = time_left([known], args.jobs, args.elsewhere and new) if known else ""
+    unknown = sorted(
+        {algorithm for algorithm, env_id in kinds if seconds[algorithm, env_id] is None}
+    )
+    if unknown:
+        told = f"what runs of {', '.join(unknown)} take is known once one is finished"
+        text = f"{text}; {told}" if text else told
+    return text
 
 
-def wall_time(runs):
-    """Return how many seconds finished runs have taken on average, or None where none says it."""
-    taken = [read_json(run.folder / "result.json").get("wall_time_seconds") for run in runs]
-    taken = [seconds for seconds in taken if isinstance(seconds, int | float) and seconds > 0]
+def mean_seconds(runs):
+    """Return how many seconds of a processor finished runs took on average, None if none tells.
+
+    Those of older versions tell only the time on the clock.
+    """
+    taken = []
+    for run in runs:
+        try:
+            result = read_json(run.folder / "result.json")
+        except DamageError:
+            continue
+        seconds = result.get("processor_seconds", result.get("wall_time_seconds"))
+        if isinstance(seconds, int | float) and seconds > 0:
+            taken.append(seconds)
     return fmean(taken) if taken else None
 
 
@@ -237,7 +272,7 @@ def time_left(batches, jobs, elsewhere=False):
             for seconds in batch:
                 heapq.heapreplace(ends, ends[0] + seconds)  # where the next place is free
             clock += max(ends, default=0)
-        runs = "1 run" if jobs == 1 else f"{jobs} runs"
+        runs = counted(jobs, "run")
         text += f", {hours_of(clock)} hours on the clock with {runs} at a time"
     if elsewhere:
         text += "; timed on this machine, others may be faster or slower"
@@ -258,7 +293,9 @@ def remember(runs_dir, env_id, environment):
 def remembered(runs_dir, env_id):
     """Return what was found when an environment was asked last, or one without timed steps."""
     with contextlib.suppress(OSError, ValueError, TypeError):  # there is no file, or half of one
-        return Environment(*json.loads(file_of(runs_dir, env_id).read_text()))
+        known = Environment(*json.loads(file_of(runs_dir, env_id).read_text()))
+        if isinstance(known.rewards, int):  # version 0.3 had a remark there
+            return known
     return Environment(math.nan, 0, 0, 0, False, {})
 
 

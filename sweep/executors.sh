@@ -23,13 +23,25 @@ no_locks() { # FOLDER
     "choose a --runs-dir on another file system, or have its locks turned on"
 }
 
-# FOLDER COMMAND: one run, its output framed by two lines that begin with "#"; returns its status.
+# A script that refuses its arguments refuses them in every run: the first one leaves this file, and
+# the sweep starts no other run of that script (on this machine, if machines share no folder).
+refusal_of() { # SWEEP FOLDER COMMAND
+  [[ ! $3 =~ ([A-Za-z0-9_]+)_continuous_noisy\.py ]] ||
+    echo "${2%/*}/logs/.refused-$1-${BASH_REMATCH[1]}"
+}
+is_refused() { [ -e "$(refusal_of "$@")" ]; }
+
+# SWEEP FOLDER COMMAND: one run, its output framed by two lines that begin with "#"; returns its status.
 # TERM and INT reach all processes of a run, from whoever sends them. USR1 reaches this shell
 # only, and means: have the run write its checkpoint and end. It sets `asked`.
 # The log is locked while the run lives, even if only the run itself survives: whoever else wants
 # to start the same run waits for it, and goes on with it if it was stopped.
 run_one() {
+  local refusal
+  refusal=$(refusal_of "$@")
+  shift
   asked=
+  [ ! -e "$refusal" ] || return 2
   mkdir -p "${1%/*}/logs" # on a machine that does not share the folder, too
   exec 9>>"$(log_of "$1")"
   if ! flock --nonblock 9 2>/dev/null; then
@@ -49,14 +61,21 @@ run_one() {
   wait "$child" || status=$?
   # analysis/folders.py reads this line
   echo "# $(date '+%F %T') $HOSTNAME: exit=$status" 2>/dev/null || true
+  [ "$status" -ne 2 ] || touch "$refusal" 2>/dev/null || true
   return "$status"
 }
 
-slurm_task() { # LINES OFFSET: one task of a job array, requeued if it was stopped by USR1
-  local folder command status=0
+# LINES OFFSET: one task of a job array, requeued if it was stopped by USR1. The SLURM_JOB_ID of the
+# array's last task is the id of the whole array, which would be requeued by it.
+slurm_task() {
+  local folder command sweep status=0 job=$SLURM_JOB_ID
+  [ -z "${SLURM_ARRAY_JOB_ID:-}" ] || job=${SLURM_ARRAY_JOB_ID}_$SLURM_ARRAY_TASK_ID
+  sweep=${1##*/lines-} # its id stands in the name of the list
   IFS=$'\t' read -r folder command < <(sed -n "$(($2 + SLURM_ARRAY_TASK_ID + 1))p" "$1")
-  run_one "$folder" "$command" >>"$(log_of "$folder")" || status=$?
-  if [ -n "$asked" ] && [ "$status" -eq 143 ]; then scontrol requeue "$SLURM_JOB_ID"; fi
+  sweep=${sweep%.tsv}
+  ! is_refused "$sweep" "$folder" "$command" || exit 2
+  run_one "$sweep" "$folder" "$command" >>"$(log_of "$folder")" || status=$?
+  if [ -n "$asked" ] && [ "$status" -eq 143 ]; then scontrol requeue "$job"; fi
   exit "$status"
 }
 
@@ -67,8 +86,9 @@ run_local() { # nproc obeys OMP_NUM_THREADS, which is about the threads of one p
   cores=$(env -u OMP_NUM_THREADS -u OMP_THREAD_LIMIT nproc)
   while IFS=$'\t' read -r folder command; do
     while [ "$(jobs -pr | wc -l)" -ge "${jobs:-$cores}" ]; do wait -n || true; done
+    ! is_refused "$sweep" "$folder" "$command" || continue
     : 2>/dev/null >>"$(log_of "$folder")" || continue # the report says why
-    run_one "$folder" "$command" >>"$(log_of "$folder")" &
+    run_one "$sweep" "$folder" "$command" >>"$(log_of "$folder")" &
   done <"$list"
   wait
 }
@@ -99,38 +119,86 @@ stop_parallel() { # HUP: parallel starts no more runs, and waits for those that 
 
 # -------------------------------------------------------------------------------------------- slurm
 
-ask_slurm() { # before anything is written; sets array_size
-  array_size=$(scontrol show config 2>/dev/null | awk '$1 == "MaxArraySize" {print $3}') || true
+clusters_of() { # the clusters that sbatch will choose from, "" for this one: as its options say
+  local clusters=${SBATCH_CLUSTERS:-${SLURM_CLUSTERS:-}} option previous=''
+  for option in ${slurm_options[@]+"${slurm_options[@]}"}; do
+    case $previous in --clusters | --cluster | -M) clusters=$option ;; esac
+    case $option in
+      --clusters=* | --cluster=*) clusters=${option#*=} ;;
+      -M?*) clusters=${option#-M} ;;
+    esac
+    previous=$option
+  done
+  echo "$clusters"
+}
+
+ask_slurm() { # before anything is written; sets array_size, the least of all clusters
+  local clusters
+  clusters=$(clusters_of)
+  array_size=$(scontrol ${clusters:+"--clusters=$clusters"} show config 2>/dev/null |
+    awk '$1 == "MaxArraySize" && (!least || $3 < least) {least = $3} END {print least}') || true
   [ "${array_size:-0}" -gt 0 ] || [ "$stopped" -ne 0 ] ||
     fail "Slurm does not answer: scontrol show config has no MaxArraySize"
 }
 
+# Sets id from what sbatch --parsable prints, ID or ID;CLUSTER; a site's sbatch may print more lines
+read_id() { # TEXT
+  local line
+  id=''
+  while IFS= read -r line; do
+    [[ ! $line =~ ^[0-9]+(;[A-Za-z0-9_.-]+)?$ ]] || id=$line
+  done < <(printf '%s\n' "$1")
+  [ -n "$id" ]
+}
+
 submit() { # the array's indices are line numbers, counted from the offset of its part
-  local count offset n id
+  local count offset n said
   count=$(wc -l <"$list")
   for ((offset = 0; offset < count && stopped == 0; offset += array_size)); do
     n=$((count - offset < array_size ? count - offset : array_size))
-    id=$(sbatch --parsable --array="0-$((n - 1))${jobs:+%$jobs}" --requeue --signal=B:USR1@180 \
+    said=$(sbatch --parsable --array="0-$((n - 1))${jobs:+%$jobs}" --requeue --signal=B:USR1@180 \
       --ntasks=1 --cpus-per-task=1 --job-name=noisy-sweep \
       --open-mode=append --output="${logs//%/%%}/slurm-%A.out" \
       ${slurm_options[@]+"${slurm_options[@]}"} \
-      --wrap "exec ./benchmark.sh slurm-task $(quoted "$list") $offset") || {
+      --wrap "exec ./benchmark.sh slurm-task $(quoted "$list") $offset") || said=''
+    if ! read_id "$said"; then
       [ "$stopped" -eq 0 ] || break # Ctrl-C ends sbatch, too
       fail "sbatch refused runs $((offset + 1)) to $((offset + n)); submitted before: ${ids[*]:-none};" \
         "run the same command again when they are over"
-    }
+    fi
     trap - EXIT # of benchmark.sh, which removes the list: the tasks read it later
-    ids+=("${id%%;*}")
+    ids+=("$id")
   done
   if [ "$stopped" -eq 0 ]; then
-    echo "submitted; to stop: scancel ${ids[*]}" >&2
+    echo "submitted; to stop: $(cancels | paste -sd';' | sed 's/;/ \&\& /g')" >&2
   elif [ "${#ids[@]}" -gt 0 ]; then
     stop_slurm
   fi
 }
-run_slurm() { # the arrays are over when squeue answers and does not name them
-  local queue
-  until queue=$(squeue --noheader --user="$(id -un)" --format=%F 2>/dev/null) &&
-    ! grep -qxF "$(printf '%s\n' "${ids[@]}")" <<<"$queue"; do sleep 5; done
+
+# Slurm's programs take the ids of one cluster at a time; ids are ID or ID;CLUSTER
+cluster_names() { printf '%s\n' "${ids[@]}" | sed 's/^[0-9]*;*//' | sort -u; }
+ids_of() { # CLUSTER
+  local one
+  for one in "${ids[@]}"; do
+    case $one in *";$1") echo "${one%%;*}" ;; *";"*) ;; *) [ -n "$1" ] || echo "$one" ;; esac
+  done
 }
-stop_slurm() { scancel "${ids[@]}"; }
+cancels() { # the commands that cancel all arrays
+  local cluster
+  cluster_names | while IFS= read -r cluster; do
+    echo "scancel ${cluster:+--clusters=$cluster }$(ids_of "$cluster" | paste -sd' ')"
+  done
+}
+run_slurm() { # the arrays are over when squeue answers and does not name them
+  local cluster queue
+  while IFS= read -r cluster <&3; do
+    until queue=$(squeue ${cluster:+"--clusters=$cluster"} --noheader --user="$(id -un)" \
+      --format=%F 2>/dev/null) &&
+      ! printf '%s\n' "$queue" | grep -qxF -f <(ids_of "$cluster"); do sleep 5; done
+  done 3< <(cluster_names)
+}
+stop_slurm() {
+  local command
+  while IFS= read -r command <&3; do $command || true; done 3< <(cancels)
+}

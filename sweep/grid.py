@@ -5,17 +5,17 @@ options.py reads the arguments, __main__.py shows how far the runs have come.
 
 import csv
 import itertools
+import math
 import os
 import re
 import shlex
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from analysis.errors import fail
-from analysis.folders import DamageError, logged, read_config, read_result, runs_of
-from noisy_wrappers import BASELINE, MAY_DIFFER_IN_A_RUN, Configuration, run_name
+from noisy_wrappers import BASELINE, Configuration, run_name
+from sweep.scripts import PROJECT, Script, number
 
-PROJECT = Path(__file__).resolve().parent.parent
 SEEDS = {"sac": range(1, 6), "td3": range(1, 6), "ppo": range(1, 11)}  # the paper's
 ENVS = ["HalfCheetah-v5", "Hopper-v5", "Humanoid-v5", "Pusher-v5", "Walker2d-v5"]
 RATES = [0.01, 0.05, 0.1, 0.2, 0.5, 1.0]
@@ -36,16 +36,17 @@ NOISES = [  # as the paper's authors ran them: dropout keeps 90 %, mixup remembe
     "RandomUniformScaleReward(0.5, 1.5)",
     "RandomUniformScaleReward(0.8, 1.2)",
 ]
-# What choose tries by default, and why: docs/sweeps.md
+# What choose tries by default, in the units of whatever environment it is: docs/sweeps.md
 CHOOSE_NOISES = [
-    "RandomUniformNoisyObservation(-0.001, 0.001)",
+    "RandomNormalNoisyObservation(0.01, relative=True)",
+    "RandomNormalNoisyObservation(0.1, relative=True)",
     "RandomUniformScaleObservation(0.8, 1.2)",
     "RandomMixupObservation(0.5, recursive=True)",
-    "RandomNormalNoisyReward(1.0)",
-    "RandomUniformNoisyReward(-0.001, 0.001)",
+    "RandomNormalNoisyReward(0.1, relative=True)",
+    "RandomNormalNoisyReward(1.0, relative=True)",
     "RandomUniformScaleReward(0.5, 1.5)",
     "RandomEarlyTermination(50)",
-    "RandomNormalNoisyAction(0.1)",
+    "RandomNormalNoisyAction(0.1, relative=True)",
     "RandomActionDelay(0, 2)",
     "RandomDynamics(0.7, 1.3)",
 ]
@@ -55,6 +56,9 @@ ABLATION = [(f"RandomUniformScaleReward({2 - b:.1f}, {b})", 0.05) for b in (1.1,
 ABLATION += [
     (f"RandomUniformNoisyObservation(-{b}, {b})", 1.0) for b in (0.0001, 0.001, 0.01, 0.1, 1.0)
 ]
+# Times as many seeds without noise as with it, at most: with more, a test of few seeds claims too
+# much where noise widens the spread, and the analysis gives no verdict (analysis/verdicts.py)
+MOST_BASELINES = 2.6
 PRESETS = {  # what a preset sets: its noises with their rates, and grid options
     "demo": {
         "pairs": [("RandomNormalNoisyObservation(1.0)", 1.0)],  # harms with any five seeds
@@ -84,13 +88,16 @@ class PlannedRun(NamedTuple):
     seed: int
     total_timesteps: int
     command: list[str]  # the script and its arguments
-    options: dict[str, object]  # the script's own arguments, as options.script_options reads them
+    script: Script | None = None  # None: of a folder whose script nobody knows
+    args: dict[str, Any] | None = None  # what the command sets, as scripts.read_words; None: any
     damage: str = ""  # what is already known to be wrong with its files
 
-
-def script_of(algorithm):
-    """Return the file of an algorithm's training script."""
-    return f"{algorithm}_continuous_noisy.py"
+    def number(self, name, otherwise=None):
+        """Return a number among its script's arguments, as far as the source tells them."""
+        if name in self.args:
+            return number(self.args[name], otherwise)
+        value = self.script.defaults.get(name)
+        return value if isinstance(value, int | float) else otherwise
 
 
 def best_of_the_paper(algorithm, env_id):
@@ -136,84 +143,78 @@ def configuration_of(pairs, common=None):
 def make_run(args, algorithm, env_id, configuration, seed, phase=""):
     """Return one run of the grid, or of a phase of a choice: that is a folder of its own."""
     runs_dir = f"{args.runs_dir}/{phase}" if phase else args.runs_dir
-    script, steps = script_of(algorithm), args.total_timesteps
+    script, steps = args.scripts[algorithm], args.total_timesteps
     noises, rates = configuration.texts
-    command = [script, "--env-id", env_id, "--seed", str(seed)]
+    command = [script.path, "--env-id", env_id, "--seed", str(seed)]
     if noises:
         command += ["--noise", *noises, "--noise-rate", *map(str, rates)]
-    command += ["--total-timesteps", str(steps), "--runs-dir", runs_dir, *args.extra]
-    folder = Path(runs_dir, run_name(env_id, script.removesuffix(".py"), noises, rates, seed))
-    return PlannedRun(folder, (algorithm, env_id), seed, steps, command, args.options[algorithm])
+    command += ["--total-timesteps", str(steps), "--runs-dir", runs_dir, *args.extra[algorithm]]
+    own = {"env_id": env_id, "seed": str(seed), "total_timesteps": str(steps)}
+    own |= args.given_words[algorithm] | {"exp_name": args.exp_names[algorithm]}
+    folder = Path(runs_dir, name_of(args, algorithm, env_id, configuration, seed))
+    return PlannedRun(folder, (algorithm, env_id), seed, steps, command, script, own)
+
+
+def name_of(args, algorithm, env_id, configuration, seed):
+    """Return the name of a run's folder."""
+    names = ("env_kwargs", "test_noise", "test_noise_rate")
+    given = {name: args.given_words[algorithm].get(name, []) for name in names}
+    try:
+        return run_name(env_id, args.exp_names[algorithm], *configuration.texts, seed, **given)
+    except ValueError as error:
+        return fail(f"after the --: {error}")
+
+
+def rate(text):
+    """Read a noise rate: a number, or text such as "1.0:0.0", which Configuration.read reads."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def grid(args):
     """Return the runs, each once."""
     runs = {}
     for algorithm, env_id in itertools.product(args.algos, args.envs):
-        noisy = configurations(args, algorithm, env_id)
-        seeds = sorted(itertools.chain(*(args.seeds or [SEEDS[algorithm]])))
-        for seed, configuration in itertools.product(seeds, [BASELINE, *noisy]):
+        noisy = dict.fromkeys(configurations(args, algorithm, env_id))
+        noisy.pop(BASELINE, None)  # at rate 0 a noise is none
+        seeds = sorted(set(itertools.chain(*(args.seeds or [SEEDS.get(algorithm, range(1, 6))]))))
+        pairs = [(seed, BASELINE) for seed in baseline_seeds(args, seeds, len(noisy))]
+        pairs += itertools.product(seeds, noisy)
+        for seed, configuration in sorted(pairs, key=lambda pair: pair[0]):
             run = make_run(args, algorithm, env_id, configuration, seed)
             runs.setdefault(run.folder, run)
     return list(runs.values())
 
 
-def runs_in(folder):
-    """Return the runs that a folder or its logs tell of, for a status that names no grid."""
-    folders = {*runs_of(Path(folder)), *logged(Path(folder))}
-    if not folders:
-        fail(f"no runs in {folder}; name their folder with --runs-dir")
-    runs = []
-    for path in sorted(folders):
-        kind, steps, damage = ("", ""), 0, ""  # unknown: it has failed before it began
-        if os.path.exists(path / "config.json"):
-            try:
-                config = read_config(path)
-                kind, steps = (config["exp_name"], config["environment"]), config["total"]
-            except DamageError as error:
-                damage = f"{path}/{error}"
-        runs.append(PlannedRun(path, kind, 0, steps, [], {}, damage))
-    return runs
+def baseline_seeds(args, seeds, configurations):
+    """Return the seeds of the runs without noise, with which every configuration is compared.
 
-
-def result(run):
-    """Return whether a run is finished, and what is wrong with its files, or "".
-
-    Exits if the folder holds a finished run of another length or with other options.
+    Without --baseline-seeds, `custom` takes the square root of the number of configurations times
+    as many as each of them has (Dunnett, 1955), but no more than MOST_BASELINES times as many.
     """
-    if run.damage or not os.path.exists(run.folder / "result.json"):
-        return False, run.damage
-    try:
-        config = read_config(run.folder)
-        read_result(run.folder, config)
-    except DamageError as error:
-        return False, f"{run.folder}/{error}; move its folder away to run it again"
-    if config["environment"] != run.kind[1]:  # two may give one folder name
-        where = config["environment"]
-        fail(f"{run.folder} holds a finished run in {where}; choose another --runs-dir")
-    steps, made = config["total"], config["args"]
-    if steps != run.total_timesteps:
-        fail(f"{run.folder} holds a finished run of {steps} steps; choose another --runs-dir")
-    differences = [
-        f"--{name.replace('_', '-')} {made[name]}, not {wanted}"
-        for name, wanted in run.options.items()
-        if name not in MAY_DIFFER_IN_A_RUN
-        and (name != "eval_frequency" or wanted is not None)  # without one, a run keeps its own
-        and made.get(name, wanted) != wanted  # an older version did not have all options
-    ]
-    if differences:
-        fail(
-            f"{run.folder} holds a finished run with {' and '.join(differences)}; choose another "
-            "--runs-dir, or the same options after the --"
-        )
-    return True, ""
+    if args.baseline_seeds:
+        return sorted(set(itertools.chain(*args.baseline_seeds)))
+    if args.preset != "custom":
+        return seeds
+    number = math.ceil(round(len(seeds) * math.sqrt(max(1, configurations)), 9))
+    number = min(number, math.floor(round(len(seeds) * MOST_BASELINES, 9)))
+    return [*seeds, *range(seeds[-1] + 1, seeds[-1] + 1 + number - len(seeds))]
 
 
 def command_line(run):
     """Return a run's command, complete: it can be pasted into a shell in the project's folder."""
     words = [os.environ.get("PYTHON", "python"), *run.command]
-    noises = any(re.match(r"[\w.]+:[^\W\d]", word) for word in run.command)  # module:Name(...)
-    own = ":" in run.kind[1] or noises
-    if own and "PYTHONPATH" in os.environ:  # where a module of the user's lies
-        words = ["env", f"PYTHONPATH={os.environ['PYTHONPATH']}", *words]
+    path = [folder for folder in [os.environ.get("PYTHONPATH")] if folder and has_module(run)]
+    if os.path.dirname(run.script.path):  # it lies elsewhere, and noisy_wrappers here
+        path.insert(0, str(PROJECT) if os.path.isabs(run.script.path) else ".")
+    if path:
+        words = ["env", f"PYTHONPATH={':'.join(path)}", *words]
     return shlex.join(words)
+
+
+def has_module(run):
+    """Tell whether a command may name a module of the user's, as module:Name does."""
+    own_noise = any(re.match(r"[\w.]+:[^\W\d]", word) for word in run.command)
+    return ":" in run.kind[1] or own_noise or bool(os.path.dirname(run.script.path))

@@ -1,16 +1,15 @@
 """The arguments of benchmark.sh that name a grid; `./benchmark.sh --help` explains them."""
 
 import argparse
-import ast
 import difflib
-import functools
 import os
 import re
 from pathlib import Path
 
 from analysis.errors import fail
-from noisy_wrappers import canonical_env_id, check_numbers, safe_name, split_noises
-from sweep.grid import ENVS, PRESETS, PROJECT, SEEDS, script_of
+from noisy_wrappers import Configuration, canonical_env_id, safe_name, split_noises
+from sweep import scripts
+from sweep.grid import ENVS, PRESETS, SEEDS, rate
 
 EXECUTOR_OPTIONS = ["--dry-run", "--executor", "--jobs", "--sshlogin", "--remote-dir"]
 EXECUTOR_OPTIONS += ["--slurm-args", "--wait", "--help"]  # benchmark.sh reads these
@@ -22,14 +21,16 @@ GIVEN_BY_THE_GRID = {  # options of the scripts, and those of the sweep that set
     "--noise-rate": "--noise-rates",
     "--total-timesteps": "--total-timesteps",
     "--runs-dir": "--runs-dir",
-    "--exp-name": "--runs-dir",  # a sweep's folders are told apart by where they lie
 }
+OF_ANY_CHOICE = {"--algos", "--envs", "--runs-dir"}  # what a status needs to find a choice
+MOST_SEEDS = 100_000  # of one option
 
 
 def parse_args(view, caller, argv):
-    """Return the grid's arguments; `extra` are the words after "--", for the scripts.
+    """Return the grid's arguments.
 
-    `options` is {algorithm: what script_options makes of them}.
+    Also, for each algorithm: `scripts`, its Script; `given_words`, the options after the "--", and
+    `extra`, their words for its commands: see scripts.read_words; `exp_names`, of its runs.
 
     Exits with one line about the first argument that no run could be started with.
     """
@@ -43,9 +44,11 @@ def parse_args(view, caller, argv):
     parser.add_argument("--seeds", nargs="+", type=seeds)
     parser.add_argument("--total-timesteps", type=whole_number, default=1_000_000)
     parser.add_argument("--runs-dir", default="runs")
+    parser.add_argument("--baseline-seeds", nargs="+", type=seeds)
     parser.add_argument("--exclude", nargs="+", action="extend", type=entry, default=[])
     parser.add_argument("--budget", type=whole_number)
     parser.add_argument("--confirm", type=whole_number, default=25)
+    parser.add_argument("--looks", type=whole_number)
     parser.add_argument("--metric", choices=("return", "success_rate"), default="return")
     split = argv.index("--") if "--" in argv else len(argv)
     words, extra = argv[:split], argv[split + 1 :]
@@ -59,48 +62,105 @@ def parse_args(view, caller, argv):
         fail(unknown_option(name, known))
     parser.set_defaults(**{"pairs": []} | PRESETS.get(preset, {}))
     args = parser.parse_args(words)
+    if view == "status" and preset == "choose" and given <= OF_ANY_CHOICE and not extra:
+        kept = kept_words(args, given, caller)
+        if kept and kept != words:
+            return parse_args(view, caller, kept)
     if args.preset != preset:
         fail(f"the preset comes first: {args.preset} --...")
-    args.view, args.caller, args.given, args.extra = view, caller, given, extra
+    args.view, args.caller, args.given = view, caller, given
+    args.words, args.extra_words = without_folder(words), extra
     args.jobs, args.elsewhere = machines()
     args.runs_dir = from_project(caller, args.runs_dir)
     args.metric = args.metric.replace("_", " ")
+    args.default_noises = not given & {"--noises"}
     if args.noises == [[("paper", None)]]:
         args.pairs, args.noises = PRESETS["paper"]["pairs"], []
     # a status that names no grid is one of whatever the folder holds
     whole_folder = preset in (None, "custom") and given <= {"--runs-dir"}
     args.names_grid = view != "status" or not whole_folder
     if args.names_grid:
-        check(args)
+        check(args, extra)
     return args
 
 
-def check(args):
-    """Exit with one line about an argument that is wrong; give environments their full names."""
-    for algorithm in args.algos:
-        if algorithm not in SEEDS:
-            fail(f"unknown algorithm {algorithm!r}; choose from {', '.join(SEEDS)}")
+def kept_words(args, given, caller):
+    """Return the words of the choice that a status without further options is about, or None."""
+    from sweep import memory  # and with it SciPy: nothing else should wait for that
+
+    algos = args.algos if "--algos" in given else []
+    envs = args.envs if "--envs" in given else []
+    kept = memory.words_of_choice(from_project(caller, args.runs_dir), algos, envs)
+    return kept and [*kept[0], "--runs-dir", args.runs_dir, *(["--", *kept[1]] if kept[1] else [])]
+
+
+def without_folder(words):
+    """Return the words of a command without --runs-dir and its value."""
+    kept = []
+    for word, previous in zip(words, ["", *words], strict=False):
+        if word.partition("=")[0] != "--runs-dir" and previous != "--runs-dir":
+            kept.append(word)
+    return kept
+
+
+def check(args, words):
+    """Exit with one line about an argument that is wrong; give environments their full names.
+
+    words: for the scripts.
+    """
+    args.algos = list(dict.fromkeys(args.algos))
+    args.scripts = {name: scripts.find(name, args.caller) for name in args.algos}
     try:
         args.envs = list(dict.fromkeys(map(canonical_env_id, args.envs)))
     except ValueError as error:
         fail(f"--envs: {error}")
     if len(set(map(safe_name, args.envs))) < len(args.envs):
         fail("--envs: two of these would have the same folders; rename one, or take them apart")
-    for name in ("--exclude", "--budget", "--confirm", "--metric"):
+    for name in ("--exclude", "--budget", "--confirm", "--looks", "--metric"):
         if name in args.given and args.preset != "choose":
             fail(f"{name} is an option of choose")
     if args.preset == "choose" and not {"--algos", "--envs"} <= args.given:
         fail("choose needs --algos and --envs: it chooses a noise for each of them")
-    if args.preset == "choose" and args.seeds:
-        fail("choose picks its own seeds: leave out --seeds; see --budget and --confirm")
-    args.options = {algorithm: script_options(algorithm, args.extra) for algorithm in args.algos}
-    ours = {"total_timesteps": args.total_timesteps, "torch_threads": 1}  # more, elsewhere
-    ours["seed"] = max((seeds[-1] for seeds in args.seeds or ()), default=0)
-    for options in args.options.values():
-        try:
-            check_numbers(options | ours)
-        except ValueError as error:
-            fail(error)
+    for name in args.given & {"--seeds", "--baseline-seeds"}:
+        if args.preset == "choose":
+            fail(f"choose picks its own seeds: leave out {name}; see --budget and --confirm")
+    if args.total_timesteps < 1:
+        fail(f"--total-timesteps must be at least 1, not {args.total_timesteps}")
+    check_words(args, words)
+
+
+def check_words(args, words):
+    """Read the words after the "--"; exit about those that belong to the grid, or to no script."""
+    for flag in (word.partition("=")[0].replace("_", "-") for word in words):
+        if flag in GIVEN_BY_THE_GRID:
+            fail(f"{flag} is part of the grid: use {GIVEN_BY_THE_GRID[flag]}, before the --")
+        if flag == "--overwrite":
+            fail("--overwrite would start interrupted runs afresh: delete their folders instead")
+    read = {name: scripts.read_words(script, words) for name, script in args.scripts.items()}
+    args.given_words = {name: given for name, (given, _) in read.items()}
+    args.extra = {name: command for name, (_, command) in read.items()}
+    for given in args.given_words.values():
+        given |= spelt_as_stored(given)
+    args.exp_names = {
+        name: " ".join(args.given_words[name].get("exp_name", [script.exp_name]))
+        for name, script in args.scripts.items()
+    }
+    if len(set(args.exp_names.values())) < len(args.algos):
+        fail(
+            "--exp-name: several algorithms would write into the same folders: name one algorithm "
+            "with --algos, or leave --exp-name out and use another --runs-dir"
+        )
+
+
+def spelt_as_stored(given):
+    """Return the options about the noise of tests as a run stores them."""
+    if "test_noise" not in given:
+        return {}
+    try:
+        test = Configuration.read(given["test_noise"], map(rate, given.get("test_noise_rate", [])))
+    except ValueError as error:
+        fail(f"--test-noise: {error}")
+    return dict(zip(("test_noise", "test_noise_rate"), map(list, test.texts), strict=True))
 
 
 def machines():
@@ -115,51 +175,6 @@ def machines():
     return None if elsewhere else len(os.sched_getaffinity(0)), elsewhere
 
 
-@functools.cache
-def parser_of(algorithm):
-    """Return a parser of a script's options, made from its text: importing it takes seconds.
-
-    Options that the grid gives are left out.
-    """
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.error = lambda message: fail(message.removeprefix("argument "))
-    nodes = ast.parse((PROJECT / script_of(algorithm)).read_text("utf-8")).body
-    [args] = [node for node in nodes if isinstance(node, ast.ClassDef) and node.name == "Args"]
-    for field in args.body[1:]:
-        flag, kind = f"--{field.target.id.replace('_', '-')}", ast.unparse(field.annotation)
-        if flag in GIVEN_BY_THE_GRID:
-            continue
-        how = {"type": float if "float" in kind else whole_number}
-        if "None" in kind:
-            how = {"type": functools.partial(unless_none, how["type"])}
-        elif kind == "bool":
-            how = {"action": argparse.BooleanOptionalAction}
-        elif kind.startswith("Literal"):
-            how = {"choices": ast.literal_eval(kind.removeprefix("Literal"))}
-        parser.add_argument(flag, default=ast.literal_eval(field.value), **how)
-    return parser
-
-
-def script_options(algorithm, words):
-    """Return {argument: value} of a script that is started with these words after the "--".
-
-    Exits with one line about a word that the script would refuse, or that belongs to the grid: a
-    typing error is not worth 9,100 failed runs.
-    """
-    words = [re.sub("^--[^=]+", lambda flag: flag[0].replace("_", "-"), word) for word in words]
-    for flag in (word.partition("=")[0] for word in words):
-        if flag in GIVEN_BY_THE_GRID:
-            fail(f"{flag} is part of the grid: use {GIVEN_BY_THE_GRID[flag]}, before the --")
-    options, unknown = parser_of(algorithm).parse_known_args(words)
-    if unknown:
-        near = difflib.get_close_matches(unknown[0], flags(parser_of(algorithm)), n=1)
-        hint = f"; did you mean {near[0]}?" if near else ""
-        fail(f"{script_of(algorithm)} has no option {unknown[0]}{hint}")
-    if options.overwrite:
-        fail("--overwrite would start interrupted runs afresh: delete their folders instead")
-    return vars(options)
-
-
 def flags(parser):
     """Return the options of a parser."""
     return [f"--{name.replace('_', '-')}" for name in vars(parser.parse_args([]))]
@@ -167,7 +182,9 @@ def flags(parser):
 
 def unknown_option(name, known):
     """Say what to write instead of an option that the grid does not have."""
-    of_scripts = {flag for algorithm in SEEDS for flag in flags(parser_of(algorithm))}
+    ours = [scripts.read(path) for path in scripts.scripts_in(scripts.PROJECT).values()]
+    of_scripts = {scripts.spelt(option) for script in ours for option in script.options}
+    of_scripts -= GIVEN_BY_THE_GRID.keys()
     if name in of_scripts:
         return f"{name} is an option of the scripts: put it at the end, after --"
     if name in EXECUTOR_OPTIONS:  # benchmark.sh reads it, unless it is written with a value
@@ -216,29 +233,17 @@ def whole_number(text):
     raise argparse.ArgumentTypeError(f"{text!r} is not a whole number, such as 1000000 or 1e6")
 
 
-def unless_none(read, text):
-    """Read "None", or what `read` reads."""
-    try:
-        return None if text == "None" else read(text)
-    except ValueError:  # without a message of its own
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
-
-
 def seeds(text):
     """Read a seed, "3", or a range of seeds, "1-5"."""
-    match = re.fullmatch(r"(\d+)(?:-(\d+))?", text)
-    values = range(int(match[1]), int(match[2] or match[1]) + 1) if match else ()
-    if not values:
-        fail(f"--seeds takes numbers and ranges, separated by spaces: 1 2 3 or 1-3, not {text!r}")
-    return values
-
-
-def rate(text):
-    """Read a noise rate: a number, or text such as "1.0:0.0", which Configuration.read reads."""
-    try:
-        return float(text)
-    except ValueError:
-        return text
+    match = re.fullmatch(r"(\d{1,18})(?:-(\d{1,18}))?", text)
+    first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
+    if last < first:
+        reason = f"takes numbers and ranges, separated by spaces: 1 2 3 or 1-3, not {text!r}"
+        raise argparse.ArgumentTypeError(reason)
+    if last - first >= MOST_SEEDS:
+        reason = f"{text!r} is more than {MOST_SEEDS:,} seeds"
+        raise argparse.ArgumentTypeError(reason)
+    return range(first, last + 1)
 
 
 def entry(text):

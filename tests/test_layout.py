@@ -76,6 +76,7 @@ def test_imports_run_one_way_and_take_no_private_name(path):
     place = ORDER.index(module(path).partition(".")[0])
     for name, names in imported(path).items():
         assert ORDER.index(name.partition(".")[0]) <= place, f"{path.name} imports {name}"
-        private = [part for part in (*name.split("."), *names) if part.startswith("_")]
+        parts = {*name.split("."), *names} - {"__version__"}
+        private = [part for part in parts if part.startswith("_")]
         assert not private, f"{path.name} takes {private} of {name}"
     assert not private_attributes(path)

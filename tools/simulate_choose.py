@@ -1,29 +1,41 @@
 """How often does `./benchmark.sh choose` find and confirm a noise that helps?
 
-    python tools/simulate_choose.py
+    python tools/simulate_choose.py               # about half an hour on one core
+    python tools/simulate_choose.py --trials 200  # a first impression
 
-prints the tables of docs/sweeps.md, in about three minutes. In each simulated choice one noise has
-a true gain and all others do nothing. Gains are in standard deviations of the final return over
-seeds. Returns are normal, or a fifth of the runs end far above the others ("high peak"), or three
-in ten far below ("failing").
+prints the tables of docs/sweeps.md. Every simulated choice is made by halving.advance and judged by
+halving.judge, as those of real runs are; only the returns are drawn, and the test divides them in
+9,999 ways instead of 99,999. In each choice one noise has a true gain and all others do nothing.
+Gains are in standard deviations of the return over seeds.
+
+Returns are drawn from made shapes, or from our own: those of the runs without noise in
+results/data, drawn again.
 """
 
 import argparse
 import sys
-from functools import partial
-from math import ceil
+from collections import defaultdict
+from functools import cache, partial
+from itertools import product
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 from tabulate import tabulate
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from analysis.statistics import random_partitions, tails, welch_t  # noqa: E402
-from sweep.halving import LEVEL, schedule  # noqa: E402
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+from analysis import folders, permutation, statistics  # noqa: E402
+from noisy_wrappers import BASELINE, Configuration  # noqa: E402
+from sweep import halving, looks  # noqa: E402
+from sweep.grid import MOST_BASELINES  # noqa: E402
 
-TRIALS = 20_000
-GAINS = (1.0, 1.5, 2.0)
-PARTITIONS = 999  # of a test; the real one has a hundred times as many
+GAINS = (0.5, 0.75, 1.0, 1.5, 2.0)
+SPREADS = (1, 0.5, 2, 0.1)  # with noise, in those without
+FEWEST = 10  # seeds of a shape of our own
+PARTITIONS = 9_999  # of a test
+ALL_PARTITIONS = cache(permutation.partitions.__wrapped__)  # those of all looks are kept
+FIXED, FIVE = (looks.Plan(looks.looks_after(25, number), statistics.LEVEL) for number in (1, 5))
 
 
 def two_peaks(rng, shape, height, share):
@@ -32,61 +44,118 @@ def two_peaks(rng, shape, height, share):
     return (returns - height * share) / np.sqrt(1 + height**2 * share * (1 - share))
 
 
+def lopsided(rng, shape):
+    """Draw returns with a long tail upwards (exponential): mean 0, deviation 1."""
+    return rng.standard_exponential(shape) - 1
+
+
 normal = np.random.Generator.standard_normal  # of a generator and a shape, as the others
 high_peak = partial(two_peaks, height=4, share=0.2)
 failing = partial(two_peaks, height=-4, share=0.3)
-DRAWS = {"normal": normal, "high peak": high_peak, "failing": failing}
+rare_peak = partial(two_peaks, height=6, share=0.05)
+DRAWS = {"normal": normal, "high peak": high_peak, "failing": failing, "lopsided": lopsided}
+DRAWS["rare high peak"] = rare_peak
 
 
-def equal_shares(noises, budget):
-    """Return the schedule of Karnin et al., whose rounds share the budget equally."""
-    rounds = schedule(noises, budget)
-    return [(n, max(1, budget // (len(rounds) * n))) for n, _ in rounds]
+@cache
+def our_own():
+    """Return {name: draw} for the runs without noise in results/data, at least FEWEST of a kind."""
+    returns = defaultdict(dict)
+    for path in sorted((ROOT / "results/data").glob("*/baseline_*")):
+        run = folders.read_run(path)
+        steps = f"{run.total_timesteps:,} steps"
+        key = f"{run.algorithm} on {run.environment}, {steps}"
+        value = statistics.final_value(run.curve.steps, run.curve.returns)
+        returns[key].setdefault(round(value, 6), value)  # some folders share runs
+    samples = {key: np.array(list(values)) for key, values in returns.items()}
+    return {
+        key: partial(draw_again, values=(values - values.mean()) / values.std())
+        for key, values in sorted(samples.items())
+        if len(values) >= FEWEST
+    }
 
 
-def search(returns, sizes):
-    """Return the noise that wins every search (trials,), by the rule of halving.advance.
-
-    returns (trials, noises, seeds); sizes: the schedule [(noises, further seeds)].
-    """
-    trials, noises, _ = returns.shape
-    alive = np.tile(np.arange(noises), (trials, 1))
-    last_seed = 0
-    for n, further in sizes:
-        last_seed += further
-        means = np.take_along_axis(returns[..., :last_seed].mean(axis=2), alive, axis=1)
-        best = np.argsort(-means, axis=1, kind="stable")[:, : ceil(n / 2)]
-        alive = np.take_along_axis(alive, np.sort(best, axis=1), axis=1)
-    return alive[:, 0]
+def shapes():
+    """Return all shapes of returns: {name: draw}."""
+    return DRAWS | our_own()
 
 
-def confirmed(noisy, baseline, rng):
-    """Return which comparisons show a gain, by the permutation test of halving.compare.
-
-    noisy, baseline (trials, seeds) -> (trials,) of bool.
-    """
-    chosen = random_partitions(noisy.shape[1], baseline.shape[1], PARTITIONS, rng)
-    above, _ = tails(welch_t(np.concatenate([noisy, baseline], axis=1).T, chosen))
-    return 2 * above <= LEVEL
+def draw_again(rng, shape, values):
+    """Draw from values with replacement."""
+    return rng.choice(values, shape)
 
 
-def simulate(noises, sizes, confirm, gain, draw=normal, spread=1.0, trials=TRIALS):
-    """Return the shares of choices that find the good noise, that confirm it, that claim any.
+class Returns(dict):
+    """The returns of a choice, drawn when they are looked up."""
 
-    With noise, returns have `spread` standard deviations of those without.
-    """
-    rng = np.random.default_rng(0)
-    seeds = sum(further for _, further in sizes)
-    good, claims = [], []
-    for _ in range(ceil(trials / 1000)):  # 1,000 at a time, to save memory
-        returns = spread * draw(rng, (1000, noises, seeds))
-        returns[:, 0] += gain
-        found = search(returns, sizes) == 0
-        fresh = spread * draw(rng, (1000, confirm)) + gain * found[:, None]
-        good.append(found)
-        claims.append(confirmed(fresh, draw(rng, (1000, confirm)), rng))
-    good, claims = np.concatenate(good), np.concatenate(claims)
-    return good.mean(), (good & claims).mean(), claims.mean()
+    def __init__(self, rng, draw, gain, spread):
+        """The first noise has the gain, and returns with noise `spread` times the deviation."""
+        super().__init__()
+        self.rng, self.draw, self.gain, self.spread = rng, draw, gain, spread
+
+    def __missing__(self, run):
+        """Draw the return of a run."""
+        noise, _ = run
+        value = self.draw(self.rng, ())
+        if noise != BASELINE:
+            value = self.spread * value + self.gain * (noise == NOISES[0])
+        self[run] = float(value)
+        return self[run]
+
+
+NOISES = [Configuration.parse("noise", i) for i in range(90)]
+
+
+def choose(noises, plan, returns):
+    """Make a choice to its end; return its state."""
+    while True:
+        state = halving.advance(NOISES[:noises], 3 * noises, plan, returns)
+        if not state.due:
+            return state
+        for run in state.due:
+            returns[run]  # is drawn
+
+
+TESTS = {}  # of one choice: advance tests the earlier looks again whenever it is asked
+
+
+def once(x, y):
+    """Do a test that was not done before."""
+    key = (*x, None, *y)
+    if key not in TESTS:
+        TESTS[key] = permutation.permutation_t(x, y)
+    return TESTS[key]
+
+
+def simulate(noises, plan, gain, draw=normal, spread=1.0, trials=1000, seed=0):
+    """Return the shares of choices that find the good noise, confirm it, claim any; their runs."""
+    rng, sums = np.random.default_rng(seed), np.zeros(4)
+    quick = {"RANDOM_PARTITIONS": PARTITIONS, "partitions": ALL_PARTITIONS}
+    with mock.patch.multiple(permutation, **quick), mock.patch.object(looks, "permutation_t", once):
+        for _ in range(trials):
+            TESTS.clear()
+            returns = Returns(rng, draw, gain, spread)
+            state = choose(noises, plan, returns)
+            claims = halving.judge(state, plan, returns).helps
+            found = state.candidates == NOISES[:1]
+            sums += found, found and claims, claims, len(returns)
+    return sums / trials
+
+
+def level(n, m, draw, spread, trials=4000, seed=0):
+    """Return how often a test of n seeds with noise against m without claims an effect of none."""
+    rng = np.random.default_rng(seed)
+    noisy, baseline = spread * draw(rng, (n, trials)), draw(rng, (m, trials))
+    chosen = permutation.partitions(n, m)
+    if len(chosen) > 2000:
+        chosen = permutation.random_partitions(n, m, 1999, rng)
+    ts = [
+        permutation.welch_t(np.concatenate([noisy, baseline])[:, part], chosen)
+        for part in np.array_split(np.arange(trials), 20)
+    ]
+    shares = [permutation.tails(t) for t in ts]
+    p = np.concatenate([2 * np.minimum(above, below) for above, below in shares])
+    return np.mean(p <= statistics.LEVEL)
 
 
 def print_table(head, rows):
@@ -94,32 +163,66 @@ def print_table(head, rows):
     print(tabulate(rows, head, "pipe", disable_numparse=True), end="\n\n", flush=True)
 
 
-def power(noises, sizes, confirm, draw=normal):
-    """Return what is found, and what is confirmed, at each gain: texts for a table."""
-    shares = [simulate(noises, sizes, confirm, gain, draw)[:2] for gain in GAINS]
-    return [f"{share:.2f}" for pair in shares for share in pair]
-
-
 def main():
     """Print the tables."""
     raw = argparse.RawDescriptionHelpFormatter
-    argparse.ArgumentParser(description=__doc__, formatter_class=raw).parse_args()
-    columns = [f"{what}, +{gain:g} sd" for gain in GAINS for what in ("found", "confirmed")]
-    rows = [
-        (n, name, *power(n, schedule(n, 3 * n), 25, draw))
-        for n in (20, 90, 10, 4, 1)
-        for name, draw in DRAWS.items()
-    ]
-    print_table(("noises", "returns", *columns), rows)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
+    parser.add_argument("--trials", type=int, default=2000)
+    parser.add_argument("--tables", nargs="+", type=int, default=[1, 2, 3, 4])
+    args = parser.parse_args()
+    for number in args.tables:
+        (power_of_a_confirmation, false_claims, whole_choices, levels)[number - 1](args.trials)
+
+
+def power_of_a_confirmation(trials):
+    """Print the first table."""
+    print("Power of a confirmation of one noise, and runs of at most 50\n")
+    columns = [f"{what}, +{gain:g} sd" for gain in (0, *GAINS) for what in ("shown", "runs")]
     rows = []
-    for name, draw in DRAWS.items():
-        claims = [simulate(1, [], 25, 0, draw, spread)[2] for spread in (1, 0.5, 2)]
-        rows.append((name, *(f"{100 * share:.1f} %" for share in claims)))
-    print_table(("returns", "same spread", "spread halved", "spread doubled"), rows)
-    designs = [("equal, 3", equal_shares(90, 270), 10), ("equal, 2", equal_shares(90, 180), 25)]
-    designs += [("√noises, 3", schedule(90, 270), 25)]
-    rows = [(name, confirm, *power(90, sizes, confirm)) for name, sizes, confirm in designs]
-    print_table(("runs of a round", "fresh seeds", *columns), rows)
+    for (name, draw), (design, plan) in product(
+        shapes().items(), (("1 look", FIXED), ("5 looks", FIVE))
+    ):
+        cells = [simulate(1, plan, gain, draw, trials=trials) for gain in (0, *GAINS)]
+        texts = [text for cell in cells for text in (f"{cell[2]:.3f}", f"{cell[3]:.0f}")]
+        rows.append((name, design, *texts))
+    print_table(("returns", "design", *columns), rows)
+
+
+def false_claims(trials):
+    """Print the second table."""
+    print("False claims that a noise helps, by the spread with noise, in percent; 5 looks\n")
+    rows = []
+    for name, draw in shapes().items():
+        claims = [simulate(1, FIVE, 0, draw, spread, 2 * trials)[2] for spread in SPREADS]
+        rows.append((name, *(f"{100 * share:.1f}" for share in claims)))
+    print_table(("returns", *(f"x {spread:g}" for spread in SPREADS)), rows)
+
+
+def whole_choices(trials):
+    """Print the third table."""
+    print("Search and confirmation: found, confirmed, and runs\n")
+    rows = []
+    for noises, (name, draw) in product((22, 90, 10, 4), list(DRAWS.items())[:3]):
+        cells = [simulate(noises, FIVE, gain, draw, trials=trials // 2) for gain in (0, 1, 1.5, 2)]
+        texts = [f"{x[0]:.2f}, {x[1]:.2f}, {x[3]:.0f}" for x in cells]
+        rows.append((noises, name, *texts))
+    print_table(("noises", "returns", *(f"+{gain:g} sd" for gain in (0, 1, 1.5, 2))), rows)
+
+
+def levels(trials):
+    """Print the fourth table."""
+    print("Level of one test with unequal numbers of seeds, in percent: the worst shape\n")
+    rows = []
+    for n, m in ((5, 5), (5, 8), (5, 10), (5, 13), (5, 25), (5, 50), (10, 26), (3, 10)):
+        worst = {
+            (100 * level(n, m, draw, spread, 2 * trials), f"{name}, x {spread:g}")
+            for (name, draw), spread in product(shapes().items(), SPREADS)
+        }
+        rows.append(
+            (f"{n} + {m}", *(f"{share:.1f} ({where})" for share, where in sorted(worst)[-3:]))
+        )
+    print_table(("seeds", "third", "second", "worst"), rows)
+    print(f"Sweeps take at most {MOST_BASELINES:g} times as many seeds without noise.")
 
 
 if __name__ == "__main__":

@@ -39,8 +39,9 @@ def row(claim, page, paper, ours, tests, runs, claimed=1, of=all, after=False):
     inside = "–"
     if not isinstance(ours, str):
         change, low, high = ours
-        ours = f"{change:+z.0f} % [{low:z.0f}, {high:z.0f}]".replace("+0 %", "0 %")
-        if not isinstance(paper, str):
+        interval = "" if np.isnan(low) else f" [{low:z.0f}, {high:z.0f}]"
+        ours = f"{change:+z.0f} %".replace("+0 %", "0 %") + interval
+        if interval and not isinstance(paper, str):
             inside = "yes" if low <= paper <= high else "no"
     if not isinstance(paper, str):
         paper = f"{paper:+.0f} %"
@@ -120,7 +121,7 @@ def harmful_noises(runs):
         f = compare(select(runs, "TD3", "HalfCheetah", NORMAL, rate), base, mann_whitney_p)
         where = {"algorithm": "TD3", "noise": NORMAL, "noise_rate": f"{float(rate):.2f}"}
         paper = published("paper/consistently_worse.csv", **where)["average_improvement_percent"]
-        claim = f"Large observation noise harms TD3, p = {float(rate):g}"
+        claim = f"Large observation noise harms TD3, rate {float(rate):g}"
         effect = f["difference"], 2 * f["p"]  # Bonferroni's correction for two rates
         page, n = "TD3", f"runs: {sizes(f)}"
         rows.append(row(claim, page, float(paper), percents(f), [effect], n, claimed=-1))
@@ -169,7 +170,7 @@ def scaled_rewards(runs):
     for rate in ("0.01", "0.05"):
         f = compare(select(runs, "SAC", "HalfCheetah", pooled.SCALE, rate), base, mann_whitney_p)
         effect = f["difference"], min(1, 2 * f["p"])  # Bonferroni's correction for two rates
-        claim = f"SAC, rewards scaled, p = {rate}: helps early"
+        claim = f"SAC, rewards scaled, rate {rate}: helps early"
         gain = cheetah[float(rate)]
         rows.append(row(claim, page, gain, percents(f), [effect], f"runs: {sizes(f)}"))
     f = pooled.sac_early().iloc[0]
@@ -186,7 +187,7 @@ def scaled_rewards(runs):
         [select(found, "PPO", e, *c) for c in ((pooled.SCALE, "0.05"), ())] for e in ENVIRONMENTS
     ]
     *change, p = average_change(pairs)
-    claim, n = "The same noise helps PPO, p = 0.05", "ablation: 15 + 15"
+    claim, n = "The same noise helps PPO, rate 0.05", "ablation: 15 + 15"
     page = "rates"
     rows.append(row(claim, page, "–", change, [(change[0], p)], n, after=True))
     claim = "The same noise helps TD3"
@@ -240,7 +241,7 @@ def others(runs):
         claim = f"PPO is sensitive to beta of {name}"
         test = [(1, float(p))]
         rows.append(row(claim, "ablation", "a figure", f"p = {p}", test, "ablation: 75"))
-    claim, page = "p = 1 is seldom the best rate", "rates"
+    claim, page = "Rate 1 is seldom the best", "rates"
     return [*rows, row(claim, page, "6 of 15; chance 2.5", "–", [], "none")]
 
 

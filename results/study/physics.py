@@ -1,11 +1,10 @@
 """Set D of plans.md: does training with changing physics help under other physics?"""
 
-import json
-
 import matplotlib
 import pandas as pd
 from matplotlib.figure import Figure
 
+from analysis.folders import read_run
 from results.study import returns
 from results.study.compare import average_change, holm, in_words, joint_p
 
@@ -30,12 +29,11 @@ def read_tests():
     """
     rows = []
     for path in sorted((returns.DATA / "physics").rglob("robustness.csv")):
-        if not (path.parent / "result.json").exists():
+        trained = read_run(path.parent, with_curve=False)
+        if not trained.finished:
             continue
-        args = json.loads((path.parent / "config.json").read_text())["args"]
-        run = args["env_id"].split("-")[0], args["seed"], " + ".join(args["noise"])
-        final = json.loads((path.parent / "result.json").read_text())["final_return_mean"]
-        rows.append((*run, FINAL, final))
+        run = trained.environment.split("-")[0], trained.seed, trained.configuration.noise
+        rows.append((*run, FINAL, trained.result["final_return_mean"]))
         episodes = pd.read_csv(path, keep_default_na=False, dtype={"noise_rate": str})
         episodes = episodes[episodes["noise_rate"].isin(["0.0", "1.0"])]
         means = episodes.groupby("noise")["episodic_return"].mean()

@@ -6,12 +6,14 @@ once. The test is that of the first page, Mann-Whitney's.
 
 import pandas as pd
 
+from analysis.folders import read_run
 from noisy_wrappers import run_name
 from results.study.compare import average_change, compare, holm, mann_whitney_p
 from results.study.returns import (
     DATA,
     ENVIRONMENTS,
     RESULTS,
+    curve_of,
     each_run_once,
     read_curve,
     read_returns,
@@ -73,9 +75,9 @@ def sac_headline():
     """
     curves = {}
     for path in sorted((DATA / "long").glob("*HalfCheetah*sac*")):
-        noise = "no noise" if path.name.startswith("baseline") else f"{SCALE}, p = 0.01"
-        seed = int(path.name.split("_s")[1].split("_")[0])
-        curves[noise, seed] = read_curve(path)
+        run = read_run(path)
+        noise = f"{SCALE}, p = 0.01" if run.configuration.noise else "no noise"
+        curves[noise, run.seed] = curve_of(run)
     table = pd.DataFrame(curves)
     for noise in dict.fromkeys(noise for noise, _ in curves):
         table[noise, "mean"] = table[noise].mean(axis=1)

@@ -1,9 +1,10 @@
 """The returns of the runs in results/data, one row a run."""
 
-import json
 from pathlib import Path
 
 import pandas as pd
+
+from analysis.folders import read_run
 
 RESULTS = Path(__file__).parents[1]
 DATA = RESULTS / "data"
@@ -21,24 +22,28 @@ def read_returns(*names, step=None):
     rows = []
     for name in names:
         for path in sorted((DATA / name).rglob("result.json")):
-            args = json.loads((path.parent / "config.json").read_text())["args"]
-            environment, version = args["env_id"].split("-")
-            row = {"folder": name, "algorithm": args["exp_name"].split("_")[0].upper()}
+            run = read_run(path.parent, with_curve=step is not None)
+            environment, version = run.environment.split("-")
+            noise, rate = run.configuration.columns
+            row = {"folder": name, "algorithm": run.algorithm}
             row |= {"environment": environment, "version": version}
-            row |= {"noise": " + ".join(args["noise"])}
-            row |= {"rate": " + ".join(f"{rate}" for rate in args["noise_rate"])}
-            row |= {"seed": args["seed"], "steps": args["total_timesteps"]}
-            result = json.loads(path.read_text())
-            row["test"] = result["final_return_mean"]
+            row |= {"noise": noise, "rate": rate if noise else ""}
+            row |= {"seed": run.seed, "steps": run.total_timesteps}
+            row["test"] = run.result["final_return_mean"]
             if step is not None:
-                row["test"] = read_curve(path.parent)[step]
-            rows.append(row | {"training": result["train_return_mean_last_100"]})
+                row["test"] = curve_of(run)[step]
+            rows.append(row | {"training": run.result["train_return_mean_last_100"]})
     return pd.DataFrame(rows)
 
 
 def read_curve(folder):
     """Return the mean test returns of a run, indexed by step."""
-    return pd.read_csv(folder / "eval.csv").groupby("step")["episodic_return"].mean()
+    return curve_of(read_run(folder))
+
+
+def curve_of(run):
+    """Return the mean test returns of a Run, indexed by step."""
+    return pd.Series(run.curve.returns, index=run.curve.steps)
 
 
 def each_run_once(runs):

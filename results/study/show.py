@@ -5,13 +5,15 @@ file reads csv files and nothing else of the project, so a page changes only whe
 """
 
 import csv
+import re
 from pathlib import Path
 from string import Formatter
 
+RATE = re.compile(r"(?<=[`)]), p = ")  # behind a noise, as in the csv files and in the paper
 TABLES = Path(__file__).parents[1] / "tables"
 COMPARISON = {  # of the columns of compare.comparisons
     "environment": "{environment}",
-    "noise": "`{noise}`, p = {rate:g}",
+    "noise": "`{noise}`, rate {rate:g}",
     "n": "{n:.0f} + {n_without:.0f}",
     "with noise": "{mean:,.1f} ± {sd:,.1f}",
     "without": "{mean_without:,.1f} ± {sd_without:,.1f}",
@@ -40,7 +42,7 @@ COLUMNS = {
         "Holm": "{holm:.2g}",
     },
     "consistent_rows.csv": {
-        "noise": "`{noise}`, p = {rate:g}",
+        "noise": "`{noise}`, rate {rate:g}",
         "improved": "{improved:.0f} of 5",
         "average [95 %]": "{average_percent:+z.0f} % [{low_percent:z.0f}, {high_percent:z.0f}]",
         "p (Welch)": "{p:.2f}",
@@ -75,7 +77,8 @@ def table(name, **where):
     if columns:
         lines = [[formatted(form, row) for form in columns.values()] for row in rows]
     titles = list(columns or rows[0])
-    lines = [f"| {' | '.join(cell or '–' for cell in line)} |" for line in [titles, *lines]]
+    lines = [[RATE.sub(", rate ", cell) for cell in line] for line in [titles, *lines]]
+    lines = [f"| {' | '.join(cell or '–' for cell in line)} |" for line in lines]
     print(lines[0], "|---" * len(titles) + "|", *lines[1:], sep="\n")
 
 
@@ -85,8 +88,11 @@ def fields(form):
 
 
 def formatted(form, row):
-    """Return a cell by its format, empty where a value is."""
+    """Return a cell by its format, empty where a value is, but without an interval that is."""
     values = {field: number(row[field]) for field in fields(form)}
+    if "" in values.values():
+        form = form.partition(" [")[0]
+        values = {field: values[field] for field in fields(form)}
     text = "" if "" in values.values() else form.format(**values)
     return text.replace("+0 %", "0 %")  # zero has no sign
 

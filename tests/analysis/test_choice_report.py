@@ -1,20 +1,12 @@
 """What analyze.py says of noise that was chosen, that changes during training, or that combines."""
 
-import json
-import subprocess
-
 import numpy as np
 import pandas as pd
 import pytest
-from test_analyze import ENDING, SCALE, row, run, write_run
+from sweeps import ENDING, SCALE, row, run, write_run
 
-import analysis.figures
-import analysis.formatting
-import analysis.runs
-import analysis.tables
 import evaluate
 
-PUSH = "RandomNormalNoisyAction(0.3)"
 HEADER = "algorithm,environment,phase,round,noise,noise_rate,seeds,score,survives\n"
 
 
@@ -45,14 +37,14 @@ def test_search_and_confirmation_are_never_mixed(tmp_path, capsys):
     assert row(summary, phase=search, noise=SCALE)[["n", "mean"]].tolist() == [3, 902]
     confirmed = row(summary, phase=fresh, noise=SCALE)
     assert confirmed[["n", "mean", "n_baseline", "baseline_mean"]].tolist() == [5, 133, 5, 103]
-    assert np.isnan(row(summary, phase=search, noise=SCALE)["improvement_percent"])
+    assert np.isnan(row(summary, phase=search, noise=SCALE)["difference_percent"])
     # Only the confirmation is judged: five against five that are all higher.
     for name in ("statistics", "best"):
         assert set(tables[name]["phase"]) == {fresh}
     assert row(tables["statistics"], noise=SCALE)["p"] == pytest.approx(2 / 252)
     printed = capsys.readouterr().out
     found = f"PPO [confirmation] on Hopper-v5 with {SCALE} at rate 1.00 is better than no noise: "
-    assert f"{found}+30.0 [27.7, 32.3] (+29 %), p = 0.0079" in printed
+    assert f"{found}+30.0 [27.7, 32.3] (+29 % [" in printed
     assert "no finished baseline" not in printed and tables["missing"].empty
     choice = tables["choice"]
     assert choice["survives"].fillna("").tolist() == ["yes", "no", "", "yes"]
@@ -86,28 +78,6 @@ def test_the_phases_are_folders_and_high_seeds_are_seeds(tmp_path):
     assert "choice" not in tables
 
 
-def test_the_flat_folder_of_an_earlier_version_is_refused_with_the_commands(tmp_path, capsys):
-    """After them, the tables are those of a choice that was never flat."""
-    root = tmp_path / "my runs"
-    write_choice(root)
-    expected = run(tmp_path, "my runs")
-    for phase in ("search", "confirmation"):
-        for i, folder in enumerate(sorted((root / phase).iterdir())):
-            seed = json.loads((folder / "config.json").read_text())["args"]["seed"]
-            folder.rename(root / f"p1.0_s{seed}_A{phase[0]}{i}__Hopper-v5__ppo")
-        (root / phase).rmdir()
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as error:
-        run(tmp_path, "my runs")
-    printed = capsys.readouterr().err
-    assert error.value.code == 2 and printed.count("\n") == 1 and printed.count("mv ") == 2
-    command = printed.partition("now: ")[2]
-    subprocess.run(command, shell=True, check=True, executable="/bin/bash")
-    for name, table in run(tmp_path, "my runs", "again").items():
-        if name != "missing":
-            pd.testing.assert_frame_equal(table, expected[name])
-
-
 def test_other_sweeps_in_the_folder_of_a_choice_stay_as_they_are(tmp_path):
     write_choice(tmp_path / "runs")
     for algorithm, env in (("PPO", "Pusher-v5"), ("SAC", "Hopper-v5")):
@@ -115,7 +85,7 @@ def test_other_sweeps_in_the_folder_of_a_choice_stay_as_they_are(tmp_path):
             write_run(tmp_path / "runs", [100.0 + seed], algorithm, env, seed=seed)
             write_run(tmp_path / "runs", [110.0 + seed], algorithm, env, SCALE, 1.0, seed)
     tables = run(tmp_path)
-    found = tables["statistics"].query("scope == 'environment'")
+    found = tables["noises"]
     assert set(zip(found["algorithm"], found["phase"], found["environment"], strict=True)) == {
         ("PPO", "confirmation", "Hopper-v5"),
         ("PPO", "", "Pusher-v5"),
@@ -147,39 +117,20 @@ def test_a_damaged_choice_is_one_line(tmp_path, capsys):
     assert not (tmp_path / "results").exists()
 
 
-def test_rates_that_change_are_read_sorted_and_shown(tmp_path):
-    for rate in (1.0, "1.0:0.0", 0.05, "0.0:1.0"):
-        for seed in (1, 2, 3):
-            write_run(tmp_path / "runs", [10 + seed], seed=seed, noise=SCALE, rate=rate)
-            write_run(tmp_path / "runs", [12 + seed], seed=seed, noise=PUSH, rate=rate)
-    both = {"noise": (PUSH, SCALE), "rate": (0.5, "1.0:0.0")}
-    for seed in (1, 2, 3):
-        write_run(tmp_path / "runs", [10], seed=seed)
-        write_run(tmp_path / "runs", [20], seed=seed, **both)
+@pytest.mark.parametrize(
+    ("gain", "survives", "verdict"),
+    [(30.0, "yes", "better"), (30.0, "no", "no clear difference"), (-30.0, "no", "worse")]
+    + [(2.0, "yes", "better"), (30.0, None, "")],
+)
+def test_a_confirmation_has_the_verdict_of_the_choice(gain, survives, verdict, tmp_path):
+    """Which looks several times: a plain p would be one look more."""
+    write_choice(tmp_path / "runs", gain=gain)
+    path = tmp_path / "runs/choice.csv"
+    lines = path.read_text().splitlines()
+    last = lines.pop().rpartition(",")[0]
+    if survives:
+        lines.append(f"{last},{survives}")
+    path.write_text("\n".join(lines) + "\n")
     tables = run(tmp_path)
-    rates = tables["summary_SAC"].query("noise == @PUSH")["noise_rate"].tolist()
-    assert rates == ["0.00 to 1.00", "0.05", "1.00 to 0.00", "1.00"]
-    combined = row(tables["summary_SAC"], noise=f"{PUSH} + {SCALE}")
-    assert combined["noise_rate"] == "0.50 + 1.00 to 0.00"
-    studies, _ = analysis.runs.make_studies(analysis.runs.read_runs(tmp_path / "runs"))
-    figures = analysis.figures.figures(studies, analysis.tables.make_tables(studies))
-    drawn = {drawing.name: drawing.draw() for drawing in figures}
-    lines = [text.get_text() for text in drawn["effects_SAC"].axes[0].get_yticklabels()]
-    lines = [line.replace("\n(", "(") for line in lines]  # broken where there is little room
-    changing = [f"{PUSH}, {rate}" for rate in ("0.00 to 1.00", "0.05", "1.00 to 0.00", "1.00")]
-    assert lines[:4] == changing and f"{PUSH} +\n{SCALE}, 0.50 +\n1.00 to 0.00" in lines
-    legend = drawn[f"curves_SAC_{analysis.formatting.slug(PUSH)}"].legends[0].get_texts()
-    named = [text.get_text().partition(" (")[0] for text in legend]
-    assert named == ["no noise", *(f"rate {rate}" for rate in rates)]
-
-
-def test_figures_of_experiments_with_similar_names_have_names_of_their_own(tmp_path):
-    for name in ("lr 1", "lr_1"):
-        for seed in (1, 2):
-            more = {"seed": seed, "exp_name": name}
-            write_run(tmp_path, [10], folder=f"{name}-{seed}", **more)
-            write_run(tmp_path, [9], folder=f"{name}-{seed}-p", noise=PUSH, rate=0.1, **more)
-    studies, _ = analysis.runs.make_studies(analysis.runs.read_runs(tmp_path))
-    figures = analysis.figures.figures(studies, analysis.tables.make_tables(studies))
-    names = {drawing.name for drawing in figures}
-    assert len(figures) == len(names) and {"effects_SAC_lr_1", "effects_SAC_lr_1_again"} <= names
+    [said] = tables["noises"]["verdict"]
+    assert said == verdict or (pd.isna(said) and not verdict)

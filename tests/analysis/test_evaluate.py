@@ -24,8 +24,10 @@ import evaluate
 import ppo_continuous_noisy as ppo
 import sac_continuous_noisy as sac
 import td3_continuous_noisy as td3
+from analysis.folders import Run
+from analysis.formatting import rounded
 from evaluate import Args, main
-from noisy_wrappers import BASELINE, Configuration, rounded
+from noisy_wrappers import BASELINE, Configuration
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = {"SAC": sac, "TD3": td3, "PPO": ppo}
@@ -93,7 +95,7 @@ def run(*options, cwd=None, **environment):
 @pytest.mark.parametrize("algorithm", SCRIPTS)
 def test_clean_returns_are_those_of_the_last_evaluation(runs, algorithm):
     run_dir = one(runs, algorithm)
-    [finished], _ = evaluate.find_runs([run_dir])
+    [finished], _ = evaluate.find_players([run_dir])
     played = evaluate.play(finished, BASELINE, Args((run_dir,), episodes=10, seed=1_000_000))
     with open(run_dir / "eval.csv", newline="") as file:
         last = list(csv.DictReader(file))[-10:]
@@ -204,7 +206,7 @@ def test_another_seed_plays_everything_and_stores_nothing(runs, capsys):
     said, *table = capsys.readouterr().out.splitlines()
     assert said == "--seed 7 is not the default: everything is played, nothing is stored"
     assert files(runs) == before
-    [finished], _ = evaluate.find_runs([run_dir])
+    [finished], _ = evaluate.find_players([run_dir])
     means = []
     for rate in (0, 0.5, 1.0):
         played = evaluate.play(finished, Configuration.read([OBSERVATION], [rate]), args)
@@ -236,7 +238,7 @@ def test_a_kill_leaves_whole_conditions_and_the_same_command_goes_on(runs):
 def test_what_is_played_is_stored_by_the_process_that_plays(runs):
     """So nothing waits for an earlier condition that still plays in another process."""
     run_dir = one(runs, "PPO")
-    [finished], _ = evaluate.find_runs([run_dir])
+    [finished], _ = evaluate.find_players([run_dir])
     evaluate.play(finished, Configuration.read([OBSERVATION], [0.5]), Args((run_dir,), episodes=2))
     assert [row["noise"] for row in stored(run_dir)] == [OBSERVATION] * 2
 
@@ -297,13 +299,13 @@ def test_a_run_is_found_once_by_whatever_path(runs, tmp_path):
     folder = one(runs, "PPO")
     (tmp_path / "link").symlink_to(runs)
     paths = [folder, runs, tmp_path / "link", folder / ".." / folder.name]
-    found, _ = evaluate.find_runs(paths)
+    found, _ = evaluate.find_players(paths)
     assert [run.folder for run in found].count(folder) == 1
     assert len(found) == len({run.folder.resolve() for run in found})
 
 
 def test_the_longer_of_two_results_is_kept(runs):
-    [finished], _ = evaluate.find_runs([one(runs, "PPO")])
+    [finished], _ = evaluate.find_players([one(runs, "PPO")])
     short, long = [(1.0, 1, 1.0)], [(1.0, 1, 1.0), (2.0, 2, 0.0)]
     for results in (short, long, short):
         evaluate.store(finished, ("", "0.0", ""), results)
@@ -311,7 +313,7 @@ def test_the_longer_of_two_results_is_kept(runs):
 
 
 def test_success_that_some_conditions_do_not_tell_is_empty_there(runs):
-    [finished], _ = evaluate.find_runs([one(runs, "PPO")])
+    [finished], _ = evaluate.find_players([one(runs, "PPO")])
     evaluate.store(finished, ("", "0.0", ""), [(0.1 + 0.2, 1, math.nan)])
     evaluate.store(finished, ("", "0.0", "Heavy-v0"), [(2.0, 2, 1.0), (-3.0, 3, 0.0)])
     assert (finished.folder / "robustness.csv").read_text().splitlines() == [
@@ -354,13 +356,53 @@ def test_a_full_disk_leaves_the_previous_file(runs, monkeypatch, capsys):
     assert files(runs) == before
 
 
+def test_a_copy_of_a_script_plays_its_own_policy(tmp_path, monkeypatch, capsys):
+    """Its environment and its network are its own: the returns are those of its last test."""
+    script = (ROOT / "ppo_continuous_noisy.py").read_text()
+    script = script.replace("nn.Linear(inputs, 64), nn.Linear(64, 64)", "nn.Linear(inputs, 64), W")
+    script = script.replace(
+        "W, nn.Linear(64, outputs)", "nn.Linear(64, 32), nn.Linear(32, outputs)"
+    )
+    script = script.replace("layers[1], nn.Tanh()", "layers[1], nn.ReLU()")
+    flat = "    return noisy.make_flat(env, STEP_LIMIT)"
+    reward = "gym.wrappers.TransformReward(env, lambda r: 2 * r + 1)"
+    assert flat in script
+    script = script.replace(flat, f"    return noisy.make_flat({reward}, STEP_LIMIT)")
+    (tmp_path / "wide_continuous_noisy.py").write_text(script)
+    monkeypatch.chdir(tmp_path)
+    options = "--env-id InvertedPendulum-v5 --total-timesteps 256 --num-steps 128 --no-compile"
+    line = [sys.executable, "wide_continuous_noisy.py", *options.split(), "--eval-episodes", "3"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    subprocess.run(line, check=True, capture_output=True, env=environment)
+    [run_dir] = [path for path in Path("runs").iterdir() if path.is_dir()]
+    last = np.loadtxt(run_dir / "eval.csv", delimiter=",", skiprows=1, usecols=2)[-3:]
+    assert main(Args((run_dir,), episodes=3, seed=1_000_000)) == 0
+    assert capsys.readouterr().out.split()[-1] == rounded(last.mean())
+    (tmp_path / "wide_continuous_noisy.py").unlink()
+    assert main(Args((run_dir,), episodes=3)) == 2
+    assert "its script wide_continuous_noisy.py is neither" in capsys.readouterr().err
+
+
+def test_an_unfinished_run_plays_if_it_is_named_and_stores_nothing(runs, capsys):
+    run_dir = one(runs, "PPO")
+    (run_dir / "result.json").unlink()
+    before = files(run_dir)
+    assert main(Args((run_dir,), episodes=2)) == 0
+    assert "its policy of step 256 is tested" in capsys.readouterr().out
+    assert files(run_dir) == before
+    main(Args((runs,), episodes=1))
+    assert "unfinished runs are left out: 1" in capsys.readouterr().out
+
+
 # The table
 
 
 def test_the_table_of_known_returns(capsys):
     def a_run(noise, rate):
-        config = Configuration.parse(noise, rate)
-        return evaluate.FinishedRun(Path(str(len(seen))), "PPO", "", "E", config, {})
+        folder, configuration = Path(str(len(seen))), Configuration.parse(noise, rate)
+        names = "PPO", "ppo_continuous_noisy.py", "E", "ppo_continuous_noisy", configuration
+        run = Run(folder, "", {"args": {}}, *names, BASELINE, 1, 1, "0.4")
+        return evaluate.Player(run)
 
     seen = {}
     for noise, rate, clean, noisy in [
@@ -663,7 +705,8 @@ def test_a_module_of_ones_own_is_imported(runs_dir, trained, tmp_path, monkeypat
     shutil.copytree(one(trained, "PPO"), run_dir)
     register(tmp_path, f"own_{len(runs_dir)}", "")
     other_environment(run_dir, f"own_{len(runs_dir)}:Mine-v0")
-    monkeypatch.setattr(evaluate, "__file__", str(tmp_path / "evaluate.py"))
+    shutil.copy(ROOT / "ppo_continuous_noisy.py", tmp_path)
+    monkeypatch.setattr(evaluate, "PROJECT", tmp_path)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", sys.path[:])
     assert main(Args((run_dir,), episodes=1)) == 0
@@ -745,7 +788,7 @@ def test_another_environment(runs, capsys):
     assert all(int(row["episodic_length"]) <= 7 for row in rows[4:])
     table = capsys.readouterr().out.splitlines()[-1]
     assert f"{home}, tested in Heavy-v0" in table
-    refused(Args((run_dir,), env_id="Pendulum-v1"), "a policy needs the same", runs, capsys)
+    refused(Args((run_dir,), env_id="Pendulum-v1"), "its observation space is Box", runs, capsys)
 
 
 def refused(args, message, runs, capsys):

@@ -1,37 +1,32 @@
 """What luck alone shows (analysis.luck.py): cases with a known answer, and its false alarms."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import simulate_choose
 from scipy import stats
-from test_analyze import FINALS, row, run, small_sweep
+from sweeps import FINALS, NAN, RESULTS, ROOT, row, run, small_sweep
 
 import analysis.luck
-import analysis.paper
-import analysis.runs
 import analysis.statistics
-import analysis.tables
-import analyze
+from analysis.studies import Study
 from noisy_wrappers import BASELINE, Configuration
+from results.study import paper
 
-NAN = float("nan")
-PAPER = Path(analyze.__file__).parent / "results/paper"
-STUDY = {"algorithm": "PPO", "exp_name": "", "phase": ""}
+STUDY = {"algorithm": "PPO", "exp_name": "", "phase": "", "tested": ""}
 MANY = 10**9  # seeds or degrees of freedom: no uncertainty
 
 
 def make_study(baseline, noisy):
     """Make a Study of final returns: baseline (seeds x envs), noisy (configs x seeds x envs)."""
-    returns = {BASELINE: baseline[None]}
+    finals = {BASELINE: baseline}
     for i, values in enumerate(noisy):
-        returns[Configuration((f"N({i})",), ((1.0, 1.0),))] = values[None]
+        finals[Configuration((f"N({i})",), ((1.0, 1.0),))] = values
     environments = [f"Env{e}-v0" for e in range(baseline.shape[1])]
     seeds = list(range(len(baseline)))
-    return analysis.runs.Study("PPO", "", "", environments, seeds, np.array([1]), returns)
+    return Study("PPO", "", "", "", environments, seeds, np.array([1]), {}, finals)
 
 
 def luck_of_study(study):
@@ -160,7 +155,7 @@ def test_useless_noise_in_a_paper_is_beyond_luck_in_five_percent_of_studies(monk
         best = noisy.mean(axis=1).max()
         values = ["Env0-v0", baseline.mean(), baseline.std(ddof=1), best]
         table = pd.DataFrame([STUDY | dict(zip(names, values, strict=True))])
-        p.append(analysis.paper.add_luck_of_paper(table, {"PPO": n})["p_luck"].item())
+        p.append(paper.add_luck_of_paper(table, {"PPO": n})["p_luck"].item())
     assert 0.03 <= (np.array(p) <= 0.05).mean() <= 0.08
 
 
@@ -168,7 +163,7 @@ def test_useless_noise_in_a_paper_is_beyond_luck_in_five_percent_of_studies(monk
 def test_the_page_says_how_often_p_luck_is_wrong_and_how_often_it_finds_an_effect(monkeypatch):
     monkeypatch.setattr(analysis.luck, "DRAWS", 400)
     n = 5
-    page = (Path(analyze.__file__).parent / "docs/statistics.md").read_text()
+    page = (ROOT / "docs/statistics.md").read_text()
     draws = {"high peak": simulate_choose.high_peak, "low peak": simulate_choose.failing}
     for name, gain in (("high peak", 0), ("low peak", 0), ("normal", 1.5)):
         [line] = re.findall(rf"^\| {name} \| {n} \| (.*) \|$", page, re.MULTILINE)
@@ -186,7 +181,7 @@ def p_of_the_best(n, gain, draw, studies=200):
 
     As analyze.py judges its own runs, and as it judges the paper's table.
     """
-    rng, own, paper = np.random.default_rng(0), 0, 0
+    rng, own, theirs = np.random.default_rng(0), 0, 0
     for _ in range(studies):
         baseline, noisy = 20 + draw(rng, (n, 1)) / 10, 20 + draw(rng, (90, n, 1)) / 10
         noisy[0] += gain / 10
@@ -195,9 +190,9 @@ def p_of_the_best(n, gain, draw, studies=200):
         own += analysis.luck.p_of_luck(luck, best) <= analysis.statistics.LEVEL
         row = STUDY | {"environment": "Env0-v0", "noisy_mean": best}
         row |= {"baseline_mean": 0.0, "baseline_std": baseline.std(ddof=1)}
-        [p] = analysis.paper.add_luck_of_paper(pd.DataFrame([row]), {"PPO": n})["p_luck"]
-        paper += p <= analysis.statistics.LEVEL
-    return 100 * own / studies, 100 * paper / studies
+        [p] = paper.add_luck_of_paper(pd.DataFrame([row]), {"PPO": n})["p_luck"]
+        theirs += p <= analysis.statistics.LEVEL
+    return 100 * own / studies, 100 * theirs / studies
 
 
 # -------------------------------------------------------------------------------------- tables
@@ -206,18 +201,18 @@ def p_of_the_best(n, gain, draw, studies=200):
 @pytest.mark.slow
 def test_luck_stands_beside_the_best(tmp_path):
     small_sweep(tmp_path / "runs")
-    tables = run(tmp_path, compare=PAPER)
+    tables = run(tmp_path)
     pusher = row(tables["best"], environment="Pusher-v5")
     finals = [values for key, values in FINALS.items() if key[0] == "Pusher-v5"]
     baseline, noisy = np.array(finals[0], float), np.array(finals[1:], float)
     assert pusher["p_luck"] == pytest.approx(luck_of_one_environment(baseline, noisy), abs=0.005)
     assert pusher["luck_median"] < pusher["luck_95"] < pusher["difference"]
     page = (tmp_path / "results/report.html").read_text()
-    assert "luck 95 % (p)" in page and "paper p luck" in page
+    assert "luck 95 % (p)" in page
 
 
 def test_luck_in_the_papers_table():
-    best = analysis.paper.add_luck_of_paper(analysis.paper.read_paper(PAPER)["best"])
+    best = paper.add_luck_of_paper(paper.read_paper(RESULTS / "paper")["best"])
     walker = row(best, algorithm="PPO", environment="Walker2d-v2")
     # Of 90 means of 10 runs the highest, minus the baseline's: about 4.0 standard errors of 1206.7
     assert walker["luck_95"] > 4.0 * 1206.7 / np.sqrt(10)

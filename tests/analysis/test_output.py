@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 import pytest
-from test_analyze import SCALE, run, write_run
+from sweeps import SCALE, run, write_run
 
 import analyze
 import evaluate
@@ -58,14 +58,6 @@ def test_names_are_escaped_in_markdown(tmp_path):
     assert r"naïve \|&lt;b>$x$ ±" in row
     header = next(line for line in table.splitlines() if line.startswith("| algorithm"))
     assert len(re.findall(r"(?<!\\)\|", row)) == header.count("|")
-
-
-def test_names_are_escaped_in_latex(tmp_path):
-    write_run(tmp_path / "runs", [1.0, 2.0], exp_name="a~b^c")
-    run(tmp_path)
-    table = (tmp_path / "results/summary_SAC.tex").read_text("utf-8")
-    assert r"\begin{longtable}{lllllllllllll}" in table
-    assert r"a\textasciitilde{}b\^{}c" in table
 
 
 @pytest.mark.slow

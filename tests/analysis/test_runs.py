@@ -1,62 +1,179 @@
-"""Reading a folder of runs: what is in no table is listed with the reason."""
+"""Reading a folder of runs: which runs count, what is in no table, and why."""
 
-from test_analyze import SCALE, run, write_run
+import re
+import shutil
 
-from analysis.runs import left_out, make_studies, read_runs
+import numpy as np
+import pandas as pd
+import pytest
+from sweeps import ENDING, SCALE, row, run, small_sweep, write_pairs, write_run
+
+from analysis.folders import SUCCESS
+from analysis.runs import STUDY, in_short, left_out, missing_runs, read_runs
+from analysis.studies import make_studies, version_notes
+from noisy_wrappers import BASELINE
 
 BEGUN = "# 2026-01-01 00:00:00 host: python ppo_continuous_noisy.py\n"
+NEW = {"versions": {"noisy_wrappers": "0.4.1"}}
+
+
+def status_of(entries, status):
+    """Return {seed: reason} of the runs with a status."""
+    return {entry.run.seed: entry.reason for entry in entries if entry.status == status}
+
+
+def notes_of(folder):
+    return make_studies(read_runs(folder))[1]
+
+
+# --------------------------------------------------------------------------------- what is damaged
+
+CORRUPTIONS = {
+    "half a line": lambda text: text[:-9],
+    "no newline at the end": lambda text: text[:-1],
+    "a short line": lambda text: text.replace(",1000\n", "\n", 1),
+    "nan": lambda text: re.sub(r"(?m)^(10000,0,)[^,]*", r"\1nan", text),
+    "a missing episode": lambda text: re.sub(r"(?m)^20000,1,.*\n", "", text),
+    "one episode twice": lambda text: text.replace("\n20000,1,", "\n20000,0,"),
+    "a missing evaluation at the end": lambda text: re.sub(r"(?m)^50000,.*\n", "", text),
+    "an evaluation twice": lambda text: text + "".join(text.splitlines(keepends=True)[-2:]),
+    "steps out of order": lambda text: text.replace("\n30000,", "\n10000,"),
+    "another final return": lambda text: re.sub(r"(?m)^(50000,1,)[^,]*", r"\g<1>7.5", text),
+    "no header": lambda text: text.split("\n", 1)[1],
+    "only a header": lambda text: text.split("\n", 1)[0] + "\n",
+    "binary": lambda text: text.replace("1000", "\x00"),
+}
+
+
+@pytest.mark.parametrize("name", CORRUPTIONS)
+def test_corrupt_evaluations_are_reported_and_left_out(name, tmp_path):
+    for seed in (1, 2, 3):
+        folder = write_run(tmp_path, [10, 20, 30, 40, 50.0 + seed], seed=seed)
+    text = (folder / "eval.csv").read_text()
+    assert CORRUPTIONS[name](text) != text
+    (folder / "eval.csv").write_text(CORRUPTIONS[name](text))
+    entries = read_runs(tmp_path)
+    [reason] = status_of(entries, "corrupt").values()
+    assert reason.startswith("eval.csv") and "\n" not in reason
+    (study,), _ = make_studies(entries)
+    assert study.finals[BASELINE].ravel().tolist() == [51, 52]  # one test is in their last 15 %
+    assert not missing_runs(entries)  # it is there, only broken
+
+
+def test_unfinished_missing_and_duplicate_runs_are_listed(tmp_path, capsys):
+    root = tmp_path / "runs"
+    small_sweep(root)
+    args = {"env": "Pusher-v5", "noise": SCALE, "rate": 0.05}
+    shutil.rmtree(root / f"Pusher-v5__SAC__{SCALE}+0.05__2")
+    shutil.rmtree(root / f"Pusher-v5__SAC__{SCALE}+0.05__3")
+    write_run(root, [-1, -1, -1, -1, 1e6], seed=3, finished=False, **args)
+    write_run(root, [-1, -1, -1, -1, 1e6], seed=4, folder="copy", **args)
+    tables = run(tmp_path)
+    missing = tables["missing"].set_index("status")
+    assert sorted(missing.index) == ["duplicate", "missing", "unfinished"]
+    assert missing.loc["missing", "seed"] == 2 and missing.loc["missing", "noise"] == SCALE
+    assert missing.loc["unfinished", "reason"] == "no result.json"
+    noisy = row(tables["summary_SAC"], environment="Pusher-v5", noise=SCALE, noise_rate="0.05")
+    assert noisy["n"] == 2  # seeds 1 and 4
+    printed = capsys.readouterr().out
+    assert "WARNING: Runs left out: 3 (" in printed and "copy" in printed
+    assert "not complete (1 unfinished, 1 missing): more runs are due, and a verdict now" in printed
+
+
+def test_every_run_left_out_has_its_own_reason(tmp_path):
+    """People see one row for each configuration and status."""
+    for seed in (1, 2, 3, 5, 6, 8):
+        finished = seed in (1, 8)
+        write_run(tmp_path, [10], seed=seed, finished=finished, noise=SCALE, rate=0.5)
+    for name in ("damaged__1", "damaged__2"):
+        write_run(tmp_path, [10], seed=9, folder=name)
+        (tmp_path / name / "config.json").write_text("{" * len(name))
+    (tmp_path / "damaged__1/config.json").write_text("[]")
+    table = left_out(read_runs(tmp_path))
+    assert table["status"].value_counts().to_dict() == {"unfinished": 4, "corrupt": 2, "missing": 6}
+    assert (table["reason"] != "").all() and table["run"].nunique() == 7
+    short = in_short(table)
+    assert short[["status", "noise", "seeds"]].fillna("").to_numpy().tolist() == [
+        ["unfinished", SCALE, "2-3, 5-6"],
+        ["corrupt", "", ""],
+        ["corrupt", "", ""],
+        ["missing", "", "1-3, 5-6, 8"],  # the baseline
+    ]
+    assert "3 more" in short["run"].iloc[0]
 
 
 def test_a_run_that_failed_before_it_had_a_folder_is_listed(tmp_path):
-    (tmp_path / "logs").mkdir()
-    for seed, text in (
-        (1, "error: scale has 2 numbers\n"),
-        (2, "KeyError: 'x'\n(training stopped)\n"),
-    ):
-        name = f"p0.1_s{seed}_NormalNoisyObservation_0.1_0.2__Pendulum-v1__ppo_continuous_noisy"
-        (tmp_path / "logs" / f"{name}.log").write_text(f"{BEGUN}{text}# 2026 host: exit=2\n")
-    for code in (0, 130, 143):  # finished or stopped; its folder was moved or deleted afterwards
-        (tmp_path / "logs" / f"a__{code}.log").write_text(f"{BEGUN}x\n# now host: exit={code}\n")
-    (tmp_path / "logs" / "a__run.log").write_text(f"{BEGUN}compiling ...\n")  # it is starting
-    (tmp_path / "logs" / "joblog.tsv").write_text("nothing of ours")
-    table, count = left_out(read_runs(tmp_path))
-    assert count == {"failed": 2}
-    assert list(table["reason"]) == ["error: scale has 2 numbers", "KeyError: 'x'"]
-    assert all(table["run"].str.contains("_NormalNoisyObservation_0.1_0.2__Pendulum-v1"))
-
-
-def test_a_run_of_a_choice_that_failed_before_it_had_a_folder_is_listed(tmp_path):
-    for phase in ("search", "confirmation"):
+    for phase in ("", "search", "confirmation"):
         (tmp_path / phase / "logs").mkdir(parents=True)
-        log = tmp_path / phase / "logs" / "a__run.log"
-        log.write_text(f"{BEGUN}error: no\n# 2026 host: exit=2\n")
-    table, count = left_out(read_runs(tmp_path))
-    assert count == {"failed": 2}
-    assert list(table["run"]) == ["search/a__run", "confirmation/a__run"]
+    (tmp_path / "logs/a__1.log").write_text(f"{BEGUN}error: no\n# 2026 host: exit=2\n")
+    text = f"{BEGUN}KeyError: 'x'\n(training stopped)\n# 2026 host: exit=1\n"
+    (tmp_path / "search/logs/a__2.log").write_text(text)
+    for code in (0, 130, 143):  # finished or stopped; its folder was moved or deleted afterwards
+        (tmp_path / f"logs/a__{code}.log").write_text(f"{BEGUN}x\n# now host: exit={code}\n")
+    (tmp_path / "logs/a__run.log").write_text(f"{BEGUN}compiling ...\n")  # it is starting
+    table = left_out(read_runs(tmp_path))
+    assert table[["status", "run", "reason"]].to_numpy().tolist() == [
+        ["failed", "a__1", "error: no"],
+        ["failed", "search/a__2", "KeyError: 'x'"],
+    ]
 
 
-def test_an_unfinished_run_of_an_older_version_lacks_no_others(tmp_path):
+def test_more_seeds_for_the_baseline_or_for_one_noise_are_nothing_missing(tmp_path):
+    for seed in range(1, 6):
+        write_run(tmp_path, [10], seed=seed)
+        if seed <= 3:
+            write_run(tmp_path, [10], seed=seed, noise=SCALE, rate=0.5)
+            write_run(tmp_path, [10], seed=seed, noise=SCALE, rate=0.2)
+        write_run(tmp_path, [10], seed=seed, noise=ENDING, rate=0.5)
+    assert not missing_runs(read_runs(tmp_path))
+    write_run(tmp_path, [10], seed=4, noise=SCALE, rate=0.2)  # now two of three noises have it
+    [missing] = missing_runs(read_runs(tmp_path))
+    assert (missing.run.configuration.noise_rate, missing.run.seed) == ("0.50", 4)
+
+
+def test_a_noise_is_not_missing_where_nobody_tried_it(tmp_path):
     for seed in (1, 2):
-        for env in ("Hopper-v4", "Hopper-v5"):
-            last = env == "Hopper-v4" and seed == 2
-            write_run(tmp_path, [10], env=env, seed=seed)
-            write_run(tmp_path, [9], env=env, seed=seed, noise=SCALE, rate=0.1, finished=not last)
-    _, count = left_out(read_runs(tmp_path))
-    assert count == {"unfinished": 1}
+        write_run(tmp_path, [10], env="Hopper-v5", seed=seed)
+    write_run(tmp_path, [10], env="Hopper-v5", seed=1, noise=SCALE, rate=0.5)
+    write_run(tmp_path, [10], env="Pusher-v5", seed=2, noise=ENDING, rate=0.1)
+    missing = [entry.run for entry in missing_runs(read_runs(tmp_path))]
+    assert [(run.environment, run.configuration.noise, run.seed) for run in missing] == [
+        ("Hopper-v5", SCALE, 2),
+        ("Pusher-v5", "", 1),
+        ("Pusher-v5", "", 2),
+        ("Pusher-v5", ENDING, 1),
+    ]
 
 
-def reasons(runs):
-    """Return what is said of each run that differs from its study, by its seed."""
-    different = runs[runs["status"] == "different"]
-    return dict(zip(different["seed"], different["reason"], strict=True))
+def test_a_missing_baseline_is_said(tmp_path, capsys):
+    write_run(tmp_path / "runs", [10], noise=SCALE, rate=0.5)
+    tables = run(tmp_path)
+    assert tables["best"].empty and tables["noises"].empty
+    assert tables["missing"]["noise"].tolist() == [""]
+    assert "no finished baseline on Hopper-v5" in capsys.readouterr().out
 
 
-def test_a_study_has_arguments_that_some_of_its_runs_have(tmp_path):
-    for seed in range(1, 11):
-        gamma, values = (0.99, [10, 20]) if seed <= 4 else (0.9, [5] if seed <= 7 else [5, 6, 7])
-        write_run(tmp_path / "runs", values, seed=seed, gamma=gamma)
-    runs = read_runs(tmp_path / "runs")
-    assert set(runs.loc[runs["status"] == "finished", "seed"]) == {1, 2, 3, 4}
+# ------------------------------------------------------------------------------- what is one study
+
+
+@pytest.mark.parametrize(
+    ("change", "study"),
+    [
+        ({"exp_name": "other"}, ("SAC", "other", "", "")),
+        ({"algorithm": "MY_REDQ"}, ("MY_REDQ", "my_redq_continuous_noisy", "", "")),
+    ],
+)
+def test_studies_never_share_a_row(change, study, tmp_path):
+    for seed in (1, 2):
+        write_run(tmp_path / "runs", [10], seed=seed, folder=f"a{seed}")
+        write_run(tmp_path / "runs", [99], seed=seed, folder=f"b{seed}", **change)
+        write_run(tmp_path / "runs", [50], seed=seed, folder=f"c{seed}", noise=SCALE, rate=0.1)
+    tables = run(tmp_path, drawn=True)
+    summary = pd.concat([t for name, t in tables.items() if name.startswith("summary_")])
+    assert list(summary["n"]) == [2, 2, 2] and sorted(summary["std"]) == [0, 0, 0]
+    other = row(summary, **dict(zip(STUDY, study, strict=True)))
+    assert other["mean"] == 99 and np.isnan(other["difference_percent"])
+    assert row(summary, noise=SCALE)["baseline_mean"] == 10
 
 
 def test_the_most_frequent_arguments_of_an_exp_name_are_its_study(tmp_path, capsys):
@@ -66,50 +183,128 @@ def test_the_most_frequent_arguments_of_an_exp_name_are_its_study(tmp_path, caps
     write_run(tmp_path / "runs", [5], seed=4, gamma=0.9, env="Pusher-v5")  # a short trial
     write_run(tmp_path / "runs", [5], seed=5, gamma=0.9, exp_name="trial")
     write_run(tmp_path / "runs", [5], seed=6, gamma=0.9, finished=False)
-    runs = read_runs(tmp_path / "runs")
-    [reason] = reasons(runs).values()
-    assert reason == (
-        "gamma is 0.9, not 0.99, total_timesteps is 10000, not 20000 as in the runs of "
-        "sac_continuous_noisy that count: give such runs another --exp-name"
-    )
-    studies, _ = make_studies(runs)
+    entries = read_runs(tmp_path / "runs")
+    [reason] = status_of(entries, "different").values()
+    assert "gamma is 0.9, not 0.99" in reason and "total_timesteps is 10000, not 20000" in reason
+    assert "another --exp-name" in reason
+    studies, _ = make_studies(entries)
     assert [study.name for study in studies] == ["SAC", "SAC [trial]"]
-    assert studies[0].environments == ["Hopper-v5"] and studies[0].steps.tolist() == [10000, 20000]
-    tables = run(tmp_path)
-    assert reason in set(tables["missing"]["reason"])
-    assert set(tables["missing"]["environment"]) == {"Hopper-v5", "Pusher-v5"}  # no baseline there
+    assert reason in set(run(tmp_path)["missing"]["reason"])
     assert "1 different" in capsys.readouterr().out
 
 
-def test_an_argument_that_a_run_lacks_is_no_difference(tmp_path):
-    """Older versions lack some; the most frequent arguments may be those of no version alone."""
-    for seed, more in enumerate(
-        [{}, {}, {}, {"new": 1}, {"new": 1}, {"new": 2}, {"newer": None, "new": 1}, {"newer": 3}]
-    ):
-        write_run(tmp_path, [10], seed=seed, **more)
-    assert {seed: text.split(" as")[0] for seed, text in reasons(read_runs(tmp_path)).items()} == {
+def test_a_study_has_arguments_that_some_of_its_runs_have(tmp_path):
+    """Not a mixture; of equally frequent ones, those of the longest runs."""
+    for seed in range(1, 11):
+        gamma, values = (0.99, [10, 20]) if seed <= 4 else (0.9, [5] if seed <= 7 else [5, 6, 7])
+        write_run(tmp_path / "a", values, seed=seed, gamma=gamma)
+    assert list(status_of(read_runs(tmp_path / "a"), "finished")) == [1, 2, 3, 4]
+    write_run(tmp_path / "b", [10, 20, 30], seed=1)
+    write_run(tmp_path / "b", [10], seed=2)
+    assert list(status_of(read_runs(tmp_path / "b"), "different")) == [2]
+
+
+def test_an_argument_that_a_run_of_0_3_lacks_is_no_difference(tmp_path):
+    more = [{}, {}, {}, {"new": 1}, {"new": 1}, {"new": 2}]
+    more += [{"newer": None, "new": 1}, {"newer": 3}]
+    for seed, args in enumerate(more):
+        write_run(tmp_path, [10], seed=seed, **args)
+    found = status_of(read_runs(tmp_path), "different")
+    assert {seed: text.split(" as")[0] for seed, text in found.items()} == {
         5: "new is 2, not 1",
         7: "newer is 3, not None",
     }
 
 
-def test_of_equally_frequent_arguments_those_of_the_longest_runs_are_the_study(tmp_path):
-    write_run(tmp_path, [10, 20, 30], seed=1)
-    write_run(tmp_path, [10], seed=2)
-    assert list(reasons(read_runs(tmp_path))) == [2]
+def test_an_argument_that_a_run_lacks_had_the_default_that_others_name(tmp_path):
+    """Also where most runs have another value; tuples are lists, text and None are values."""
+    layers = NEW | {"defaults": {"layer_norm": False, "sizes": [256, 256]}}
+    own = {"layer_norm": True, "sizes": [256, 256], "name": None}
+    for seed in (1, 2, 3):
+        write_run(tmp_path, [10], seed=seed, config=layers, **own)
+    write_run(tmp_path, [10], seed=4, config=NEW)  # before there was the option
+    write_run(tmp_path, [10], seed=5, config=layers, **own | {"layer_norm": False})
+    found = status_of(read_runs(tmp_path), "different")
+    assert found.keys() == {4, 5}
+    assert found[4].startswith("layer_norm is False, not True")
 
 
-def test_averages_over_environments_take_the_newest_version_of_each_and_say_so(tmp_path):
+def test_runs_of_two_releases_are_never_pooled(tmp_path, capsys):
+    for seed in (1, 2, 3):
+        write_run(tmp_path / "runs", [10], seed=seed, config=NEW)
+    write_run(tmp_path / "runs", [99], seed=4)
+    [reason] = status_of(read_runs(tmp_path / "runs"), "different").values()
+    assert reason.startswith("of release 0.3, whose numbers differ from those of 0.4")
+    assert "finish a study with one release, or give its runs another --exp-name" in reason
+    assert run(tmp_path)["summary_SAC"]["mean"].tolist() == [10]
+    assert "of release 0.3" in capsys.readouterr().out
+
+
+def test_where_runs_were_tested_is_said_and_tells_studies_apart(tmp_path, capsys):
+    tested = {"test_noise": ["RandomActionDelay(1)"], "test_noise_rate": [1.0]}
+    root = tmp_path / "runs"
+    write_pairs(root, range(101, 106), range(201, 206), **tested)
+    write_run(root, [1.0], seed=9, test_noise=[], test_noise_rate=[])
+    tables = run(tmp_path)
+    assert "SAC [tested under RandomActionDelay(1) at 1.0] on Hopper-v5" in capsys.readouterr().out
+    assert set(tables["noises"]["tested"]) == {"tested under RandomActionDelay(1) at 1.0"}
+    assert tables["missing"]["status"].tolist().count("different") == 1
+    assert "tested under RandomActionDelay(1)" in (tmp_path / "results/noises.md").read_text()
+
+
+def test_versions_of_an_environment_are_environments_and_a_note_says_so(tmp_path):
+    for env in ("Hopper-v4", "Hopper-v5", "Walker2d-v4"):
+        write_pairs(tmp_path, [100, 101], [110, 111], env=env)
+    [note] = notes_of(tmp_path)
+    assert "Hopper-v4 and Hopper-v5 count as environments of their own" in note
+
+
+def test_paths_threads_and_evaluation_steps_do_not_split_rows(tmp_path):
+    versions = {"versions": {"mujoco": "3.14.0"}}
+    write_run(tmp_path, [1, 2, 3, 4], seed=1)
+    write_run(tmp_path, [6, 8], seed=2, every=20_000, torch_threads=4, cuda=True)
+    write_run(tmp_path, [1, 2, 3, 5], seed=3, runs_dir="x", config=versions)
+    entries = read_runs(tmp_path)
+    (study,), notes = make_studies(entries)
+    assert study.algorithm == "SAC" and study.steps.tolist() == [20_000, 40_000]
+    assert study.curves[BASELINE][:, :, 0].tolist() == [[2, 6, 2], [4, 8, 5]]
+    assert "cut to those that all share, 2 of up to 4" in notes[0]
+    notes = version_notes(entries)
+    assert any("with different mujoco" in note and "3.14.0 (n = 1)" in note for note in notes)
+
+
+def test_a_run_that_ended_by_itself_counts_with_its_own_last_tests(tmp_path):
+    """And extra tests at other steps stand in no curve."""
     for seed in (1, 2):
-        for env in ("Hopper-v4", "Hopper-v5", "Walker2d-v4"):
-            write_run(tmp_path / "runs", [10 if env == "Hopper-v4" else 100], env=env, seed=seed)
-            level = 1 if env == "Hopper-v4" else 110
-            write_run(tmp_path / "runs", [level], env=env, seed=seed, noise=SCALE, rate=0.1)
-    statistics = run(tmp_path)["statistics"]
-    average = statistics[statistics["scope"] == "all"]
-    assert list(average["environments"]) == [2] and average["difference_percent"].item() == 10
-    _, notes = make_studies(read_runs(tmp_path / "runs"))
-    assert notes == [
-        "SAC [environments v4] is apart, because averages over environments take the newest "
-        "version of each: Hopper-v4"
-    ]
+        write_run(tmp_path, [10 * seed] * 10, seed=seed)
+    folder = write_run(tmp_path, [1, 2, 3, 4], seed=3, total_timesteps=100_000)
+    text = (folder / "eval.csv").read_text().replace("\n40000,", "\n34567,")
+    (folder / "eval.csv").write_text(text)
+    (study,), notes = make_studies(read_runs(tmp_path))
+    assert study.finals[BASELINE].ravel().tolist() == [10, 20, 3.5]  # 30,000 is in its last 15 %
+    assert study.steps.tolist() == [10_000 * i for i in range(1, 11)]
+    curve = study.curves[BASELINE][:, 2, 0]
+    assert curve[:3].tolist() == [1, 2, 3] and np.isnan(curve[3:]).all()
+    assert "ended by themselves before their 100,000 steps: 1 of 3, at step 34,567" in notes[0]
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "said"),
+    [
+        ({"git_commit": 40 * "1"}, {"git_commit": 40 * "1" + "-dirty"}, "1111111111-dirty (n = 1)"),
+        ({"script_sha256": 64 * "a"}, {"script_sha256": 64 * "b"}, "different texts of sac_cont"),
+        ({"script_sha256": 64 * "a"}, {"script_sha256": f"{64 * 'a'}, {64 * 'b'}"}, "bbbb (n = 1)"),
+    ],
+)
+def test_runs_of_different_code_are_noted(one, other, said, tmp_path):
+    for seed, config in enumerate((one, other)):
+        write_run(tmp_path, [1], seed=seed, config=config)
+    entries = read_runs(tmp_path)
+    [note] = version_notes(entries)
+    assert said in note
+    assert make_studies(entries)[0][0].finals[BASELINE].shape == (2, 1)  # both count
+
+
+def test_success_that_is_told_by_nobody_makes_no_study(tmp_path):
+    write_run(tmp_path, [1.0])
+    assert make_studies(read_runs(tmp_path), SUCCESS) == ([], [])

@@ -2,16 +2,19 @@
 
 import re
 from itertools import combinations
-from pathlib import Path
+from math import nan, sqrt
 
 import numpy as np
 import pytest
 import simulate_choose
 from scipy import stats
+from sweeps import ROOT
 
-from analysis import statistics
+from analysis import permutation, statistics
+from analysis.power import detectable_shift
+from analysis.verdicts import MOST_RATIO_OF_RATES, is_lopsided
 
-DOCS = Path(__file__).parents[2] / "docs/statistics.md"
+DOCS = ROOT / "docs/statistics.md"
 NAN, INF = float("nan"), float("inf")
 
 
@@ -90,11 +93,11 @@ def test_random_divisions_where_there_are_too_many(monkeypatch):
     a, b = rng.normal(0.8, 1, (6, 2)), rng.normal(0, 1, (5, 2))
     cases = [(a[:, :1], b[:, :1]), (a[:4], b[:4]), (stacked(a[:2, 0], a[:, 1]), b)]
     exact = [statistics.permutation_t(*case)[1] for case in cases]
-    monkeypatch.setattr(statistics, "MOST_PARTITIONS", 60)
-    statistics.partitions.cache_clear()
+    monkeypatch.setattr(permutation, "MOST_PARTITIONS", 60)
+    permutation.partitions.cache_clear()
     drawn = [statistics.permutation_t(*case) for case in cases]
     far = statistics.permutation_t(a + 100, b)
-    statistics.partitions.cache_clear()
+    permutation.partitions.cache_clear()
     ps = [p for _, p, _ in drawn]
     assert ps != exact and ps == pytest.approx(exact, rel=0.1)
     assert far[1:] == (2e-5, 2e-5)  # the actual one and its opposite, never zero
@@ -120,12 +123,6 @@ def test_an_environment_where_runs_hardly_differ_decides_no_more_than_others():
         assert comparison.p < 0.01
 
 
-def test_noise_that_always_solves_what_was_never_solved_is_as_clear_as_can_be():
-    x, y = stacked(*5 * [[100] * 5]), stacked(*5 * [[0] * 5])
-    comparison = statistics.compare(x, y)
-    assert comparison.p == comparison.smallest_p == pytest.approx(2e-5)
-
-
 # ------------------------------------------------------------------------------------- comparisons
 
 
@@ -134,10 +131,14 @@ def test_a_comparison_by_hand():
     found = statistics.compare(x, y)
     welch = stats.ttest_ind(x, y, equal_var=False)
     assert (found.n, found.n_baseline, found.difference) == (5, 6, 4)
-    assert found[5:7] == pytest.approx(welch.confidence_interval(0.95))
-    assert found.difference_percent == pytest.approx(40) and found.t == pytest.approx(
-        4 / np.sqrt(2.5 / 5 + 2 / 6)
-    )
+    limits = found.difference_low, found.difference_high
+    assert limits == pytest.approx(welch.confidence_interval(0.95))
+    assert found.t == pytest.approx(4 / sqrt(2.5 / 5 + 2 / 6))
+    assert found.difference_percent == pytest.approx(40)
+    look = statistics.compare(x, y, level=0.001)  # of a sequence: the repeated interval
+    limits = look.difference_low, look.difference_high
+    assert limits == pytest.approx(welch.confidence_interval(0.999)) and look.p == found.p
+    assert (look.percent_low, look.percent_high) == statistics.fieller(x, y, 0.001)
     assert found.effect_size == pytest.approx(4 / np.sqrt((2.5 + 2) / 2))
     # Power: the noncentral t of 9 degrees of freedom, with Welch's standard error
     shift = found.detectable / np.sqrt(2.5 / 5 + 2 / 6)
@@ -154,18 +155,11 @@ def test_rounding_errors_are_no_difference():
     assert x.mean() != y.mean()
     found = statistics.compare(x, y)
     assert (found.difference, found.effect_size, found.pooled_std, found.p) == (0, 0, 0, 1)
-    assert found.seeds_needed == np.inf
     x, y = np.full(5, 0.95), np.full(10, 0.95)
     assert statistics.compare(x, y)[4:7] == (0, 0, 0)  # the difference and its interval
     two = statistics.compare(np.full((3, 2), [0.95, 0.7]), np.full((5, 2), [0.95, 0.7]))
     assert (two.effect_size, two.t, two.p) == (0, 0, 1)
     assert np.isnan(statistics.exact(np.nan, x))
-
-
-def test_an_iqm_that_may_be_drawn_as_zero_has_no_interval_of_its_change(recwarn):
-    x, y = np.array([[0.0, 1, 1, 1, 1]] * 2).T, np.array([[0.0, 0, 1, 1, 1, 1, 1, 1]] * 2).T
-    value, low, high = statistics.bootstrap_iqm(x, y)
-    assert np.isfinite(value) and np.isnan([low, high]).all() and not recwarn.list
 
 
 def test_over_environments_effects_are_averaged_and_percent_where_all_have_it():
@@ -179,24 +173,142 @@ def test_over_environments_effects_are_averaged_and_percent_where_all_have_it():
     assert found.difference_percent == pytest.approx(100 * 5 / 115)
 
 
+# ------------------------------------------------------------------------------------- percentages
+
+
 @pytest.mark.parametrize(
-    ("baseline", "percent"),
+    ("baseline", "others", "percent"),
     [
-        ([100, 110, 120], 10 / 1.1),
-        ([-100, -110, -120], 10 / 1.1),
-        ([1e-9, 1.1e-9, 1.2e-9], 10 / 1.1e-11),  # tiny, but clearly not zero
-        ([0, 0, 0], NAN),
-        ([-1e-6, 2e-6, 1e-6], NAN),
-        ([1, 2, 30], NAN),
-        ([5.0], 200),
-        ([5, 15], 100),
-        ([-5, 15], NAN),
-        ([], NAN),
+        ([100, 110, 120], [], 10 / 1.1),
+        ([-100, -110, -120], [], 10 / 1.1),
+        ([1e-9, 1.1e-9, 1.2e-9], [], 10 / 1.1e-11),  # tiny, but clearly not zero
+        ([0.5, 0.6, 0.7], [0.9, 1.0], 10 / 0.006),  # returns between 0 and 1
+        ([0, 0, 0], [], NAN),
+        ([-1e-6, 2e-6, 1e-6], [], NAN),
+        ([1, 2, 30], [], NAN),
+        ([5.0], [], 200),
+        ([5, 15], [], 100),
+        ([-5, 15], [], NAN),
+        ([], [1.0], NAN),
+        # Clearly not zero, but small beside what the returns span
+        ([-1e-5, -1.1e-5, -1.2e-5], [92.0], NAN),
+        ([9.9, 10, 10.1], [109.8], 100),
+        ([9.9, 10, 10.1], [110.1], NAN),
+        ([-9.9, -10, -10.1], [-110.1], NAN),
     ],
 )
-def test_percent_stands_where_the_baseline_is_clearly_not_zero(baseline, percent):
-    found = statistics.percent_of(10, np.array(baseline, float))
+def test_percent_stands_where_the_baseline_is_large(baseline, others, percent):
+    found = statistics.percent_of(10, np.array(baseline, float), others)
     assert found == pytest.approx(percent, nan_ok=True)
+
+
+def test_fiellers_limits_by_hand():
+    """mean x = 16, variance 10 / 5; mean y = 10, variance 2.5 / 5.
+
+    At the ratio 1.6 the variances are 2 and 1.28, so there are 3.28^2 / (4 / 4 + 1.6384 / 4) =
+    7.632 degrees of freedom, for which t = 2.32539 and t^2 = 5.40743. The limits of the ratio are
+    (160 +- sqrt(160^2 - (256 - 2 t^2) (100 - t^2 / 2))) / (100 - t^2 / 2)
+    = (160 +- sqrt(25600 - 245.18514 * 97.29628)) / 97.29628 = (160 +- 41.7618) / 97.29628.
+    """
+    x, y = np.array([12.0, 14, 16, 18, 20]), np.array([8.0, 9, 10, 11, 12])
+    limits = 100 * ((160 - 41.7618) / 97.29628 - 1), 100 * ((160 + 41.7618) / 97.29628 - 1)
+    assert statistics.fieller(x, y) == pytest.approx(limits, abs=0.01)
+    assert statistics.fieller(-x, -y) == pytest.approx((-limits[1], -limits[0]), abs=0.01)
+    found = statistics.compare(x, y)
+    assert (found.percent_low, found.percent_high) == statistics.fieller(x, y)
+    # An exact baseline: Welch's limits in percent of it
+    low, high = stats.ttest_1samp(x, 0).confidence_interval(0.95)
+    exact = statistics.fieller(x, np.full(5, 10.0))
+    assert exact == pytest.approx((10 * low - 100, 10 * high - 100))
+
+
+def test_fiellers_interval_is_cut_or_does_not_exist():
+    x, y = np.array([0.1, 0.2, 4.0]), np.array([8.0, 12, 10, 11])
+    assert statistics.fieller(x, y)[0] == -100  # positive returns
+    assert statistics.fieller(x - 1, y)[0] < -100
+    unbounded, nearly = np.array([1.0, 30, 5, 2, 3]), np.array([10.0, 18.5, 1, 5, 8])
+    assert np.isnan(statistics.fieller(y, unbounded)).all()
+    assert np.isnan(statistics.fieller(y, nearly)).all()  # it would reach beyond 1,000 %
+    assert np.isnan(statistics.fieller(x, np.array([-1.0, 1.0]))).all()
+
+
+@pytest.mark.parametrize("change", [-56, 90])
+def test_fiellers_coverage(change):
+    """Welch's limits in percent of a mean that is taken as known: 99.8 % and 88.5 %."""
+    rng, inside, trials = np.random.default_rng(0), 0, 1000
+    for _ in range(trials):
+        y, x = rng.normal(1, 0.3, 10), (1 + change / 100) * rng.normal(1, 0.3, 10)
+        low, high = statistics.fieller(x, y)
+        inside += low <= change <= high
+    assert 0.93 < inside / trials < 0.97
+
+
+# ------------------------------------------------------------------------------- rates of success
+
+
+def test_seeds_that_all_succeed_are_no_proof():
+    """(50 + 1) / (50 + 2) of the episodes, with one success and one failure more."""
+    x, y = np.full(5, 100.0), np.full(5, 0.0)
+    _, error, low, high = statistics.contrast([x, x], [1, -1], episodes=10)
+    assert error == pytest.approx(100 * sqrt(2 * 51 / 52 * 1 / 52 / 52))
+    assert low < 0 < high
+    found = statistics.compare(x, y, episodes=10)
+    assert found.difference_low < 100 == found.difference_high  # no more than 100 points
+    assert np.isnan(found.difference_percent)
+    spread = np.array([20.0, 50, 80, 90, 10])  # the seeds' own variance is larger
+    assert statistics.variance_of_mean(spread, 10) == spread.var(ddof=1) / 5
+
+
+@pytest.mark.slow
+def test_coverage_of_success_is_what_the_page_says():
+    rng = np.random.default_rng(0)
+
+    def alike(rate, n):
+        return 10.0 * rng.binomial(10, rate, n)
+
+    def spread(rate, n):  # as if five episodes of a seed decided for all
+        return 10.0 * rng.binomial(10, rng.beta(5 * rate, 5 - 5 * rate, n))
+
+    page = DOCS.read_text()
+    for name, draw in (("alike", alike), ("differ", spread)):
+        for with_noise, without in ((0.97, 0.97), (0.99, 0.9), (0.97, 0.8)):
+            cells = []
+            for n in (3, 5, 10):
+                inside = 0
+                for _ in range(1000):
+                    samples = draw(with_noise, n), draw(without, n)
+                    _, _, low, high = statistics.contrast(samples, [1, -1], episodes=10)
+                    inside += low - 1e-9 <= 100 * (with_noise - without) <= high + 1e-9
+                cells.append(inside / 10)
+            rates = f"{100 * with_noise:.0f} % and {100 * without:.0f} %"
+            [line] = re.findall(rf"^\| {name} \| {rates} \| (.*) \|$", page, re.MULTILINE)
+            said = [float(cell.rstrip(" %")) for cell in line.split(" | ")]
+            assert said == pytest.approx(cells, abs=2), (name, rates)
+
+
+# ------------------------------------------------------------------------------ what a run returns
+
+
+@pytest.mark.parametrize(
+    ("steps", "values", "expected"),
+    [
+        ([100], [7], 7),
+        (range(10, 101, 10), range(10), 8.5),  # those at 90 and 100
+        (range(5, 101, 5), range(20), 18),  # 90, 95, 100: 85 is not in the last 15 %
+        ([10, 50, 100], [1, 2, 3], 3),
+        ([10, 33, 36, 40], [1, 2, 3, 4], 3.5),  # ended by itself at 40
+    ],
+)
+def test_a_run_counts_with_its_last_tests(steps, values, expected):
+    found = statistics.final_value(np.array(steps), np.array(values, float))
+    assert found == pytest.approx(expected)
+
+
+def test_a_curve_reaches_a_target_with_the_runs_that_are_there():
+    curves = np.array([[1.0, 3], [4, 6], [9, nan]])
+    assert statistics.steps_to_reach(curves, [10, 20, 30], 5) == 20
+    assert statistics.steps_to_reach(curves, [10, 20, 30], 9) == 30
+    assert np.isnan(statistics.steps_to_reach(curves, [10, 20, 30], 10))
 
 
 # ------------------------------------------------------------------------------------------- power
@@ -213,15 +325,20 @@ def test_the_detectable_shift_is_found_in_80_percent_of_the_cases(n, m):
     assert (2 * above <= 0.05 + 1e-12).mean() == pytest.approx(0.8, abs=0.035)
 
 
-def test_seeds_needed_is_the_first_number_that_finds_the_shift():
-    assert np.isnan(statistics.detectable_shift(3, 3))  # the smallest possible p is 0.1
-    assert np.isnan(statistics.detectable_shift(4, 4, 0.02))
-    for shift in (3.0, 2.0, 1.2):
-        n = statistics.seeds_needed(shift)
-        assert statistics.detectable_shift(n, n) <= shift
-        assert n == 4 or not statistics.detectable_shift(n - 1, n - 1) <= shift
-    assert statistics.seeds_needed(0.3) == 176  # as G*Power's t-test
-    assert statistics.seeds_needed(0) == INF
+def test_what_no_number_of_seeds_can_show():
+    assert np.isnan(detectable_shift(3, 3))  # the smallest possible p is 0.1
+    assert np.isnan(detectable_shift(4, 4, 0.02))
+
+
+def test_holm_and_contrast_by_hand():
+    np.testing.assert_allclose(statistics.holm([0.04, 0.01, 0.03]), [0.06, 0.03, 0.06])
+    np.testing.assert_allclose(statistics.holm([0.6, 0.7]), [1, 1])
+    x, y = np.array([1.0, 2, 3, 4]), np.array([5.0, 9, 7])
+    found = statistics.contrast([x, y], [1, -1])
+    welch = stats.ttest_ind(x, y, equal_var=False)
+    assert found[:2] == pytest.approx((-4.5, np.sqrt(5 / 3 / 4 + 4 / 3)))
+    assert found[2:] == pytest.approx(tuple(welch.confidence_interval(0.95)))
+    assert np.isnan(statistics.contrast([x, y[:1]], [1, -1])[1:]).all()
 
 
 # -------------------------------------------------------------------- simulations of the comparison
@@ -241,15 +358,16 @@ RETURNS = {  # all with mean 0 and standard deviation 1
 }
 
 
-def simulated(n, draw, spread, draws=2000):
-    """Percent of comparisons of equal means, n against n, with p <= 0.05; coverage of intervals."""
+def simulated(n, m, draw, spread, draws=2000):
+    """Percent of comparisons of equal means, n against m, with p <= 0.05; coverage of intervals."""
     rng = np.random.default_rng(n)
-    values = np.concatenate([spread * draw(rng, (n, draws)), draw(rng, (n, draws))])
-    chosen = statistics.random_partitions(n, n, 999, rng) if n > 5 else statistics.partitions(n, n)
+    values = np.concatenate([spread * draw(rng, (n, draws)), draw(rng, (m, draws))])
+    few = n + m <= 10
+    chosen = permutation.partitions(n, m) if few else statistics.random_partitions(n, m, 999, rng)
     shares = statistics.tails(statistics.welch_t(values, chosen))
     x, y = values[:n], values[n:]
-    variances = [z.var(axis=0, ddof=1) / n for z in (x, y)]
-    _, half = statistics.satterthwaite(variances, np.full((2, 1), n))
+    variances = [z.var(axis=0, ddof=1) / len(z) for z in (x, y)]
+    _, half = statistics.satterthwaite(variances, np.array([[n], [m]]))
     covered = abs(x.mean(axis=0) - y.mean(axis=0)) <= half
     return 100 * (2 * np.minimum(*shares) <= 0.05 + 1e-12).mean(), 100 * covered.mean()
 
@@ -278,144 +396,41 @@ def test_mann_whitney_rejects_equal_means_where_the_spread_differs():
         )
 
 
+def cells_of(page, line):
+    """Return the numbers in the cells of a table's line that begins so."""
+    [cells] = re.findall(rf"^\| {line} \| (.*) \|$", page, re.MULTILINE)
+    return [float(cell.rstrip(" %")) for cell in cells.split(" | ")]
+
+
 @pytest.mark.slow
 def test_level_and_coverage_are_those_that_the_page_says():
     page = DOCS.read_text()
     for name, draw in RETURNS.items():
         for spread in (1, 0.5, 2):
-            assert simulated(3, draw, spread)[0] == 0  # no p is below 0.1
-            [line] = re.findall(rf"^\| {name} \| x {spread} \| (.*) \|$", page, re.MULTILINE)
-            said = [float(cell.rstrip(" %")) for cell in line.split(" | ")]
-            found = [simulated(n, draw, spread) for n in (5, 10, 25)]
+            assert simulated(3, 3, draw, spread)[0] == 0  # no p is below 0.1
+            found = [simulated(n, n, draw, spread) for n in (5, 10, 25)]
             levels, coverages = zip(*found, strict=True)
+            said = cells_of(page, f"{name} \\| x {spread}")
             assert said == pytest.approx([*levels, *coverages], abs=0.6), (name, spread)
 
 
-# --------------------------------------------------------------------- the interval of an IQM
+def rare_peak(rng, shape):
+    """One run in ten lies ten widths above the others."""
+    returns = rng.normal(0, 1, shape) + np.where(rng.random(shape) < 0.1, 10, 0)
+    return (returns - 1) / np.sqrt(1 + 100 * 0.1 * 0.9)
 
 
-def two_peaked(rng, shape, share, spread):
-    """Final returns of which a share lies around 1000, the others around 3000."""
-    return rng.normal(np.where(rng.random(shape) < share, 1000, 3000), spread)
-
-
-DISTRIBUTIONS = {
-    "normal": lambda rng, shape: rng.normal(3000, 500, shape),
-    "skewed": lambda rng, shape: 2000 * rng.lognormal(0, 0.5, shape),
-    "20 % low": lambda rng, shape: two_peaked(rng, shape, 0.2, 300),
-}
-MIXTURES = {  # the second is as narrow as the peaks of PPO on HalfCheetah
-    "40 % low": lambda rng, shape: two_peaked(rng, shape, 0.4, 300),
-    "40 % low, narrow": lambda rng, shape: two_peaked(rng, shape, 0.4, 100),
-}
-
-
-def covered(n, intervals, distributions=DISTRIBUTIONS, trials=500):
-    """Percent of samples of n seeds whose interval holds the true IQM: the worst distribution."""
-    worst = 100.0
-    for seed, draw in enumerate(distributions.values()):
-        rng = np.random.default_rng(seed)
-        truth = statistics.iqm(draw(rng, 400_000))
-        low, high = intervals(draw(rng, (trials, n)))
-        worst = min(worst, 100 * np.mean((low <= truth) & (truth <= high)))
-    return worst
-
-
-def ours(samples):
-    return np.array([statistics.bootstrap_iqm(sample[:, None])[1:] for sample in samples]).T
-
-
-def scipys(samples, method):
-    settings = {"n_resamples": 999, "method": method, "axis": -1, "rng": np.random.default_rng(0)}
-    done = stats.bootstrap((samples,), lambda x, axis: stats.trim_mean(x, 0.25, axis), **settings)
-    return done.confidence_interval
+UNEQUAL = [(3, 10), (5, 8), (5, 13), (5, 25), (5, 50), (10, 50), (30, 50)]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("n", "usual", "mixtures"), [(3, 94, 75), (5, 96, 85), (10, 95, 89)])
-def test_coverage_of_the_iqm_is_what_the_page_says(n, usual, mixtures):
-    assert int(covered(n, ours)) == usual
-    assert int(covered(n, ours, MIXTURES)) == mixtures
-    page = " ".join(DOCS.read_text().split())
-    assert f"| {n} | {usual} % | {mixtures} % |" in page
-
-
-@pytest.mark.slow
-def test_coverage_of_the_alternatives_at_five_seeds_is_lower():
-    for method in ("percentile", "basic", "BCa"):
-        assert covered(5, lambda samples, method=method: scipys(samples, method)) < 93
-    assert covered(5, ours) > 93
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [*DISTRIBUTIONS, *MIXTURES])
-def test_noise_that_does_nothing_improves_nothing(name):
-    """The IQM of skewed returns is not their mean; no improvement must come of that."""
-    rng, draw, found = np.random.default_rng(0), (DISTRIBUTIONS | MIXTURES)[name], []
-    for _ in range(200):
-        found.append(
-            statistics.bootstrap_iqm(draw(rng, (10, 5)), draw(rng, (10, 5)), resamples=200)
-        )
-    known = np.isfinite(found).all(axis=1)  # a baseline that may be zero has no percent
-    estimate, low, high = np.array(found)[known].T
-    assert known.mean() > 0.98
-    assert abs(estimate.mean()) < 3 * estimate.std() / np.sqrt(len(estimate))
-    assert ((low > 0) | (high < 0)).mean() <= 0.08
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("spread", [500, 50])
-def test_ten_noisy_seeds_do_not_make_up_for_three_of_the_baseline(spread):
-    """Percent of useless noises said to help or harm: 10 noisy seeds, 3 of the baseline.
-
-    With degrees of freedom of the noisy seeds alone, as is usual, it is 10 and 20 %.
-    """
-    rng, trials, wrong = np.random.default_rng(0), 500, 0
-    for _ in range(trials):
-        x, y = rng.normal(3000, spread, (10, 1)), rng.normal(3000, 500, (3, 1))
-        _, low, high = statistics.bootstrap_iqm(x, y, resamples=300)
-        wrong += low > 0 or high < 0
-    assert 100 * wrong / trials <= 7
-
-
-def test_satterthwaites_interval_of_three_seeds_is_welchs():
-    """With three seeds the IQM is the mean, so the bootstrap has a known limit: Welch's interval.
-
-    The baseline's IQM is far from zero: dividing by it then adds nothing.
-    """
-    x, y = np.array([[10.0], [40.0], [10.0]]), np.array([[0.0], [1.0], [5.0]])
-    base = 1e6
-    value, low, high = statistics.bootstrap_iqm(x + base, y + base, resamples=400_000)
-    welch = stats.ttest_ind(x[:, 0], y[:, 0], equal_var=False).confidence_interval(0.95)
-    assert value == pytest.approx(100 * 18 / base, rel=1e-4)
-    np.testing.assert_allclose([low, high], 100 * np.array(welch) / base, rtol=0.01)
-
-
-def test_iqm_is_scipys():
-    rng = np.random.default_rng(0)
-    for n in range(1, 12):
-        scores = rng.normal(size=(2, 3, n))
-        expected = stats.trim_mean(scores, 0.25, axis=-1)
-        np.testing.assert_allclose(statistics.iqm(scores), expected, rtol=1e-12)
-        scores[0, 1, 0] = np.nan
-        assert np.isnan(statistics.iqm(scores)).sum() == 1
-
-
-def test_seeds_that_are_all_alike_have_an_interval_of_one_point():
-    assert statistics.bootstrap_iqm(np.full((5, 1), 30.0), np.full((3, 1), 20.0)) == (
-        50,
-        50,
-        50,
-    )
-
-
-def test_an_iqm_has_no_percent_of_what_may_be_zero():
-    x, y = np.full((3, 2), 5.0), np.array([[10.0, -1], [11, 1], [12, 2]])
-    assert np.isnan(statistics.bootstrap_iqm(x, y)).all()
-    assert np.isfinite(statistics.bootstrap_iqm(x[:, :1], y[:, :1])).all()
-
-
-def test_the_change_of_an_iqm_is_relative_to_the_baselines_iqm():
-    """All returns are positive, so it is above -100 %, whatever the baseline's mean is."""
-    x, y = np.full((5, 1), 30.0), np.array([[3000.0], [3000], [3000], [3000], [100]])
-    assert statistics.bootstrap_iqm(x, y)[0] == pytest.approx(-99)
+def test_levels_of_unequal_numbers_of_seeds_are_those_that_the_page_says():
+    """And no verdict is given on a single rate where they are highest."""
+    page = DOCS.read_text()
+    for name, draw in (RETURNS | {"rare peak": rare_peak}).items():
+        for spread in (1, 2):
+            found = [simulated(n, m, draw, spread)[0] for n, m in UNEQUAL]
+            said = cells_of(page, f"{name} \\| x {spread} unequal")
+            assert said == pytest.approx(found, abs=1), (name, spread)
+    judged = [pair for pair in UNEQUAL if not is_lopsided(*pair, MOST_RATIO_OF_RATES)]
+    assert judged == [(5, 8), (30, 50)]

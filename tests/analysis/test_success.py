@@ -7,13 +7,15 @@ import numpy as np
 import pandas as pd
 import pytest
 import tyro
-from test_analyze import SCALE, row, run, write_run
+from sweeps import SCALE, row, run, write_run
 
 import analysis.robustness
-import analysis.runs
 import analyze
 import evaluate
 import ppo_continuous_noisy as ppo
+from analysis.folders import SUCCESS
+from analysis.runs import finished, read_runs
+from analysis.studies import make_studies
 
 ENV = "FetchReach-v4"
 PUSH, OTHER = "RandomNormalNoisyAction(0.3)", "RandomNormalNoisyObservation(0.1)"
@@ -39,22 +41,20 @@ def runs_dir(tmp_path):
 
 
 def test_rates_are_read_in_percent(runs_dir):
-    runs = analysis.runs.read_runs(runs_dir)
-    assert set(runs["status"]) == {"finished"}
-    [study], _ = analysis.runs.make_studies(runs, "success rate")
-    noisy = max(study.returns)
-    assert study.final(noisy)[:, 0].tolist() == [50, 100, 100, 100, 100]
-    assert study.returns[noisy][0, :, 0].tolist() == [0, 0, 0, 0, 0]
+    [study], _ = make_studies(read_runs(runs_dir), SUCCESS)
+    noisy = max(study.finals)
+    assert study.finals[noisy][:, 0].tolist() == [50, 100, 100, 100, 100]
+    assert study.curves[noisy][0, :, 0].tolist() == [0, 0, 0, 0, 0]
 
 
 def test_the_verdict_is_in_percentage_points(runs_dir, capsys):
     out = runs_dir / "out"
     analyze.main(analyze.Args(runs_dir, out, metric="success_rate"))
     said = capsys.readouterr().out
-    found = f"{ENV} with {SCALE} at rate 1.00 is better than no noise: +40 [12, 68] percentage "
-    assert f"{found}points of success, p = 0.048" in said
+    found = rf"{ENV} with {re.escape(SCALE)} at rate 1.00 is better than no noise: \+40 \[.*\]"
+    assert re.search(f"{found} percentage points of success, p = 0.048", said)
     assert not re.search(r"\(\+\d+ %\)", said)
-    for name in ("best.csv", "statistics.csv", "summary_SAC.csv"):
+    for name in ("best.csv", "noises.csv", "summary_SAC.csv"):
         lines = (out / name).read_text().splitlines()
         names = lines[0].split(",")
         for line in lines[1:]:
@@ -88,7 +88,7 @@ def test_returns_that_are_all_equal_say_nothing(tmp_path, capsys):
     said = capsys.readouterr().out
     told = "all tests of all runs return -50.00 in 20,000 steps, so they say nothing about noise"
     assert told in said and "success" not in tables
-    judged = row(tables["statistics"], noise=SCALE)
+    judged = row(tables["noises"], noise=SCALE)
     assert judged["verdict"] == "all equal" and np.isnan(judged["p"])
     assert "no clear difference" not in said and "+0.0 %" not in said
     with pytest.raises(SystemExit):
@@ -136,12 +136,12 @@ def test_a_run_that_tells_no_success_had_none(runs_dir):
         rows = [f",0.0,{i},-50.0,9{',1' if tells and i < 1 else ',' * tells}" for i in range(5)]
         text = "\n".join([header + ",success" * tells, *rows])
         (folder / "robustness.csv").write_text(text + "\n")
-    runs = analysis.runs.read_runs(runs_dir)
-    [study], notes = analysis.runs.make_studies(runs, "success rate")
-    assert study.final(max(study.returns))[:, 0].tolist() == [0, 0, 100, 100, 100]
+    entries = read_runs(runs_dir)
+    [study], notes = make_studies(entries, SUCCESS)
+    assert study.finals[max(study.finals)][:, 0].tolist() == [0, 0, 100, 100, 100]
     [note] = notes
     assert f"runs on {ENV} that never tell success, as others do, count as 0 %: 2 (" in note
-    table, _ = analysis.robustness.read_robustness(runs_dir, runs, "success rate")
+    table, _ = analysis.robustness.read_robustness(finished(entries), SUCCESS)
     assert table.sort_values("seed")["mean"].tolist() == [0, 0, 20, 20, 20]
 
 

@@ -6,24 +6,23 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
+import sweeps
 from scipy import stats
 
-from results.study import __main__, baselines, claims, compare, physics, returns
+from analysis.statistics import fieller
+from results.study import __main__, baselines, claims, compare, paper, physics, returns
 
 NOISE = "RandomNormalNoisyReward(1.0)"
-RESULT = {"train_return_mean_last_100": 0.0}
+SCALE = "RandomUniformScaleReward(0.5, 1.5)"
 
 
 def write_run(folder, test, noise="", rate=1.0, seed=1, env_id="Hopper-v5"):
     """Write what the study reads of a run: tests of 0 and `test` at steps 10 and 20."""
-    path = folder / f"{noise}-{rate}-{seed}-{env_id}"
-    path.mkdir(parents=True)
-    args = {"exp_name": "ppo_continuous_noisy", "env_id": env_id, "seed": seed}
-    args |= {"noise": [noise] if noise else [], "noise_rate": [rate] if noise else []}
-    (path / "config.json").write_text(json.dumps({"args": args | {"total_timesteps": 20}}))
-    (path / "result.json").write_text(json.dumps(RESULT | {"final_return_mean": test}))
-    rows = f"10,0,-1\n10,1,1\n20,0,{test - 1}\n20,1,{test + 1}\n"
-    (path / "eval.csv").write_text("step,episode,episodic_return\n" + rows)
+    noises = {"noise": noise, "rate": rate} if noise else {}
+    more = {"seed": seed, "env": env_id, "every": 10, "folder": f"{noise}-{rate}-{seed}-{env_id}"}
+    path = sweeps.write_run(folder, [0.0, test], "PPO", **noises, **more)
+    result = {"final_return_mean": test, "train_return_mean_last_100": 0.0}
+    (path / "result.json").write_text(json.dumps(result))
     return path
 
 
@@ -102,18 +101,24 @@ def test_a_comparison_by_hand():
     assert (found["n_without"], found["mean_without"]) == (4, -10)
     assert found["difference"] == 6 and found["difference_percent"] == pytest.approx(60)
     assert (found["low"], found["high"]) == pytest.approx(tuple(interval))
-    assert found["low_percent"] == pytest.approx(10 * found["low"])
+    assert (found["low_percent"], found["high_percent"]) == fieller(x, y)
     assert found["p"] == pytest.approx(2 / 35)
 
 
-def test_the_average_change_of_one_environment_is_welchs():
+def test_the_average_change_has_fiellers_interval_and_the_declared_test():
+    """Over environments the distances of the limits add up as the sides of a right angle do."""
     x, y = np.array([3.0, 5, 4, 9]), np.array([8.0, 12, 10])
     change, low, high, p = compare.average_change([(x, y)])
-    expected = stats.ttest_ind(x, y, equal_var=False)
-    limits = expected.confidence_interval(0.95)
-    assert [change, low, high] == pytest.approx([-47.5, 10 * limits.low, 10 * limits.high])
-    assert p == pytest.approx(expected.pvalue)
-    assert compare.average_change([(x, y), (x, y)])[0] == pytest.approx(change)
+    assert [change, low, high] == pytest.approx([-47.5, *fieller(x, y)])
+    assert p == pytest.approx(stats.ttest_ind(x, y, equal_var=False).pvalue)  # Welch's
+    twice = compare.average_change([(x, y), (x, y)])
+    expected = [change, change - (change - low) / np.sqrt(2), change + (high - change) / np.sqrt(2)]
+    assert twice[:3] == pytest.approx(expected)
+
+
+def test_no_average_of_positive_returns_is_below_minus_100_percent():
+    x, y = np.array([0.1, 0.2, 4.0]), np.array([8.0, 12, 10, 11])
+    assert compare.average_change([(x, y)])[1] == -100
 
 
 def test_a_set_is_compared_by_environment_and_together(data):
@@ -222,3 +227,30 @@ def test_committed_tables_are_those_of_the_committed_runs():
         computed = pd.read_csv(io.StringIO(__main__.as_csv(table)))
         committed = pd.read_csv(returns.RESULTS / f"tables/{name}.csv")
         pd.testing.assert_frame_equal(computed, committed, rtol=1e-3, atol=0.1, obj=name)
+
+
+def test_an_interval_that_does_not_exist_is_left_out():
+    ours = claims.row("c", "page", 5, (10.0, np.nan, np.nan), [(10, 0.5)], "5 + 5")
+    assert (ours["ours [95 %]"], ours["covered"]) == ("+10 %", "–")
+
+
+def test_the_papers_tables_stand_beside_ours(tmp_path):
+    """Rows match by noise as run; a difference needs equal steps."""
+    mixup = "RandomMixupObservation(0.5, recursive=True)"
+    rng = np.random.default_rng(0)
+    for seed in range(5):
+        for config in ({}, {"noise": mixup, "rate": 0.05}, {"noise": SCALE, "rate": 0.05}):
+            curve = 3000 + 500 * rng.normal(size=100)
+            sweeps.write_run(tmp_path, curve, env="Hopper-v5", seed=seed, **config)
+        sweeps.write_run(tmp_path, [5.0] * 5, env="Walker2d-v5", exp_name="short", seed=seed)
+    tables = paper.tables_of(tmp_path)
+    both = sweeps.row(tables["best"], environment="Hopper-v5", noise=mixup)
+    assert (both["n"], both["paper_mean"], both["paper_std"]) == (5, 3597.2, 164.6)
+    error = np.sqrt(both["std"] ** 2 / 5 + 164.6**2 / 5)
+    assert both["difference_se"] == pytest.approx((both["mean"] - 3597.2) / error)
+    short = sweeps.row(tables["best"], environment="Walker2d-v5", exp_name="short", noise="")
+    assert short["mean"] == 5 and np.isnan(short["difference_se"])
+    early = tables["early_performance"]
+    half = sweeps.row(early, environment="Hopper-v5", noise_rate="0.05", steps_millions=0.4)
+    assert half["paper_mean"] == 2863 and half["n"] == 5 and np.isfinite(half["difference_se"])
+    assert len(early) == 75 and len(tables["consistent"]) == 29  # the paper's rows

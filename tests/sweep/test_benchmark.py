@@ -27,6 +27,7 @@ import pytest
 import stub_run
 from views import ROOT, attempts, finish, folders, locked, log_of, view
 
+from noisy_wrappers import __version__
 from sweep import choose
 from sweep.options import parse_args
 
@@ -39,7 +40,7 @@ SCALE, BOTH = (
     "RandomNormalNoisyReward(1.0)+RandomEarlyTermination(1, 100)",
 )
 GRID = ["custom", "--algos", "sac", "--envs", "Pendulum-v1", "--seeds", "1"]
-GRID += ["--noises", SCALE, BOTH, "--noise-rates", "0.5"]
+GRID += ["--noises", SCALE, BOTH, "--noise-rates", "0.5", "--baseline-seeds", "1"]
 # SAC that never starts learning is the cheapest real run there is.
 CHEAP = "--no-compile --learning-starts 1000000000 --buffer-size 1000 --eval-episodes 1"
 CHEAP += " --eval-frequency 1000 --checkpoint-frequency 1000000000"
@@ -241,7 +242,8 @@ def engine(request, stub):
         return ["--executor", "parallel", *hosts], request.getfixturevalue("sshd")
     if request.param == "parallel":
         need("parallel")
-    return ["--executor", request.param, "--jobs", "2"], stub
+    # of what a user has set up, nothing changes a sweep
+    return ["--executor", request.param, "--jobs", "2"], stub | {"PARALLEL": "--dry-run -X"}
 
 
 @pytest.mark.slow
@@ -277,6 +279,25 @@ def test_a_failing_and_a_killed_run(engine, tmp_path):
     logs = {folder: log_of(folder).read_text() for folder in (fails, killed, good)}
     assert run(*grid, *executor, env=env).code == 0
     assert logs == {folder: log_of(folder).read_text() for folder in logs}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", [*ENGINES, SSH], indirect=True)
+def test_a_script_that_refuses_its_arguments_is_started_no_more(engine, tmp_path):
+    """Nor does it hinder another script."""
+    executor, env = engine
+    grid = ["baseline", "--algos", "sac", "ppo", "--envs", "Pendulum-v1", "--seeds", "1-4"]
+    grid += ["--total-timesteps", "40000", "--runs-dir", tmp_path]
+    (tmp_path / "refuse").touch()
+    result = run(*grid, *executor, env=env)
+    assert result.code == 1, result.err
+    said = "sac_continuous_noisy.py refused its arguments, so no more of its runs were started: "
+    assert f"{said}error: --gamma must be at most 1, not 2\n" in result.out
+    assert 1 <= len(list(tmp_path.glob("logs/*__sac_*.log"))) <= 3  # of those side by side
+    assert "8 runs: 4 done" in result.out and not list(tmp_path.glob("logs/.refused*"))
+    (tmp_path / "refuse").unlink()
+    again = run(*grid, *executor, env=env)
+    assert again.code == 0 and "8 runs: 8 done" in again.out, again.out + again.err
 
 
 @pytest.mark.slow
@@ -377,8 +398,10 @@ def test_a_machine_without_the_project(sshd, tmp_path):
 
 @pytest.mark.slow
 def test_slurm_requeues_before_the_time_limit(slurm, tmp_path):
-    grid = ["baseline", *GRID[1:7], "--total-timesteps", "500000", "--runs-dir", tmp_path / "50%A"]
-    (folder,) = folders(*grid)
+    """The last task of an array has the array's id, and is requeued alone."""
+    grid = ["baseline", *GRID[1:5], "--seeds", "1-2", "--total-timesteps", "500000"]
+    grid += ["--runs-dir", tmp_path / "50%A"]
+    runs = folders(*grid)
     grid += ["--executor", "slurm"]
     refused = run(*grid, "--slurm-args=--comment='hello", env=slurm)
     assert refused.code == 2 and "--slurm-args has a quote that does not end" in refused.err
@@ -387,13 +410,83 @@ def test_slurm_requeues_before_the_time_limit(slurm, tmp_path):
     (job,) = re.findall(r"scancel (\d+)$", submitted.err.strip())
     shown = output(["scontrol", "show", "job", job], slurm)
     assert "Comment=hello world" in shown and "Nice=7" in shown and "Requeue=1" in shown
-    wait_for(lambda: is_training(folder), what="the first evaluation")
+    wait_for(lambda: all(map(is_training, runs)), what="the first evaluations")
+    tasks = output(["squeue", "--noheader", "--array", "--format=%A %K"], slurm).splitlines()
+    (last,) = [line.split()[1] for line in tasks if line.split()[0] == job]
     # What --signal=B:USR1@180 has Slurm do three minutes before the limit.
-    subprocess.run(["scancel", "--batch", "--signal=USR1", job], env=slurm, check=True)
-    wait_for((folder / "result.json").exists, "the second attempt")
-    first, second = attempts(folder)
+    signal_it = ["scancel", "--batch", "--signal=USR1", f"{job}_{last}"]
+    subprocess.run(signal_it, env=slurm, check=True)
+    wait_for(lambda: all((run / "result.json").exists() for run in runs), "the second attempt")
+    first, second = attempts(runs[int(last)])
     assert first[-1].endswith("exit=143")
     assert second[0].startswith("resumed at step "), "not resumed"
+    assert len(attempts(runs[1 - int(last)])) == 1, "the other task was requeued, too"
+
+
+@pytest.fixture
+def no_slurm(tmp_path, stub):
+    """A Slurm that only writes down what it was asked: its environment, and that file."""
+    tools, asked = tmp_path / "bin", tmp_path / "asked"
+    tools.mkdir()
+    said = {
+        "sbatch": "echo 'Welcome to the cluster'; echo '12;big'; echo 'quota: 7 of 9'",
+        "scontrol": "echo 'MaxArraySize = 9'; echo 'MaxArraySize = 5'",
+        "squeue": f"echo 'CLUSTER: big'; grep -c squeue {asked} | grep -qx 1 && echo 12 || true",
+        "scancel": "",
+    }
+    for name, command in said.items():
+        (tools / name).write_text(f'#!/bin/sh\necho {name} "$@" >>{asked}\n{command}\n')
+        (tools / name).chmod(0o755)
+    return stub | {"PATH": f"{tools}:{PATH}"}, asked
+
+
+def test_slurm_with_several_clusters(no_slurm, tmp_path):
+    """Its programs are told which one; what a site prints beside an id is no part of it."""
+    env, asked = no_slurm
+    grid = ["baseline", *GRID[1:5], "--seeds", "1-6", "--runs-dir", tmp_path / "runs"]
+    result = run(*grid, "--executor", "slurm", "--wait", "--slurm-args", "-M big,small", env=env)
+    assert result.code == 1 and "submitted; to stop: scancel --clusters=big 12 12\n" in result.err
+    lines = asked.read_text().splitlines()
+    assert lines[0] == "scontrol --clusters=big,small show config"
+    assert [re.search(r"--array=\S+", line)[0] for line in lines if "sbatch" in line] == [
+        "--array=0-4",  # at most five, as on the smallest of the clusters
+        "--array=0-0",
+    ]
+    queues = [line for line in lines if line.startswith("squeue")]
+    assert len(queues) == 2 and all(
+        "--clusters=big" in line for line in queues
+    )  # 12 was there once
+    asked.write_text("")
+    sweep = start(*grid, "--executor", "slurm", "--wait", env=env | {"SBATCH_CLUSTERS": "big"})
+    wait_for(lambda: "squeue" in asked.read_text(), "the first look")
+    sweep.send_signal(signal.SIGINT)
+    sweep.communicate(timeout=PATIENCE)
+    lines = asked.read_text().splitlines()
+    assert lines[0] == "scontrol --clusters=big show config"
+    assert sweep.returncode == 130 and "scancel --clusters=big 12 12" in lines
+
+
+@pytest.mark.parametrize(
+    ("ids", "requeued"),
+    [
+        ({"SLURM_JOB_ID": "7", "SLURM_ARRAY_JOB_ID": "7"}, "7_1"),
+        ({"SLURM_JOB_ID": "8"}, "8"),
+    ],
+)
+def test_a_task_is_requeued_alone(ids, requeued, no_slurm, tmp_path):
+    env, asked = no_slurm
+    grid = ["baseline", *GRID[1:5], "--seeds", "1-2", *FOREVER, "--runs-dir", tmp_path / "runs"]
+    lines = tmp_path / "runs/logs/lines-host-1-2.tsv"
+    lines.parent.mkdir(parents=True)
+    listed = view("list", *grid).out.replace(sys.executable, env["PYTHON"])
+    lines.write_text(listed)
+    env = env | {"SLURM_ARRAY_TASK_ID": "1"} | ids
+    task = start("slurm-task", lines, "0", env=env)
+    folder = Path(listed.splitlines()[1].split("\t")[0])
+    wait_for(lambda: is_training(folder), "the run")
+    task.send_signal(signal.SIGUSR1)
+    task.communicate(timeout=PATIENCE)
+    assert task.returncode == 143 and asked.read_text() == f"scontrol requeue {requeued}\n"
 
 
 @pytest.mark.slow
@@ -420,6 +513,27 @@ def test_ctrl_c_while_arrays_are_submitted(program, slurm, tmp_path):
 
 
 # THE COMMAND
+
+
+@pytest.mark.slow
+def test_a_clone_of_windows_runs(tmp_path):
+    """Git for Windows writes the ends of lines as Windows has them, unless it is told not to."""
+    if not (ROOT / ".git").exists():
+        pytest.skip("no git here")
+    autocrlf = ["git", "-c", "core.autocrlf=true"]
+    clone = [*autocrlf, "clone", "--quiet", "--depth", "1", f"file://{ROOT}", tmp_path / "clone"]
+    subprocess.run(clone, check=True)
+    for name in ("benchmark.sh", "sweep/executors.sh", "Makefile", ".ci/run", "analyze.py"):
+        assert b"\r" not in (tmp_path / "clone" / name).read_bytes(), name
+    assert b"\r" in (tmp_path / "clone/README.md").read_bytes()  # as Git would do with all
+
+
+@pytest.mark.slow
+def test_a_list_needs_no_room_for_temporary_files(small_disk):
+    subprocess.run(f"dd if=/dev/zero of={small_disk}/filler bs=1k 2>/dev/null", shell=True)
+    env = ENV | {"TMPDIR": str(small_disk)}
+    result = run("paper", "--dry-run", "--runs-dir", ROOT / "none", env=env)
+    assert result.code == 0 and result.out.count("\n") == 9100, result.err
 
 
 @pytest.mark.slow
@@ -502,16 +616,26 @@ def test_choose_survives_being_killed(stub, tmp_path):
 
 
 @pytest.mark.slow
+def test_results_that_are_seen_late_are_waited_for(stub, tmp_path):
+    """As those of another machine on a network's file system; the next batch depends on them."""
+    command = [*CHOOSE[:-1], "--budget", "2", "--runs-dir", tmp_path, "--jobs", "4"]
+    result = run(*command, env=stub | {"STUB_HIDES": "3"})
+    assert result.code == 0 and len(verdicts(result.out)) == 1, result.out + result.err
+
+
+@pytest.mark.slow
 def test_a_failing_run_stops_its_choice_and_no_other(tmp_path, stub):
     command = [*CHOOSE[:-1], "--algos", "ppo", "sac", "--confirm", "5", "--budget", "2"]
     command += ["--runs-dir", tmp_path]
     result = run(*command, env=stub | {"STUB_FAILS": "*Dropout*ppo*"})
     assert result.code == 1 and "exit 1" in result.out and "error: this one fails" in result.out
-    assert "PPO on Pendulum-v1, round 1 of 1: 2 of 2 noises, seed 1; runs to do: 1" in result.out
+    assert (
+        "PPO on Pendulum-v1, round 1 of 1: 2 of 2 configurations, seed 1; runs to do: 1"
+        in result.out
+    )
     assert '--exclude "RandomDropoutObservation(0.9)@1.0"' in result.out
     assert verdicts(result.out)[-1] == (
-        "SAC on Pendulum-v1: all runs are done; the verdict comes with the others, for which p is "
-        "corrected"
+        "SAC on Pendulum-v1: all runs are done; the verdict comes with the others"
     )
     assert not (tmp_path / "choice.csv").exists()
     status = view("status", *command)
@@ -530,19 +654,15 @@ def test_a_choice_never_mixes_runs_with_other_options(tmp_path):
     play(*command)
     first = view("report", *command)
     assert first.code == 0 and "13 done" in first.out
-    for words in (command, [*command, "--confirm", "5"]):
-        other = view("list", *words, "--", "--gamma", "0.5")
-        assert other.code == 2 and not other.out and other.err.count("\n") == 1
-        assert "holds a finished run with --gamma 0.99, not 0.5; choose another" in other.err
+    other = view("list", *command, "--", "--gamma", "0.5")
+    assert other.code == 2 and not other.out and other.err.count("\n") == 1
+    assert "with other arguments: --gamma 0.99, not 0.5" in other.err
     same = view("report", *command, "--", "--no-compile", "--gamma", "0.990")
     assert (same.code, same.out) == (0, first.out)
-    tests = next(tmp_path.glob("search/p*__*/eval.csv"))  # one test fewer
-    lines = tests.read_text().splitlines(keepends=True)
-    tests.write_text("".join([lines[0], *lines[11:]]))
-    mixed = view("list", *command)
-    _, line = mixed.err.splitlines()  # after how fast the environment is
-    assert mixed.code == 2 and line.startswith("error: ")
-    assert "were not tested at the same steps: choose another --runs-dir" in line
+    old = next(tmp_path.glob("search/p*__*/config.json"))
+    old.write_text(old.read_text().replace(__version__, "0.3.1"))
+    shown = view("list", *command, "--confirm", "5")  # two runs would be due
+    assert shown.code == 2 and "1 run was made in" in shown.err and "by release 0.3" in shown.err
 
 
 # REPORTS AND ERRORS
@@ -572,9 +692,9 @@ def test_status_without_a_grid_reads_the_folder(tmp_path):
 
 
 def test_running_is_what_holds_the_lock(tmp_path):
-    grid = ["baseline", "--algos", "sac", "--envs", "Hopper-v5", "--seeds", "1-6"]
+    grid = ["baseline", "--algos", "sac", "--envs", "Hopper-v5", "--seeds", "1-7"]
     grid += ["--total-timesteps", "1000", "--runs-dir", tmp_path]
-    silent, testing, elsewhere, lost, moved, stopped = folders(*grid)
+    silent, testing, elsewhere, lost, moved, stopped, future = folders(*grid)
     log_of(silent).parent.mkdir()
     for folder, age, end in (
         (silent, 14, ""),
@@ -583,6 +703,7 @@ def test_running_is_what_holds_the_lock(tmp_path):
         (lost, 3, ""),
         (moved, 1, "# now host: exit=0\n"),
         (stopped, 1, "# now host: exit=130\n"),
+        (future, -999, ""),  # another machine's clock is wrong
     ):
         log_of(folder).write_text(f"# now host: python x.py\ncompiling ...\n{end}")
         os.utime(log_of(folder), (time.time() - 60 * age,) * 2)
@@ -590,11 +711,11 @@ def test_running_is_what_holds_the_lock(tmp_path):
         for words in (grid, ["--runs-dir", tmp_path]):
             status = view("status", *words)
             assert status.code == 0
-            assert "2 running, 1 probably running, 0 failed, 3 to do" in status.out
+            assert "2 running, 1 probably running, 0 failed, 4 to do" in status.out
             [line] = re.findall("  running, .*", status.out)
             assert re.search(rf"silent for 14 min +{log_of(silent)} +compiling", line)
         report = view("report", *grid).out
-        assert "2 running, 0 failed, 4 to do" in report and report.count("still running") == 2
+        assert "2 running, 0 failed, 5 to do" in report and report.count("still running") == 2
     assert not (lost / ".lock").exists()
 
 
@@ -918,6 +1039,17 @@ def test_an_environment_and_runs_in_the_callers_folder(tmp_path, stub):
     pasted = f"{line} --no-compile --eval-episodes 1"
     subprocess.run(pasted, shell=True, check=True, cwd=ROOT)
     assert result.exists()
+    # A script of one's own finds noisy_wrappers, in the sweep and when its line is pasted.
+    text = "import noisy_wrappers\nclass Args: pass\nprint('found it')\nraise SystemExit(3)\n"
+    (tmp_path / "redq_continuous_noisy.py").write_text(text)
+    own = ["baseline", "--algos", "redq", "--envs", "Pendulum-v1", "--seeds", "1"]
+    swept = run(*own, cwd=tmp_path, script=ROOT / "benchmark.sh")
+    assert swept.code == 1 and re.search(
+        r"exit 3 .*__redq_continuous_noisy.log +found it", swept.out
+    )
+    line = run(*own, "--dry-run", cwd=tmp_path, script=ROOT / "benchmark.sh").out
+    pasted = subprocess.run(line, shell=True, cwd=ROOT, capture_output=True, text=True)
+    assert (pasted.returncode, pasted.stdout) == (3, "found it\n")
     # A module of Python's own name is in nobody's way, and PYTHON may be relative, too.
     (tmp_path / "types.py").write_text("raise ImportError")
     (tmp_path / "env").symlink_to(Path(sys.executable).parents[1])

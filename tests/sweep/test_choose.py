@@ -14,45 +14,40 @@ import numpy as np
 import pytest
 import simulate_choose
 import stub_run
+from views import view
 
-from analysis.runs import CHOICE_COLUMNS
-from analysis.statistics import Comparison, holm
-from noisy_wrappers import BASELINE, Configuration, rounded
-from sweep import choose
+from analysis.choice import CHOICE_COLUMNS
+from analysis.formatting import rounded
+from analysis.statistics import compare, contrast
+from noisy_wrappers import BASELINE, Configuration
+from sweep import choose, telling
 from sweep.environment import Environment, remember
-from sweep.halving import (
-    FIRST_CONFIRMATION_SEED,
-    advance,
-    compare,
-    fewest_seeds,
-    helps,
-    records,
-    schedule,
-    score,
-    sentence,
-)
+from sweep.halving import FIRST_CONFIRMATION_SEED, Verdict, advance, judge, records, sizes_of_rounds
+from sweep.looks import Plan, bounds, futility_limits, looks_after, nominal_levels
 from sweep.options import parse_args
 
 SEARCH_SEEDS, CONFIRM = 50, 10  # columns of a table of returns
 A = "RandomNormalNoisyReward(1.0)"
+ONE_LOOK = Plan((CONFIRM,), 0.05)
+FIVE_LOOKS = Plan((5, 10, 15, 20, 25), 0.05)
 
 
 def named(count):
     return [Configuration.parse("noise", i) for i in range(count)]
 
 
-def play(noises, budget, table, confirm=CONFIRM):
+def play(noises, budget, table, plan=ONE_LOOK):
     """Run a choice to its end; table (noises, and the baseline last; seeds) holds the returns."""
     place = {noise: i for i, noise in enumerate([*noises, BASELINE])}
     returns = {}
-    state = advance(noises, budget, confirm, returns)
+    state = advance(noises, budget, plan, returns)
     while state.due:
         for noise, seed in state.due:
             column = seed - 1
             if seed >= FIRST_CONFIRMATION_SEED:
                 column = SEARCH_SEEDS + seed - FIRST_CONFIRMATION_SEED
             returns[noise, seed] = table[place[noise], column]
-        state = advance(noises, budget, confirm, returns)
+        state = advance(noises, budget, plan, returns)
     return state, returns
 
 
@@ -67,14 +62,14 @@ def draw(rng, effects):
 
 
 def test_schedule():
-    assert schedule(1, 3) == []
-    assert schedule(2, 6) == [(2, 3)]
+    assert sizes_of_rounds(1, 3) == []
+    assert sizes_of_rounds(2, 6) == [(2, 3)]
     # The shares of two rounds are 12 * 2 / (2 + 1.41) = 7.03 runs and 4.97: 1.8 and 2.5 a noise.
-    assert schedule(4, 12) == [(4, 2), (2, 2)]
-    assert schedule(5, 15) == [(5, 1), (3, 2), (2, 2)]
-    assert schedule(90, 270) == [(90, 1), (45, 1), (23, 2), (12, 3), (6, 4), (3, 5), (2, 6)]
-    assert schedule(16, 16) == [(16, 1), (8, 1), (4, 1), (2, 1)]  # never less than one seed
-    assert len(schedule(64, 640)) == 6 and len(schedule(65, 640)) == 7
+    assert sizes_of_rounds(4, 12) == [(4, 2), (2, 2)]
+    assert sizes_of_rounds(5, 15) == [(5, 1), (3, 2), (2, 2)]
+    assert sizes_of_rounds(90, 270) == [(90, 1), (45, 1), (23, 2), (12, 3), (6, 4), (3, 5), (2, 6)]
+    assert sizes_of_rounds(16, 16) == [(16, 1), (8, 1), (4, 1), (2, 1)]  # never less than one seed
+    assert len(sizes_of_rounds(64, 640)) == 6 and len(sizes_of_rounds(65, 640)) == 7
 
 
 def test_advance_by_hand():
@@ -82,7 +77,7 @@ def test_advance_by_hand():
     returns = {}
 
     def due():
-        return advance(noises, 7, 4, returns).due
+        return advance(noises, 7, Plan((4,), 0.05), returns).due
 
     # Rounds: 3 noises, 1 seed; 2 noises, 2 more
     assert due() == [(noise, 1) for noise in noises]
@@ -92,8 +87,8 @@ def test_advance_by_hand():
     assert due() == [(b, 2), (c, 2), (b, 3), (c, 3)]
     returns |= {(b, 2): 1.0, (b, 3): 3.0, (c, 2): 2.0, (c, 3): 2.0}
     # Of seeds 2 and 3 alone, both means are 2; of all seeds, b has 3 and c has 2.67.
-    state = advance(noises, 7, 4, returns)
-    assert state.noises == [b]
+    state = advance(noises, 7, Plan((4,), 0.05), returns)
+    assert state.candidates == [b]
     assert [done.survivors for done in state.rounds] == [[b, c], [b]]
     assert state.rounds[1].scores == {b: 3.0, c: pytest.approx(8 / 3)}
     assert state.seeds == range(1001, 1005)
@@ -113,15 +108,6 @@ def test_equal_scores_are_decided_by_the_order_given():
     assert play(noises, 15, table)[0].rounds[1].survivors == noises[:2]
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 90])
-def test_every_choice_takes_the_announced_number_of_runs(count):
-    rng = np.random.default_rng(count)
-    state, returns = play(named(count), 3 * count, draw(rng, rng.normal(0, 0.1, count)))
-    search = sum(noises * seeds for noises, seeds in schedule(count, 3 * count))
-    assert len(returns) == search + 2 * CONFIRM
-    assert len(state.noises) == 1 and len(state.rounds) == math.ceil(math.log2(count))
-
-
 def test_a_planted_noise_is_found_and_confirmed():
     rng = np.random.default_rng(0)
     for _ in range(10):
@@ -129,162 +115,158 @@ def test_a_planted_noise_is_found_and_confirmed():
         best = rng.integers(90)
         effects[best] = 1.5  # five standard deviations of a seed
         state, returns = play(named(90), 270, draw(rng, effects))
-        assert state.noises == [named(90)[best]]
-        comparison = compare(state.noises[0], state.seeds, returns)
-        assert helps(comparison, comparison.p)
+        assert state.candidates == [named(90)[best]]
+        assert judge(state, ONE_LOOK, returns).helps
 
 
 def test_the_choice_is_as_good_as_a_grid_of_ten_seeds():
-    """By the simulation, which the next test compares with the search."""
-    rng, choices = np.random.default_rng(0), 2000
-    effects = rng.normal(0, 0.1, (choices, 90))
-    returns = effects[..., None] + rng.normal(0, 0.3, (choices, 90, SEARCH_SEEDS))
-    chosen = simulate_choose.search(returns, schedule(90, 270))
-    grid = returns[..., :10].mean(axis=-1).argmax(axis=-1)
-    numbers = np.arange(choices)
-    assert effects[numbers, chosen].mean() >= effects[numbers, grid].mean()
+    rng, chosen, grid = np.random.default_rng(0), [], []
+    for _ in range(300):
+        effects = rng.normal(0, 0.1, 90)
+        table = draw(rng, effects)
+        [winner] = play(named(90), 270, table)[0].candidates
+        chosen.append(effects[named(90).index(winner)])
+        grid.append(effects[table[:90, :10].mean(axis=1).argmax()])
+    assert np.mean(chosen) >= np.mean(grid) - 0.01
 
 
-@pytest.mark.parametrize("count", [1, 3, 90])
-def test_the_simulation_searches_by_the_rule(count):
-    rng = np.random.default_rng(count)
-    tables = [draw(rng, rng.normal(0, 0.3, count)) for _ in range(40)]
-    winners = [play(named(count), 3 * count, table)[0].noises for table in tables]
-    searched = np.stack([table[:count, :SEARCH_SEEDS] for table in tables])
-    found = simulate_choose.search(searched, schedule(count, 3 * count))
-    assert [[named(count)[i]] for i in found] == winners
+# THE CONFIRMATION
 
 
-@pytest.mark.slow
-def test_the_simulation_confirms_by_the_test():
+def test_bounds_of_obrien_and_fleming():
+    """Five equal looks, two-sided 0.05, Lan and DeMets' error spending.
+
+    The figures are those of ldbounds and of R's gsDesign (sfLDOF), as in Jennison and Turnbull
+    (2000), "Group Sequential Methods", section 7.2; one look is the usual 1.96.
+    """
+    assert bounds(*FIVE_LOOKS) == pytest.approx([4.877, 3.357, 2.680, 2.290, 2.031], abs=5e-4)
+    assert bounds((25,), 0.05) == pytest.approx([1.95996], abs=1e-5)
+    assert nominal_levels(FIVE_LOOKS)[-1] == pytest.approx(0.0423, abs=1e-4)
+    assert bounds((20, 40), 0.05) == pytest.approx([2.963, 1.969], abs=1e-3)
+
+
+def test_all_looks_together_keep_the_level():
     rng = np.random.default_rng(0)
-    noisy, baseline = rng.normal(0.3, 0.3, (60, CONFIRM)), rng.normal(0, 0.3, (60, CONFIRM))
-    verdicts = []
-    for x, y in zip(noisy, baseline, strict=True):
-        noise = Configuration.parse("A", 1)
-        returns = {(noise, seed): value for seed, value in enumerate(x)}
-        returns |= {(BASELINE, seed): value for seed, value in enumerate(y)}
-        comparison = compare(noise, range(CONFIRM), returns)
-        verdicts.append(helps(comparison, comparison.p))
-    assert 0 < sum(verdicts) < 60
-    found = simulate_choose.confirmed(noisy, baseline, rng)  # with fewer partitions
-    assert np.mean(found != verdicts) <= 0.05
+    z = rng.standard_normal((200_000, 5)).cumsum(axis=1) / np.sqrt(np.arange(1, 6))
+    for level in (0.05, 0.0125):
+        passed = (np.abs(z) >= bounds(FIVE_LOOKS.looks, level)).any(axis=1).mean()
+        assert passed == pytest.approx(level, rel=0.03)
 
 
-@pytest.mark.parametrize("noises", [20, 90])
-def test_the_default_finds_and_confirms_what_docs_say(noises):
-    sizes = schedule(noises, 3 * noises)
-    found = [simulate_choose.simulate(noises, sizes, 25, gain, trials=4000) for gain in (1, 1.5)]
-    assert [confirmed for _, confirmed, _ in found] == pytest.approx([0.63, 0.90], abs=0.025)
+def test_looks_after():
+    assert looks_after(25) == (5, 10, 15, 20, 25) and looks_after(25, 1) == (25,)
+    assert (
+        looks_after(9) == (9,) and looks_after(12) == (6, 12) and looks_after(50, 3) == (17, 34, 50)
+    )
+
+
+def test_futility_by_hand():
+    """Hoped for is a gain that all seeds show in 9 of 10 cases: at the end z has the mean 3.24.
+
+    After 15 of 25 seeds the rest adds 0.4 * 3.24 on average, with deviation sqrt(0.4).
+    """
+    limit = futility_limits(*FIVE_LOOKS)[2]
+    ahead = 2.031 - limit * math.sqrt(0.6) - 0.4 * (1.95996 + 1.28155)
+    assert ahead / math.sqrt(0.4) == pytest.approx(0.5244, abs=2e-3)  # 30 % of a normal lie above
+
+
+def confirmation(noisy, baseline, plan=FIVE_LOOKS):
+    """Confirm one noise with these returns; return the state and the verdict at its end."""
+    table = np.zeros((2, SEARCH_SEEDS + len(noisy)))
+    table[:, SEARCH_SEEDS:] = noisy, baseline
+    state, returns = play(named(1), 3, table, plan)
+    assert set(returns) == {(n, s) for n in (*named(1), BASELINE) for s in state.seeds}
+    return state, judge(state, plan, returns)
+
+
+def test_a_confirmation_stops_at_a_look():
+    rng = np.random.default_rng(1)
+    base = rng.normal(0, 1, 25)
+    for gain, seeds, helped in ((3.0, 10, True), (-3.0, 5, False), (0.0, 10, False)):
+        state, verdict = confirmation(rng.normal(gain, 1, 25), base)
+        assert (len(state.seeds), verdict.helps, state.due) == (seeds, helped, [])
+        assert state.look == FIVE_LOOKS.looks.index(seeds) + 1
+    # the first look, at five seeds, can show no gain: 2 of 252 ways are not few enough
+    far = confirmation(100 + base, base)
+    assert len(far[0].seeds) == 10 and far[1].helps
+    assert len(confirmation(100 + base, base, Plan((25,), 0.05))[0].seeds) == 25
+
+
+def test_the_interval_is_that_of_the_look():
+    rng = np.random.default_rng(3)
+    noisy, base = rng.normal(2.5, 1, 25), rng.normal(0, 1, 25)
+    state, verdict = confirmation(noisy, base)
+    n = len(state.seeds)
+    needed = nominal_levels(FIVE_LOOKS)[state.look - 1]
+    _, _, low, high = contrast([noisy[:n], base[:n]], [1, -1], needed)
+    found = verdict.comparison
+    assert (found.difference_low, found.difference_high) == pytest.approx((low, high))
+    assert verdict.needed == needed < 0.05 and n < 25
+
+
+def test_advance_gives_the_same_whenever_it_is_asked():
+    """At any moment, whatever runs are there: it is a function of the returns."""
+    rng = np.random.default_rng(5)
+    table = rng.normal([[0.4], [0.0], [0.2], [0.0]], 1, (4, SEARCH_SEEDS + 25))
+    state, returns = play(named(3), 9, table, FIVE_LOOKS)
+    for _ in range(30):
+        known = {run: value for run, value in returns.items() if rng.random() < rng.random()}
+        while (now := advance(named(3), 9, FIVE_LOOKS, known)).due:
+            known |= {run: returns[run] for run in now.due[: rng.integers(1, 4)]}
+        assert now == state
+
+
+@pytest.mark.parametrize(
+    ("gain", "draw", "share", "runs"),
+    [(0, "normal", (0.012, 0.042), (28, 34)), (1, "normal", (0.89, 0.96), (32, 38))],
+)
+def test_the_simulation_of_a_confirmation(gain, draw, share, runs):
+    """A small one of tools/simulate_choose.py, whose tables are in docs/sweeps.md."""
+    draw = simulate_choose.DRAWS[draw]
+    _, _, claims, used = simulate_choose.simulate(1, simulate_choose.FIVE, gain, draw, trials=600)
+    assert share[0] <= claims <= share[1] and runs[0] <= used <= runs[1]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("draw", "spread"), [("normal", 1), ("high_peak", 0.5), ("failing", 2)])
-def test_useless_noises_are_claimed_to_help_in_at_most_four_percent(draw, spread):
-    """Also where they change the spread of the returns."""
-    draw = getattr(simulate_choose, draw)
-    _, _, claims = simulate_choose.simulate(1, [], 25, 0, draw, spread, trials=4000)
-    assert 0.012 <= claims <= 0.042
-    assert abs(draw(np.random.default_rng(0), 10**6).mean()) < 0.005
-
-
-def test_few_noises_are_chosen_no_worse_than_with_equal_rounds_and_ten_fresh_seeds():
-    now, before = schedule(4, 12), simulate_choose.equal_shares(4, 12)
-    for gain in (1.0, 1.5, 2.0):
-        _, old, _ = simulate_choose.simulate(4, before, 10, gain, trials=4000)
-        assert simulate_choose.simulate(4, now, 25, gain, trials=4000)[1] > old
-
-
-def test_a_run_scores_the_mean_of_its_tests_in_the_last_15_percent():
-    steps = np.arange(50_000, 1_000_001, 50_000)  # PPO: the last three
-    assert score(steps, np.arange(20)) == 18
-    steps = np.arange(10_000, 1_000_001, 10_000)  # SAC and TD3: the last fifteen
-    assert score(steps, np.arange(100)) == 92
-    assert score([50_000, 100_000], [1.0, 5.0]) == 5  # the other one is half-trained
+def test_the_default_finds_and_confirms_what_docs_say():
+    found = [
+        simulate_choose.simulate(22, simulate_choose.FIVE, gain, trials=500) for gain in (1, 1.5)
+    ]
+    assert [share[1] for share in found] == pytest.approx([0.60, 0.87], abs=0.06)
 
 
 # THE VERDICT
 
-
-def test_fewest_seeds():
-    # 2 / C(2n, n): 0.029 for 4, 0.0079 for 5, 0.0022 for 6
-    assert [fewest_seeds(verdicts) for verdicts in (1, 2, 6, 7)] == [4, 5, 5, 6]
-
-
-GOOD = Comparison(
-    environments=1,
-    n=10,
-    n_baseline=10,
-    n_baseline_most=10,
-    difference=11.8,
-    difference_low=8.4,
-    difference_high=15.3,
-    difference_percent=21.0,
-    effect_size=1.2,
-    pooled_std=9.8,
-    t=2.7,
-    p=0.011,
-    smallest_p=2e-5,
-    detectable=12.9,
-    seeds_needed=12,
-)
+GOOD = compare(np.arange(10.0) + 10, np.arange(10.0))._replace(p=0.011, t=2.7)
+GOOD = GOOD._replace(difference=11.8, difference_low=8.4, difference_high=15.3)
+GOOD = GOOD._replace(difference_percent=21.0, percent_low=15.0, percent_high=28.0)
 
 
 def test_verdicts_in_words():
     noise = Configuration.parse("RandomEarlyTermination(50)", 1.0)
-    name = "PPO on Pusher-v5"
-    assert sentence(name, noise, 90, GOOD, 0.011, 1) == (
+
+    def said(comparison, noises=90, share=0, seeds=10, planned=10, needed=0.05):
+        verdict = Verdict(comparison, seeds, planned, needed)
+        return telling.sentence("PPO on Pusher-v5", noise, noises, verdict, share)
+
+    assert said(GOOD) == (
         "PPO on Pusher-v5: RandomEarlyTermination(50) at 1.0 beats no noise: 10 fresh seeds, "
-        "+11.8 [8.4, 15.3] (+21 %), p = 0.011."
+        "+11.8 [8.4, 15.3] (+21 % [15, 28]), p = 0.011."
     )
-    assert not helps(GOOD, 0.06)
-    corrected = sentence(name, noise, 90, GOOD, 0.055, 5)
-    assert "none of 90 noises could be shown to help; the best of them, Random" in corrected
-    assert "p = 0.011, corrected for 5 verdicts 0.055; " in corrected
-    seen = "; with 10 seeds a difference of 12.9 would have been seen (80 % power"
-    assert corrected.endswith(f"{seen} before the correction).")
-    unclear = GOOD._replace(p=0.07, difference_low=-1.0)
-    assert sentence(name, noise, 90, unclear, 0.07, 1).endswith("(80 % power).")
-    # An interval with zero in it beside a p below 0.05 would look like a mistake
-    odd = " Borderline: the interval includes zero."
-    assert sentence("", noise, 90, unclear._replace(p=0.03), 0.03, 1).endswith(f"p = 0.03.{odd}")
-    odd = odd.replace("includes", "excludes")
-    assert sentence("", noise, 90, GOOD._replace(p=0.07), 0.07, 1).endswith(f"power).{odd}")
-    falling = Configuration.parse(A, "1.0:0.0")
-    assert f"{A} at 1.0 to 0.0 beats" in sentence("", falling, 2, GOOD, 0.011, 1)
-    assert sentence("PPO on X", noise, 1, unclear, 0.3, 1).startswith(
-        "PPO on X: RandomEarlyTermination(50) at 1.0 could not be shown to help: 10 fresh seeds, "
-    )
+    early = said(GOOD, planned=25, needed=0.0126, share=3)
+    assert "beats no noise: stopped after 10 of 25 planned fresh seeds, +11.8" in early
+    assert early.endswith("p = 0.011, needed: 0.013 (level shared by 3 verdicts).")
+    unclear = GOOD._replace(p=0.07, difference_low=-1.0, percent_low=-2.0)
+    told = said(unclear, needed=0.022)
+    assert "none of 90 configurations could be shown to help; the best of them, Random" in told
+    assert told.endswith("; excluded: a gain of more than 28 %, a loss of more than 2.0 %.")
+    assert "at 1.0 could not be shown to help: " in said(unclear, noises=1)
+    odd = " Borderline: the interval includes zero."  # beside such a p it looks like a mistake
+    assert said(unclear._replace(p=0.03)).endswith(odd)
+    assert said(GOOD._replace(p=0.07)).endswith(odd.replace("includes", "excludes"))
     bad = GOOD._replace(t=-2.7, difference=-11.8, difference_low=-15.3, difference_high=-8.4)
-    assert not helps(bad, bad.p)
-    assert "is worse than no noise: 10 fresh seeds, -11.8" in sentence("", noise, 9, bad, 0.01, 1)
-
-
-@pytest.mark.parametrize(
-    ("baseline", "expected"),
-    [
-        ([8.0, 9.0, 11.0, 12.0], "+3.5 (+35 %), p = 0.057 (smallest possible: 0.029); with 4"),
-        ([-1e-6, 0.0, 1e-6, 0.0], "beats no noise: 4 fresh seeds, +13.50, p = 0.029 (smallest"),
-        ([-12.0, -13.0, -14.0, -15.0], "+27.0 (+200 %), p = 0.029"),
-    ],
-)
-def test_a_comparison_by_hand(baseline, expected):
-    """The 12 is in both: with it exchanged, the difference is the same."""
-    noise = Configuration.parse("A", 0.1)
-    returns = {(noise, 1001 + i): value for i, value in enumerate([12.0, 13.0, 14.0, 15.0])}
-    returns |= {(BASELINE, 1001 + i): value for i, value in enumerate(baseline)}
-    found = compare(noise, range(1001, 1005), returns)
-    assert found.difference == pytest.approx(13.5 - np.mean(baseline)) and found.n == 4
-    assert expected in sentence("PPO on X", noise, 2, found, found.p, 1)
-
-
-def test_a_single_noise_that_harms():
-    noise = Configuration.parse("A", 0.1)
-    returns = {(noise, 1001 + i): float(i) for i in range(4)}
-    returns |= {(BASELINE, 1001 + i): 10.0 + i for i in range(4)}
-    found = compare(noise, range(1001, 1005), returns)
-    said = sentence("PPO on X", noise, 1, found, found.p, 1)
-    assert said.startswith("PPO on X: A at 0.1 is worse than no noise: 4 fresh seeds, -10")
+    assert "is worse than no noise: 10 fresh seeds, -11.8" in said(bad, noises=1)
+    assert not Verdict(bad, 10, 10, 0.05).helps and not Verdict(GOOD, 10, 10, 0.01).helps
 
 
 def test_records_of_choice_csv():
@@ -315,7 +297,7 @@ def arguments(text, tmp_path):
 def conclude(args):
     """What `report` does with a choice: write choice.csv, and say the verdicts, line by line."""
     with contextlib.redirect_stdout(io.StringIO()) as out:
-        choose.report(choose.choices(args), args)
+        telling.report(choose.choices(args), args)
     return out.getvalue().splitlines()
 
 
@@ -359,22 +341,15 @@ def test_two_algorithms_and_environments_at_once(tmp_path):
         for algorithm in ("PPO", "SAC")
         for env in ("Pendulum-v1", "MountainCarContinuous-v0")
     ]
-    shown = [re.search(r"p = ([.\d]+), corrected for 4 verdicts ([.\d]+)", s) for s in sentences]
-    p_values = [float(match[1]) for match in shown]
-    assert [float(match[2].rstrip(".")) for match in shown] == pytest.approx(
-        holm(p_values), rel=0.1
-    )
+    assert all("(level shared by 4 verdicts)" in sentence for sentence in sentences)
     lines = read(tmp_path / "choice.csv")
     assert len(lines) == 4 * (3 + 2 + 2)
     assert {line["noise_rate"] for line in lines} == {"0.0", "1.0", "0.3 + 1.0:0.0"}
-    for line in lines:  # a search counts a run's last two tests of ten, the confirmation the last
+    for line in lines:  # a run counts with its last two tests of ten
         noise = Configuration.parse(line["noise"], line["noise_rate"])
         run = line["algorithm"].lower(), line["environment"], *noise.texts
-        if line["round"]:
-            last = range(1, int(line["seeds"]) + 1)
-            wanted = [fmean(stub_run.tests_of(*run, seed)[-2:]) for seed in last]
-        else:
-            wanted = [stub_run.tests_of(*run, seed)[-1] for seed in range(1001, 1006)]
+        seeds = range(1, int(line["seeds"]) + 1) if line["round"] else range(1001, 1006)
+        wanted = [fmean(stub_run.tests_of(*run, seed)[-2:]) for seed in seeds]
         assert float(line["score"]) == pytest.approx(fmean(wanted))
 
 
@@ -393,7 +368,7 @@ def test_a_noise_is_chosen_by_the_rate_of_success(env_id, tmp_path):
     for line in lines[-2:]:
         noise = Configuration.parse(line["noise"], line["noise_rate"])
         last = [
-            stub_run.episodes_of("ppo", env_id, *noise.texts, seed)[-1]
+            stub_run.episodes_of("ppo", env_id, *noise.texts, seed)[-2:]
             for seed in range(1001, 1006)
         ]
         rates[noise] = 100 * np.mean(np.array(last) > 100)
@@ -438,35 +413,30 @@ def test_a_run_that_tells_no_success_had_none(tmp_path):
 
 
 def test_choose_stops_where_all_tests_are_equal(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(stub_run, "episodes_of", lambda *run: [[-50.0] * 10] * 10)
-    args = arguments(f"--algos | ppo | --envs | Pendulum-v1 | {THREE}", tmp_path)
+    """And an environment where they are stops no other."""
+    real, same = stub_run.episodes_of, [[-50.0] * 10] * 10
+    patched = lambda *run: same if "Car" in run[1] else real(*run)  # noqa: E731
+    monkeypatch.setattr(stub_run, "episodes_of", patched)
+    told = "PPO on MountainCarContinuous-v0: all tests of all runs return -50.00 in 4,000 steps"
+    args = arguments(f"--algos | ppo | --envs | MountainCarContinuous-v0 | {THREE}", tmp_path)
     with pytest.raises(SystemExit) as exit_:
         batches(args)
-    assert exit_.value.code == 1
+    assert exit_.value.code == 1 and f"error: {told} (runs: 6), so" in capsys.readouterr().err
     assert len(list(tmp_path.glob("*/*__*"))) == 6  # after the first round: two seeds of three
-    told = "PPO on Pendulum-v1: all tests of all runs return -50.00 in 4,000 steps (runs: 6), so"
-    assert f"error: {told}" in capsys.readouterr().err
-
-
-def test_an_environment_where_all_tests_are_equal_stops_no_other(tmp_path, monkeypatch, capsys):
-    real = stub_run.episodes_of
-    same = [[-50.0] * 10] * 10
-    monkeypatch.setattr(
-        stub_run, "episodes_of", lambda *run: same if "Car" in run[1] else real(*run)
-    )
     envs = "Pendulum-v1 | MountainCarContinuous-v0"
     args = arguments(f"--algos | ppo | --envs | {envs} | {THREE}", tmp_path)
     batches(args)
     [verdict] = conclude(args)
     assert verdict.startswith("PPO on Pendulum-v1: ")
-    told = "warning: PPO on MountainCarContinuous-v0: all tests of all runs return -50.00 in"
-    assert told in capsys.readouterr().err
+    assert f"warning: {told}" in capsys.readouterr().err
     assert len({line["environment"] for line in read(tmp_path / "choice.csv")}) == 1
 
 
 def test_the_readme_says_what_it_takes_by_default(tmp_path):
     text = " ".join((Path(__file__).parents[2] / "README.md").read_text().split())
-    pattern = r"takes (\d+) runs of a .*: about (\d+) core-hours with PPO and (\d+) with SAC in a"
+    pattern = (
+        r"takes at most (\d+) runs of a .*: about (\d+) core-hours with PPO and (\d+) with SAC in a"
+    )
     runs, *hours = map(int, re.search(pattern, text).groups())
     for algorithm, announced in zip(("ppo", "sac"), hours, strict=True):
         words = ["choose", "--algos", algorithm, "--envs", "Hopper", "--runs-dir", str(tmp_path)]
@@ -474,7 +444,7 @@ def test_the_readme_says_what_it_takes_by_default(tmp_path):
         known = Environment(0.05e-3, 200, 1000, 11, True, {})
         remember(args.runs_dir, "Hopper-v5", known)
         choices = choose.choices(args)
-        assert choose.total(choices, args).startswith(f"{runs} runs in all")
+        assert telling.total(choices, args).startswith(f"at most {runs} runs, ")
         assert runs * choices[0].run_seconds / 3600 == pytest.approx(announced, rel=0.1)
 
 
@@ -484,11 +454,12 @@ def test_the_default_noises_and_those_of_the_paper(tmp_path):
     def tried(more=""):
         args = parse_args("status", "/", f"{words} {more}".split())
         [choice] = choose.choices(args)
-        return choice.state.noises
+        return choice.state.candidates
 
-    assert len(tried()) == 20 and {noise.noise_rate for noise in tried()} == {"0.05", "1.00"}
-    assert len({noise.noise for noise in tried()}) == 10
-    assert not any(noise.noise == "RandomNormalNoisyObservation(1.0)" for noise in tried())
+    assert len(tried()) == 22 and {noise.noise_rate for noise in tried()} == {"0.05", "1.00"}
+    assert len({noise.noise for noise in tried()}) == 11
+    additive = [n.noise for n in tried() if re.match("RandomNormal|RandomUniformNoisy", n.noise)]
+    assert len(additive) == 10 and all("relative=True" in noise for noise in additive)
     assert [str(noise) for noise in tried("--noise-rates 0.2")] == [
         f"{noise.noise} at 0.2" for noise in tried()[::2]
     ]
@@ -505,7 +476,7 @@ def test_a_damaged_run_is_not_to_be_retried_or_excluded(tmp_path, capsys):
     path = choice.runs[choice.state.due[0]].folder / "eval.csv"
     path.write_text(path.read_text()[:-1])
     capsys.readouterr()
-    choose.report(choose.choices(args), args)
+    telling.report(choose.choices(args), args)
     [line] = capsys.readouterr().out.splitlines()
     assert line.endswith("runs to do: 1.")
 
@@ -514,11 +485,11 @@ def test_where_nothing_finishes_no_noise_is_to_be_excluded(tmp_path, capsys):
     args = arguments(f"--algos | ppo | --envs | Pendulum-v1 | {THREE}", tmp_path)
     [choice] = choose.choices(args)
     capsys.readouterr()
-    choose.report([choice], args)
+    telling.report([choice], args)
     out = capsys.readouterr().out
     assert "leave PPO on Pendulum-v1 out: see --algos and --envs" in out and "--exclude" not in out
     stub_run.train(choice.runs[choice.state.due[0]].command)
-    choose.report(choose.choices(args), args)
+    telling.report(choose.choices(args), args)
     assert capsys.readouterr().out.count("--exclude") == 3
 
 
@@ -529,11 +500,12 @@ def test_an_excluded_noise_is_no_other_choice(tmp_path):
         stub_run.train(choice.runs[run].command)
     excluded = f"{words} | --exclude | RandomEarlyTermination(50)@1"
     [choice] = choose.choices(arguments(excluded, tmp_path))
-    assert len(choice.returns) == 19
+    assert len(choice.returns) == 21
     # as `report` prints it, a line for each noise that fails
-    excluded += f" | --exclude | {A}@1 | {A}@1.0"
+    scale = "RandomUniformScaleReward(0.5, 1.5)"
+    excluded += f" | --exclude | {scale}@1 | {scale}@1.0"
     [choice] = choose.choices(arguments(excluded, tmp_path))
-    assert len(choice.returns) == 18
+    assert len(choice.returns) == 20
 
 
 def test_what_the_confirmation_can_show(tmp_path):
@@ -541,27 +513,28 @@ def test_what_the_confirmation_can_show(tmp_path):
 
     def lines(words):
         args = arguments(words, tmp_path)
-        plan = choose.plan(choose.choices(args), args)
+        plan = telling.before_a_batch(choose.choices(args), args)
         return [line for line in plan if "fresh seeds confirm" in line]
 
     unit = "standard deviations over seeds with 80 % power"
     assert lines(words) == [f"25 fresh seeds confirm a true gain of 0.8 {unit}"]
     [line] = lines(words.replace("ppo", "ppo | sac"))
-    assert line.endswith(f" 0.9 {unit}, corrected for 2 verdicts")
+    assert line.endswith(f" 0.9 {unit}, where 2 verdicts share the level")
     # Once there is a spread, in the return's own units
     two = f"{words} | RandomMixupObservation(0.5)@1 | --budget | 6 | --confirm | 5"
     [choice] = choose.choices(arguments(two, tmp_path))
     for run in map(choice.runs.get, choice.state.due):
         stub_run.train(run.command)
     tests = [
-        [stub_run.tests_of("ppo", "Pendulum-v1", [noise], [1.0], seed)[-1] for seed in (1, 2, 3)]
-        for noise in (A, "RandomMixupObservation(0.5)")
+        [
+            fmean(stub_run.tests_of("ppo", "Pendulum-v1", [n], [1.0], seed)[-2:])
+            for seed in (1, 2, 3)
+        ]
+        for n in (A, "RandomMixupObservation(0.5)")
     ]
     spread = math.sqrt(fmean(np.var(tests, axis=1, ddof=1)))
     [line] = lines(two)
-    gain, units = re.search(
-        r"of about ([\d.]+) \(([\d.]+) standard deviations of the", line
-    ).groups()
+    gain, units = re.search(r"of about ([\d.]+) \(([\d.]+) standard deviations over", line).groups()
     assert line.startswith("PPO on Pendulum-v1: 5 fresh seeds confirm a true gain of about ")
     assert float(gain) == pytest.approx(spread * float(units), rel=0.06)
     [choice] = choose.choices(arguments(two, tmp_path))
@@ -570,15 +543,58 @@ def test_what_the_confirmation_can_show(tmp_path):
     assert lines(two) == [line]
 
 
-def test_a_second_choice_takes_the_same_fresh_seeds(tmp_path, capsys):
-    words = f"--algos | ppo | --envs | Pendulum-v1 | --noises | {A}@1 | --confirm | "
-    assert [len(batch) for batch in batches(arguments(words + "4", tmp_path))] == [8]
-    [more] = batches(arguments(words + "6", tmp_path))
-    assert {re.search(r"_s(\d+)_", name)[1] for name in more} == {"1005", "1006"}
-    other = words.replace(A, "RandomMixupObservation(0.5)") + "6"
-    with pytest.raises(SystemExit):  # at once, not after its search
-        choose.choices(arguments(f"{other} | --total-timesteps | 8000", tmp_path))
-    assert "holds a finished run of 4000 steps" in capsys.readouterr().err
+def test_what_was_fixed_beforehand_is_kept(tmp_path, capsys):
+    """The looks and the level, before the first run of the confirmation, whatever comes later."""
+    one = f"--algos | ppo | --envs | Pendulum-v1 | --noises | {A}@1"
+
+    def listed(text):
+        args = arguments(text, tmp_path)
+        args.view = "list"
+        return choose.choices(args)
+
+    arguments(one, tmp_path)
+    assert not (tmp_path / "choice.json").exists()  # a status keeps nothing
+    [choice] = listed(f"{one} | --confirm | 10")
+    assert choice.plan == Plan((5, 10), 0.05)
+    for other in ("--confirm | 20", "--looks | 1 | --confirm | 10"):
+        with pytest.raises(SystemExit):
+            listed(f"{one} | {other}")
+        assert "its confirmation has begun, with 10 seeds and 2 looks" in capsys.readouterr().err
+    two = one.replace("Pendulum-v1", "Pendulum-v1 | MountainCarContinuous-v0")
+    first, second = listed(two)  # an environment is added
+    assert first.plan == choice.plan and second.plan == Plan((5, 10, 15, 20, 25), 0.025)
+    assert listed(one)[0].plan == choice.plan
+    by_success = "--envs | toy_envs:Success-v0 | --metric | success_rate"
+    assert listed(one.replace("--envs | Pendulum-v1", by_success))[0].plan.level == 0.05
+    (tmp_path / "choice.json").write_text("{")
+    with pytest.raises(SystemExit):  # it must not be decided anew
+        listed(one)
+    assert "which keeps the plan of a choice" in capsys.readouterr().err
+
+
+def test_fresh_seeds_that_ran_otherwise_are_refused_at_once(tmp_path, capsys):
+    words = f"--algos | ppo | --envs | Pendulum-v1 | --noises | {A}@1 | --confirm | 4"
+    batches(arguments(words, tmp_path))
+    other = words.replace(A, "RandomMixupObservation(0.5)") + " | --total-timesteps | 8000"
+    args = arguments(other, tmp_path)
+    args.view = "list"
+    with pytest.raises(SystemExit):  # not after its search
+        choose.choices(args)
+    assert "4 runs were made" in (said := capsys.readouterr().err)
+    assert "--total-timesteps 4000, not 8000" in said
+
+
+def test_a_status_finds_the_options_of_the_choice(tmp_path):
+    words = ["--algos", "ppo", "sac", "--envs", "Pendulum", "--noises", f"{A}@1", "--confirm", "6"]
+    words += ["--runs-dir", tmp_path]
+    assert view("list", "choose", *words, "--", "--gamma", "0.9").code == 0
+    asked = ("--algos ppo --envs Pendulum-v1", "--algos sac --envs Pendulum", "--algos sac", "")
+    shown = [view("status", "choose", *text.split(), "--runs-dir", tmp_path) for text in asked]
+    assert all(one.code == 0 and "24 runs in all" in one.out for one in shown)
+    assert len({one.out for one in shown}) == 1
+    assert "--algos and --envs" in view("status", "choose", "--algos", "td3", *words[-2:]).err
+    other = view("status", "choose", *words[:5], *words[-4:])  # whoever says more means it
+    assert "24 runs in all" not in other.out
 
 
 @pytest.mark.slow
@@ -609,7 +625,7 @@ def test_two_commands_that_end_side_by_side_keep_each_others_lines(tmp_path, mon
     line = ("x",) * len(CHOICE_COLUMNS)
     replace = os.replace
     fork = multiprocessing.get_context("fork")
-    second = fork.Process(target=choose.write_choice, args=(path, [line]))
+    second = fork.Process(target=telling.write_choice, args=(path, [line]))
 
     def replace_late(temporary, path):
         monkeypatch.undo()
@@ -618,7 +634,7 @@ def test_two_commands_that_end_side_by_side_keep_each_others_lines(tmp_path, mon
         replace(temporary, path)
 
     monkeypatch.setattr(os, "replace", replace_late)
-    choose.write_choice(path, [("first", *line[1:])])
+    telling.write_choice(path, [("first", *line[1:])])
     second.join()
     assert second.exitcode == 0
     assert [found["algorithm"] for found in read(path)] == ["first", "x"]
@@ -637,14 +653,14 @@ def test_status_says_who_survives(tmp_path, monkeypatch):
         f"--budget | 7 | --noises | {' | '.join(noises)}",
         tmp_path,
     )
-    line, total = choose.standing(choose.choices(args), args)
+    line, total = telling.standing(choose.choices(args), args)
     assert total == "15 runs in all, 7 to search and 8 to confirm; 0 are done"
-    assert line == "PPO on Pendulum-v1, round 1 of 2: 3 of 3 noises, seed 1; runs to do: 3"
+    assert line == "PPO on Pendulum-v1, round 1 of 2: 3 of 3 configurations, seed 1; runs to do: 3"
     for choice in choose.choices(args):
         for run in choice.state.due:
             stub_run.train(choice.runs[run].command)
-    assert list(choose.standing(choose.choices(args), args)) == [
-        "PPO on Pendulum-v1, round 2 of 2: 2 of 3 noises, seeds 1 to 3; runs to do: 4",
+    assert list(telling.standing(choose.choices(args), args)) == [
+        "PPO on Pendulum-v1, round 2 of 2: 2 of 3 configurations, seeds 1 to 3; runs to do: 4",
         "  mean return after round 1:",
         f"  {rounded(scores[best]):>10}  {best} at 1.0",
         f"  {rounded(scores[second]):>10}  {second} at 1.0",
@@ -654,7 +670,7 @@ def test_status_says_who_survives(tmp_path, monkeypatch):
     ]
     batches(args)
     finished = choose.choices(args)
-    [verdict] = choose.standing(finished, args)
+    [verdict] = telling.standing(finished, args)
     assert verdict.startswith("PPO on Pendulum-v1: ") and "4 fresh seeds" in verdict
     assert not (tmp_path / "choice.csv").exists()  # the status only looks
     assert [verdict] == conclude(args)

@@ -19,9 +19,8 @@ import tyro
 from views import ROOT, finish, folders, locked, log_of, view
 
 import noisy_wrappers
-from sweep import options
-from sweep.grid import PlannedRun, command_line
-from sweep.options import GIVEN_BY_THE_GRID, script_options
+from sweep import options, scripts
+from sweep.grid import MOST_BASELINES
 
 ALGORITHMS = {"sac": 5, "td3": 5, "ppo": 10}  # seeds
 SCALE = "RandomUniformScaleReward(0.5, 1.5)"
@@ -36,7 +35,7 @@ def dry_run(*args):
     result = view("list", *args)
     assert result.code == 0, result.err
     lines = [line.split("\t")[1] for line in result.out.splitlines()]
-    assert result.err.startswith(f"{len(lines)} runs")
+    assert result.err.startswith(f"{len(lines):,} run")
     parser = argparse.ArgumentParser()
     parser.add_argument("python", choices=[sys.executable])
     parser.add_argument("script", choices=[f"{name}_continuous_noisy.py" for name in ALGORITHMS])
@@ -124,21 +123,11 @@ def test_other_presets():
     assert picture in (ROOT / "Makefile").read_text()
 
 
-def test_a_folder_without_a_name_is_refused():
-    result = view("list", "demo", "--runs-dir", "")
-    assert (result.code, result.err) == (2, "error: --runs-dir must name a folder\n")
-
-
 def test_a_report_quotes_the_folder(tmp_path):
     grid = ["baseline", *GRID, "--total-timesteps", "1000", "--runs-dir", tmp_path / "a b"]
     [folder] = folders(*grid)
     finish(folder, env_id="Pendulum-v1")
     assert f"analyze.py --runs-dir '{tmp_path}/a b'\n" in view("report", *grid).out
-
-
-def test_a_status_with_a_preset_that_is_not_the_first_word_is_refused(tmp_path):
-    result = view("status", "--runs-dir", tmp_path, "demo")
-    assert (result.code, result.err) == (2, "error: the preset comes first: demo --...\n")
 
 
 def test_a_folder_that_no_file_system_can_hold_ends_in_a_line(tmp_path):
@@ -148,29 +137,23 @@ def test_a_folder_that_no_file_system_can_hold_ends_in_a_line(tmp_path):
         assert result.err.startswith("error: --runs-dir: /") and "too long" in result.err
 
 
-@pytest.mark.parametrize(
-    ("env_id", "noise", "is_own"),
-    [
-        ("Hopper-v5", A, False),
-        ("my_envs:2D-v0", A, True),
-        ("Hopper-v5", "my_noises:Sticky(2)", True),
-    ],
-)
-def test_a_command_with_a_module_of_the_users_takes_the_path_along(
-    env_id, noise, is_own, monkeypatch
-):
+def test_a_command_with_a_module_of_the_users_takes_the_path_along(monkeypatch, tmp_path):
+    """No other command does: a file there may have the name of one of Python's modules."""
+    (tmp_path / "my_noises.py").write_text(
+        "import noisy_wrappers\n\n\nclass Sticky(noisy_wrappers.RewardNoise):\n    pass\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("PYTHONPATH", "/own")
-    command = ["ppo_continuous_noisy.py", "--env-id", env_id, "--noise", noise]
-    command += ["--noise-rate", "1.0:0.0"]
-    run = PlannedRun(Path("runs/x"), ("ppo", env_id), 1, 1000, command, {})
-    assert command_line(run).startswith("env PYTHONPATH=/own ") is is_own
+    grid = ["custom", *GRID, "--noise-rates", "1:0", "--noises", "my_noises:Sticky()"]
+    plain, own = view("list", *grid).out.splitlines()[-2:]
+    assert "PYTHONPATH" not in plain and "\tenv PYTHONPATH=/own " in own
 
 
 def test_a_status_of_a_whole_folder_asks_for_no_environment(tmp_path, monkeypatch):
     finish(tmp_path / "one")
     monkeypatch.setattr(options, "canonical_env_id", None)
     shown = view("status", "--runs-dir", tmp_path)
-    assert (shown.code, shown.err) == (0, "") and "1 runs: 1 done" in shown.out
+    assert (shown.code, shown.err) == (0, "") and "1 run: 1 done" in shown.out
 
 
 def test_spellings_and_rate_zero_are_one_run():
@@ -184,7 +167,8 @@ def test_spellings_and_rate_zero_are_one_run():
 
 def test_rates_of_ones_own():
     cells = ["--noises", f"{A}@0.1+RandomEarlyTermination(50)@1:0", "RandomDropoutObservation(0.9)"]
-    lines = dry_run("custom", *GRID, *cells, "--noise-rates", "0.5", "1.0:0")
+    cells += ["--noise-rates", "0.5", "1.0:0", "--baseline-seeds", "1"]
+    lines = dry_run("custom", *GRID, *cells)
     early, reward, drop = (
         "RandomEarlyTermination(50)",
         "RandomNormalNoisyReward(1.0)",
@@ -248,90 +232,256 @@ def test_a_report_of_runs_without_logs_does_not_blame_the_disk(tmp_path):
     assert result.code == 1 and "damaged" in result.out and not result.err
 
 
-def test_a_finished_run_of_another_length_is_not_taken_for_done(tmp_path):
-    grid = ["baseline", *GRID]
-    grid += ["--total-timesteps", "1000", "--runs-dir", tmp_path]
-    [folder] = folders(*grid)
-    finish(folder, steps=20, env_id="Pendulum-v1")
-    result = view("list", *grid)
-    assert result.code == 2 and "holds a finished run of 20 steps" in result.err
-    assert not (tmp_path / "logs").exists()
-
-
-def test_a_finished_run_in_another_environment_is_not_taken_for_done(tmp_path):
-    """The names of the two may give one name of a folder."""
+@pytest.fixture
+def one(tmp_path):
+    """A grid of one run, and its folder."""
     grid = ["baseline", *GRID, "--total-timesteps", "1000", "--runs-dir", tmp_path]
     [folder] = folders(*grid)
-    finish(folder, env_id="Pendulum/v1")
-    shown = view("list", *grid)
-    assert (shown.code, shown.out) == (2, "")
-    assert f"{folder} holds a finished run in Pendulum/v1; choose another" in shown.err
+    return grid, folder
 
 
-def test_a_finished_run_with_other_options_is_not_taken_for_done(tmp_path):
-    grid = ["baseline", "--algos", "sac", "--envs", "Hopper-v5", "--seeds", "1"]
-    grid += ["--total-timesteps", "1000", "--runs-dir", tmp_path]
-    [folder] = folders(*grid)
-    finish(folder, gamma=0.99, autotune=True, learning_starts=10, torch_threads=8, compile=False)
-    refused = view("list", *grid, "--", "--gamma", "0.5", "--learning_starts=10", "--no-autotune")
-    assert (
-        refused.code == 2
-        and not refused.out
-        and refused.err
-        == (
-            f"error: {folder} holds a finished run with --gamma 0.99, not 0.5 and --autotune True, "
-            "not False; choose another --runs-dir, or the same options after the --\n"
-        )
+@pytest.mark.parametrize(
+    ("made", "words", "said"),
+    [
+        ({"steps": 20}, "", "--total-timesteps 20, not 1000"),
+        ({"env_id": "Pendulum/v1"}, "", "--env-id Pendulum/v1, not Pendulum-v1"),  # one folder
+        ({"gamma": 0.99}, "--gamma 0.5", "--gamma 0.99, not 0.5"),
+        ({"autotune": True, "gamma": 0.99}, "--no-autotune", "--autotune True, not False"),
+        ({"learning_starts": 10}, "", "--learning-starts 10, not 5000"),  # an option of today's
+        ({}, "--tau 0.1", "--tau 0.005, not 0.1"),  # an option that the run did not have
+        ({"noise_rates": [0.5]}, "--gamma 0.9", "--gamma 0.99, not 0.9"),
+        ({"max_episode_steps": 50}, "--max-episode-steps None", "--max-episode-steps 50, not None"),
+    ],
+)
+def test_a_run_with_other_arguments_is_not_done(made, words, said, one):
+    """It is counted before anything starts, and shown; a result is not needed for that."""
+    grid, folder = one
+    finish(folder, **{"env_id": "Pendulum-v1", "exp_name": "sac_continuous_noisy"} | made)
+    words = ["--", *words.split()] if words else []
+    for _ in range(2):
+        refused = view("list", *grid, *words)
+        assert (refused.code, refused.out, refused.err.count("\n")) == (2, "", 1), refused.err
+        assert f"1 run was made in {folder.parent} with other arguments: {said}" in refused.err
+        assert folder.name in refused.err and "another --exp-name" in refused.err
+        status = view("status", *grid, *words)
+        assert status.code == 0 and "0 done, 0 running, 0 failed, 1 to do" in status.out
+        assert said in status.out
+        (folder / "result.json").unlink(missing_ok=True)
+    named = view("list", *grid, "--", *words[1:], "--exp-name", "other")
+    assert named.code == 0 and "/baseline_s1__Pendulum-v1__other\t" in named.out
+
+
+def test_a_run_with_the_same_arguments_is_done(one):
+    grid, folder = one
+    made = {"env_id": "Pendulum-v1", "exp_name": "sac_continuous_noisy", "gamma": 0.99, "gone": 1}
+    finish(folder, **made, torch_threads=8, compile=False, learning_starts=5000, hidden=[64, 64])
+    same = (
+        "",
+        "--gamma .990",
+        "--learning_starts=5e3 --no-compile --torch-threads 2",
+        "--gamma=99e-2",
     )
-    assert "with --learning-starts 10, not 5000; choose" in view("status", *grid).err
-    for same in ("--learning-starts 10", "--learning_starts=10 --no-compile --torch-threads 2"):
-        result = view("report", *grid, "--", *same.split())
-        assert result.code == 0 and "1 runs: 1 done" in result.out, result.err
-    # An older version had an option that is gone, and did not have some of today's
-    finish(folder, gamma=0.99, capture_video=True)
-    assert "1 runs: 1 done" in view("status", *grid).out
-    assert "1 done" in view("report", *grid, "--", "--max-episode-steps", "50").out
+    for words in same:
+        shown = view("report", *grid, "--", *words.split())
+        assert shown.code == 0 and "1 run: 1 done" in shown.out, shown.out + shown.err
 
 
-def test_misspelt_options_are_refused_where_nothing_is_to_do(tmp_path):
-    grid = ["baseline", *GRID, "--total-timesteps", "1000", "--runs-dir", tmp_path]
-    [folder] = folders(*grid)
+def test_runs_of_another_text_of_the_script_are_counted(one):
+    grid, folder = one
+    made = {"env_id": "Pendulum-v1", "exp_name": "sac_continuous_noisy"}
+    text = scripts.find("sac", ROOT).sha256
+    for sha256, said in ((text, 0), ("ab", 1), (f"ab, {text}", 1)):
+        more = {"script": "sac_continuous_noisy.py", "script_sha256": sha256}
+        finish(folder, more=more, **made)
+        listed, status = view("list", *grid), view("status", *grid)
+        whole = view("status", "--runs-dir", folder.parent)
+        assert listed.code == 0 and "0 to do" in listed.err and "1 done" in status.out
+        for shown in (listed.err, status.out, whole.out):
+            assert shown.count("1 run was made") == said == shown.count("another text of sac_con")
+
+
+def test_runs_of_two_releases_are_two_studies(tmp_path):
+    grid = ["baseline", *GRID[:-1], "1-2", "--total-timesteps", "1000", "--runs-dir", tmp_path]
+    old, new = folders(*grid)
+    finish(old, more={"versions": {}}, env_id="Pendulum-v1")
+    refused = view("list", *grid)
+    assert refused.code == 2 and not refused.out and "by release 0.3" in refused.err
+    assert "Finish them with 0.3, or give this sweep another --exp-name" in refused.err
+    assert "by release 0.3" in view("status", *grid).out
+    finish(new, more={"versions": {}}, env_id="Pendulum-v1", seed=2)
+    both = view("list", *grid)  # it is finished: all are of one study
+    assert both.code == 0 and "2 runs were made" in both.err and "0 to do" in both.err
+
+
+# THE SCRIPTS
+
+OWN = '''"""A script of somebody's own."""
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+WIDTH = 64
+
+
+@dataclass
+class Base:
+    env_id: str = "Hopper-v5"
+    seed: int = 1
+    total_timesteps: int = 1_000_000
+    noise: tuple[str, ...] = ()
+    noise_rate: tuple[float | str, ...] = ()
+    runs_dir: str = "runs"
+    exp_name: str = Path(__file__).stem
+
+
+@dataclass
+class Args(Base):
+    """Arguments."""
+
+    label: str = "plain"
+    """A docstring below an option."""
+    hidden: tuple[int, ...] = (64, 2 * 32)
+    entropy: float = -math.log(2)
+    shift: float = -0.5
+    data: Path = Path("x")
+    width: int | None = None
+    kind: Literal["a", "b"] = "a"
+    layer_norm: bool = False
+'''
+
+
+@pytest.fixture
+def elsewhere(tmp_path):
+    """A folder of the caller's with a script of its own."""
+    (tmp_path / "redq_continuous_noisy.py").write_text(OWN)
+    return tmp_path
+
+
+def test_an_algorithm_is_a_script_of_the_project_or_of_the_callers_folder(elsewhere):
+    grid = ["custom", "--algos", "redq", "sac", "--envs", "Pendulum-v1", "--seeds", "1"]
+    found = view("list", *grid, "--noises", f"{A}@1", "--runs-dir", "r", caller=elsewhere)
+    lines = [line.split("\t") for line in found.out.splitlines()]
+    assert found.code == 0 and len(lines) == 4
+    own = [command for folder, command in lines if folder.endswith("__redq_continuous_noisy")]
+    start = f"env PYTHONPATH={ROOT} {sys.executable} {elsewhere}/redq_continuous_noisy.py --env-id "
+    assert len(own) == 2 and all(command.startswith(start) for command in own)
+    assert all("PYTHONPATH" not in command for _, command in lines if command not in own)
+    unknown = view("list", *grid, "--algos", "dqn", caller=elsewhere)
+    assert (
+        unknown.code == 2 and f"no dqn_continuous_noisy.py in {ROOT} or {elsewhere}" in unknown.err
+    )
+    assert unknown.err.endswith("; choose from ppo, redq, sac, td3\n")
+    (elsewhere / "sac_continuous_noisy.py").write_text(OWN)  # which one is meant?
+    (elsewhere / "bad_continuous_noisy.py").write_text("class Args(:")
+    scripts.scripts_in.cache_clear()
+    both = view("list", *grid, caller=elsewhere)
+    assert both.code == 2 and "differ: give one of them another name" in both.err
+    (elsewhere / "bad_continuous_noisy.py").write_text("class Args(:")
+    assert (
+        "bad_continuous_noisy.py: " in view("list", *grid, "--algos", "bad", caller=elsewhere).err
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "made"),
+    [
+        ("--label text-1 --hidden 32 32", {"label": "text-1", "hidden": [32, 32]}),
+        ("--hidden=8", {"hidden": [8]}),
+        ("--entropy -1e-3 --shift=-2", {"entropy": -0.001, "shift": -2.0}),
+        ("--data /a/b.txt --width 1e6", {"data": "/a/b.txt", "width": 1_000_000}),
+        ("--width None --kind b", {"width": None, "kind": "b"}),
+        ("--layer-norm", {"layer_norm": True}),
+        ("--layer_norm --no-layer_norm", {"layer_norm": False}),
+    ],
+)
+def test_options_are_the_scripts_own_business(words, made, elsewhere, tmp_path):
+    """Values of any kind pass, and are compared with what the run has stored."""
+    grid = [
+        "baseline",
+        "--algos",
+        "redq",
+        *GRID[2:],
+        "--total-timesteps",
+        "9",
+        "--runs-dir",
+        tmp_path,
+    ]
+    listed = view("list", *grid, "--", *words.split(), caller=elsewhere)
+    [folder, command] = listed.out.rstrip().split("\t")
+    passed = shlex.split(command)[shlex.split(command).index(str(tmp_path)) + 1 :]
+    wanted = words.replace("1e6", "1000000").replace("_", "-").split()
+    assert passed == wanted
+    defaults = {"label": "plain", "hidden": [64, 64], "entropy": -0.69, "shift": -0.5, "data": "x"}
+    defaults |= {"width": None, "kind": "a", "layer_norm": False, "eval_episodes": 10}
+    args = {"env_id": "Pendulum-v1", "exp_name": "redq_continuous_noisy"} | defaults
+    more = {"algorithm": "REDQ", "script": "redq_continuous_noisy.py", "defaults": defaults}
+    finish(Path(folder), 9, more, **args | made)
+    assert "0 to do" in view("list", *grid, "--", *words.split(), caller=elsewhere).err
+    plain = view("list", *grid, caller=elsewhere)  # without the options
+    same = defaults | made == defaults
+    assert (plain.code == 0) is same and ("other arguments" in plain.err) is not same
+    other = view("list", *grid, "--", "--label", "other", caller=elsewhere)
+    assert other.code == 2 and "not other" in other.err
+
+
+def test_names_of_options_are_checked_where_nothing_is_to_do(one):
+    grid, folder = one
     finish(folder, env_id="Pendulum-v1")
-    assert "1 runs, 0 to do" in view("list", *grid).err
+    assert "1 run, 0 to do" in view("list", *grid).err
     for words, message in {
         "--gama 0.99": "sac_continuous_noisy.py has no option --gama; did you mean --gamma?",
-        "--gamma=0.99 1": "sac_continuous_noisy.py has no option 1",
-        "--gamma --no-compile": "--gamma: expected one argument",
-        "--compile=False": "--compile/--no-compile: ignored explicit argument 'False'",
-        "--tau abc": "--tau: invalid float value: 'abc'",
-        "--batch-size 1.5e0": "--batch-size: '1.5e0' is not a whole number, such as 1000000 or 1e6",
-        "--eval-frequency often": "--eval-frequency: 'often' is not a whole number, such as "
-        "1000000 or 1e6",
-        "--batch-size 0": "--batch-size must be at least 1, not 0",
-        "--gamma 1.1": "--gamma must be at most 1, not 1.1",
-        "--matmul-precision low": "--matmul-precision: invalid choice: 'low' (choose from highest, "
-        "medium, bf16)",
+        "0.99": "sac_continuous_noisy.py has no option 0.99; after -- comes the name of an option",
+        "--no-gamma": "sac_continuous_noisy.py has no option --no-gamma; did you mean --gamma?",
     }.items():
         result = view("list", *grid, "--", *words.split())
-        said = re.sub("'(highest|medium|bf16)'", r"\1", result.err)  # so before Python 3.12.8
-        assert (result.code, result.out, said) == (2, "", f"error: {message}\n")
+        assert (result.code, result.out, result.err) == (2, "", f"error: {message}\n")
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_the_grid_reads_options_as_the_scripts_do(algorithm, monkeypatch):
-    script = import_module(f"{algorithm}_continuous_noisy")
+def test_what_a_source_tells_is_what_tyro_reads(algorithm):
+    script = scripts.find(algorithm, ROOT)
+    args = import_module(f"{algorithm}_continuous_noisy").Args
+    defaults = {name: getattr(args(), name) for name in args.__dataclass_fields__}
+    assert script.defaults == {
+        name: value for name, value in defaults.items() if name != "exp_name"
+    }
     for words in (
-        "",
         "--gamma 0.5 --eval_episodes=3 --no-compile --matmul_precision medium",
+        "--eval-frequency None",
         "--gamma=.5 --gamma 1 --cuda --no_overwrite --max-episode-steps 1_000",
-        "--gamma 0 --torch-threads=1000 --checkpoint-frequency 1e5 --eval-frequency None",
-        "--eval-frequency=2e3 --max-episode-steps None",
+        "--checkpoint-frequency 1e5 --eval-frequency=2e3",
     ):
-        monkeypatch.setattr("sys.argv", ["script", *words.split()])
-        read = vars(script.read_args())
-        given = {flag[2:].replace("-", "_") for flag in GIVEN_BY_THE_GRID}
-        wanted = {name: read[name] for name in read.keys() - given}
-        assert script_options(algorithm, words.split()) == wanted
+        given, command = scripts.read_words(script, words.split())
+        read = vars(tyro.cli(args, args=command))
+        assert all(scripts.is_same(read[name], given[name]) for name in given)
+        changed = {name for name, value in read.items() if value != defaults[name]}
+        assert changed <= given.keys() and len(given) == len(
+            set(re.findall(r"--(?:no.)?(\w\w+)", words))
+        )
+
+
+# HOW MANY RUNS
+
+
+@pytest.mark.parametrize(
+    ("noises", "more", "baselines"),
+    [
+        (1, "", [1, 2, 3]),
+        (3, "", [1, 2, 3, 4, 5, 6]),  # 3 * sqrt(3) = 5.2
+        (12, "", list(range(1, 8))),  # 3 * sqrt(12) = 10.4, and at most 2.6 times as many
+        (3, "--baseline-seeds 2 7-8", [2, 7, 8]),
+    ],
+)
+def test_baselines_that_pay(noises, more, baselines):
+    cells = [f"RandomNormalNoisyReward({i + 1})@0.1" for i in range(noises)]
+    grid = ["custom", *GRID[:-1], "1-3", "--noises", *cells, *more.split()]
+    lines = dry_run(*grid)
+    assert [line.seed for line in lines if not line.noise] == baselines
+    assert Counter(line.seed for line in lines if line.noise) == dict.fromkeys([1, 2, 3], noises)
+    said = "" if baselines == [1, 2, 3] else f" ({len(baselines)} of them without noise)"
+    assert view("list", *grid).err == f"{len(lines)} runs{said}, {len(lines)} to do\n"
+    assert max(map(len, [baselines])) <= max(3, MOST_BASELINES * 3)
 
 
 # BAD INPUT
@@ -341,7 +491,6 @@ def test_the_grid_reads_options_as_the_scripts_do(algorithm, monkeypatch):
     ("args", "message"),
     [
         ("nope", "unknown preset 'nope'; choose one of demo, baseline, best"),
-        ("best --algos dqn", "unknown algorithm 'dqn'; choose from sac, td3, ppo"),
         ("custom --noises Foo(1) --noise-rates 1", "bad noise 'Foo(1)': unknown name; valid are"),
         ("paper --noise-rates 1.5", "1.5"),
         (
@@ -363,9 +512,9 @@ def test_the_grid_reads_options_as_the_scripts_do(algorithm, monkeypatch):
         (f"{C} --seeds 1-3", "leave out --seeds"),
         (
             f"{C} --noises paper --budget 89",
-            "--budget must be at least 90, a run for each noise, not 89",
+            "--budget must be at least 90, a run for each configuration, not 89",
         ),
-        (f"{C} --budget 100000", "--budget 100000 is too large: the best noises would run with"),
+        (f"{C} --budget 100000", "--budget 100000 is too large: the best would run with"),
         (f"{C} --confirm 3", "--confirm must be at least 4, not 3: with fewer seeds no difference"),
         (f"{C} --envs Hopper Pusher-v5 --confirm 4", "--confirm must be at least 5, not 4: "),
         (f"{C} --noises {A} --noise-rates 0", "there is no noise to choose from"),
@@ -376,11 +525,14 @@ def test_the_grid_reads_options_as_the_scripts_do(algorithm, monkeypatch):
         ("demo --envs nope:Env-v0", "--envs: there is no environment 'nope:Env-v0': No module"),
         (
             "demo --seeds 1 2-1",
-            "--seeds takes numbers and ranges, separated by spaces: 1 2 3 or 1-3",
+            "--seeds: takes numbers and ranges, separated by spaces: 1 2 3 or 1-3",
         ),
         ("demo --seeds 1,2,3", "separated by spaces: 1 2 3 or 1-3, not '1,2,3'"),
         ("demo --seeds 1-", "not '1-'"),
-        (f"demo --seeds 1-{2**63}", f"--seed must be at most {2**63 - 1}, not {2**63}"),
+        ("demo --seeds 1-99999999999", "'1-99999999999' is more than 100,000 seeds"),
+        (f"{C} --baseline-seeds 1", "leave out --baseline-seeds"),
+        (f"{C} --looks 13", "--looks must be from 1 to half of --confirm, not 13"),
+        ("best -- --exp-name mine", "--exp-name: several algorithms would write into the same"),
         ("demo --total-timesteps 1.5", "'1.5' is not a whole number, such as 1000000 or 1e6"),
         ("demo --total-timesteps inf", "'inf' is not a whole number"),
         ("demo --seed 1", "unknown option --seed; did you mean --seeds?"),
@@ -390,19 +542,14 @@ def test_the_grid_reads_options_as_the_scripts_do(algorithm, monkeypatch):
         ("demo --gama 0.9", "did you mean --gamma, an option of the scripts, at the end after --?"),
         ("demo --xyzzy 1", "unknown option --xyzzy; ./benchmark.sh --help lists them"),
         ("demo --runs-dir=-x", "--runs-dir must be a path"),
+        ("demo --runs-dir=", "--runs-dir must name a folder"),
+        ("--algos sac demo", "unknown preset '--algos'"),
         ("demo -- --overwrite", "--overwrite would start interrupted runs afresh"),
         ("demo --algos", "--algos: expected at least one argument"),
         ("demo --dry-run=1", "--dry-run takes no value"),
-        (
-            "demo --total-timesteps 2e3",
-            "--num-steps must be from 2 * --num-minibatches (64) to --total-timesteps (2000), not",
-        ),
         ("demo --total-timesteps 0", "--total-timesteps must be at least 1, not 0"),
-        ("demo -- --num-steps 63", "--num-steps must be from 2 * --num-minibatches (64) to"),
-        ("demo -- --target-kl abc", "--target-kl: 'abc' is not a number"),
         ("demo -- --help", "ppo_continuous_noisy.py has no option --help"),
         ("demo -- --seed 2", "--seed is part of the grid: use --seeds, before the --"),
-        ("demo -- --exp-name my_ppo", "--exp-name is part of the grid: use --runs-dir, before"),
         ("best --algos sac ppo -- --tau 0.1", "ppo_continuous_noisy.py has no option --tau"),
     ],
 )

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
 
+from noisy_wrappers import __version__
 from sweep.__main__ import main
 
 ROOT = Path(__file__).parents[2]
@@ -39,12 +40,16 @@ def folders(*words):
     return [Path(line.split("\t")[0]) for line in found.out.splitlines()]
 
 
-def finish(folder, steps=1000, **args):
-    """Write what tells that a run of the sweep is finished."""
+def finish(folder, steps=1000, more=(), **args):
+    """Write what tells that a run of the sweep is finished; more: of config.json, beside args."""
     folder.mkdir(parents=True, exist_ok=True)
-    args = {"env_id": "Hopper-v5", "exp_name": "x", "seed": 1, "noise": [], "noise_rate": []} | args
+    seed = re.search(r"_s(\d+)_", folder.name)
+    args = {"seed": int(seed[1]) if seed else 1, "exp_name": folder.name.rpartition("__")[2]} | args
+    args = {"env_id": "Hopper-v5", "noise": [], "noise_rate": []} | args
     args |= {"total_timesteps": steps, "eval_episodes": 10}
-    (folder / "config.json").write_text(json.dumps({"algorithm": "SAC", "args": args}))
+    versions = {"noisy_wrappers": __version__}
+    config = {"algorithm": "SAC", "args": args, "versions": versions} | dict(more)
+    (folder / "config.json").write_text(json.dumps(config))
     result = {"total_timesteps": steps, "final_return_mean": 1.0}
     (folder / "result.json").write_text(json.dumps(result))
 

@@ -80,6 +80,14 @@ NOISES = [
     "RandomObservationDelay(1, 3)",
 ]
 DYNAMICS = "RandomDynamics(0.5, 1.5)"
+# One of each base class, and of those that have a mechanism of their own.
+BASES = [
+    "RandomNormalNoisyObservation(0.3)",
+    "RandomMixupObservation(0.3, recursive=True)",
+    "RandomNormalNoisyReward(0.3)",
+    "RandomEarlyTermination(3, 9)",
+    *NOISES[-5:],
+]
 # Those that are decided when an episode begins, and the others.
 EPISODE_NOISES = [text for text in NOISES if "Termination(3" in text or text in NOISES[-4:]]
 STEP_NOISES = [text for text in NOISES if text not in EPISODE_NOISES]

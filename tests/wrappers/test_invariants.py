@@ -4,8 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from cases import (
+    BASES,
     DYNAMICS,
-    NOISES,
     REWARD_CASES,
     GenericEnv,
     build,
@@ -23,7 +23,7 @@ from noisy_wrappers import (
 )
 
 
-@pytest.mark.parametrize("text", NOISES)
+@pytest.mark.parametrize("text", BASES)
 @pytest.mark.parametrize("env_id", ["Pendulum-v1", None, "InvertedPendulum-v5"])
 def test_rate_zero_is_the_bare_environment(text, env_id):
     env_id = registered(text)[0] if text == DYNAMICS else env_id or registered(text)[0]
@@ -34,7 +34,7 @@ def test_rate_zero_is_the_bare_environment(text, env_id):
     assert same(rollout(build(text, gym.make(env_id), 0.0), 3, 50, action), bare)
 
 
-@pytest.mark.parametrize("text", NOISES)
+@pytest.mark.parametrize("text", BASES)
 def test_unperturbed_data_are_the_very_same_objects(text):
     data = (np.ones(3), 1.5, False, False, {"key": 1})
     env = GenericEnv(reset=lambda env: (data[0], data[4]), step=lambda env, action: data)
@@ -44,7 +44,7 @@ def test_unperturbed_data_are_the_very_same_objects(text):
     assert all(got is given for got, given in zip(env.step(0), data, strict=True))
 
 
-@pytest.mark.parametrize("text", NOISES)
+@pytest.mark.parametrize("text", BASES)
 def test_data_of_the_environment_are_never_mutated(text):
     first, owned = np.zeros(3), np.arange(1.0, 4.0)
     first.flags.writeable = owned.flags.writeable = False

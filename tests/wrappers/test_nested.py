@@ -99,6 +99,14 @@ def test_keys_restrict_the_noise():
     assert got["achieved_goal"] is samples[0]["achieved_goal"]
 
 
+def test_an_environment_may_return_other_sequences():
+    space = Dict(a=Box(-1, 1, (2,)), b=Box(-1, 1, (1,)))
+    observation = {"a": np.array([0.25, 0.5], object), "b": [1]}
+    env = GenericEnv(space, reset=lambda env: (observation, {}))
+    got, info = RandomDropoutObservation(env, 1.0, 1.0).reset()
+    assert info == {} and got["a"].tolist() == [0.25, 0.5] and got["b"].dtype == np.float32
+
+
 def test_keys_of_a_tuple_are_indices():
     space = Tuple((Box(-1, 1, (2,)), Box(-1, 1, (3,))))
     env, samples = sampled(space)
@@ -157,13 +165,9 @@ def test_check_env(space):
 @pytest.mark.parametrize(
     ("env", "keys", "reason"),
     [
-        (
-            lambda: sampled(GOALS)[0],
-            ("goal",),
-            "the keys .'achieved_goal', 'desired",
-        ),
-        (lambda: sampled(GOALS)[0], (0,), "have the keys"),
-        (lambda: GenericEnv(), ("observation",), r"have the keys \[\]"),
+        (make_goals, ("goal",), "the keys .'achieved_goal', 'desired"),
+        (make_goals, (0,), "have the keys"),
+        (GenericEnv, ("observation",), r"have the keys \[\]"),
         (
             lambda: sampled(Dict(x=Box(-1, 1), y=Discrete(2)))[0],
             ("y",),

@@ -12,7 +12,13 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
-from noisy_wrappers import RandomEarlyTermination, make_noisy, noise_statistics, set_progress
+from noisy_wrappers import (
+    RandomEarlyTermination,
+    make_noisy,
+    noise_statistics,
+    parse_noise,
+    set_progress,
+)
 
 PAGE = Path(__file__).parents[2] / "docs" / "wrappers.md"
 
@@ -40,6 +46,19 @@ def test_the_code_of_the_page():
     assert rates["RandomEarlyTermination/rate"] == 0.5
     assert 0 < rates["RandomNormalNoisyReward/rate"] <= 0.5  # the last rollout began at half time
     assert names["mean"] < -100
+
+
+def test_the_page_names_only_what_there_is():
+    """Noises of its tables, and the usual fields, are right."""
+    text = PAGE.read_text()
+    for noise in set(re.findall(r"`(Random\w+\([^`]*\))`", text)):
+        if re.search(r"\(.*(\bk\b|low)", noise) is None:
+            parse_noise(noise)
+    rows = re.findall(r"^\| (`.*?) \|", text[text.index("| field |") :], re.M)
+    fields = re.findall(r"`(\w+)`", " ".join(rows[:8]))
+    assert len(fields) == 11
+    for field in fields:
+        parse_noise(f"RandomDynamics(0.5, 1.5, fields=({field!r},))")
 
 
 def noisy_pendulum():

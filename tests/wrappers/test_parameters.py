@@ -7,7 +7,7 @@ from fractions import Fraction
 import gymnasium as gym
 import numpy as np
 import pytest
-from cases import NOISES, WIDE, GenericEnv, build, constant_env
+from cases import BASES, NOISES, WIDE, GenericEnv, build, constant_env
 from gymnasium.utils.env_checker import check_env
 
 from noisy_wrappers import (
@@ -92,7 +92,7 @@ def test_bad_parameters():
         assert repr(value) in message, (name, args, kwargs, message)
 
 
-@pytest.mark.parametrize("text", NOISES)
+@pytest.mark.parametrize("text", BASES)
 def test_noise_rate_is_writable_and_checked(text):
     env = build(text, GenericEnv(WIDE), 0)
     for rate in (1, 0.0, np.float32(0.5), 1.0):

@@ -231,15 +231,6 @@ def test_the_true_return_stays_where_noises_are_added_later():
     assert steps[-1][4]["episode"]["r"] == pytest.approx(sum(step[1] for step in steps))
 
 
-def test_an_environment_may_return_one_info_with_an_episode_of_its_own():
-    shared = {"episode": 3}
-    env = make_noisy(GenericEnv(step=lambda *_: (np.zeros(3), 1.0, True, False, shared)), [], [])
-    for _ in range(2):
-        env.reset(seed=0)
-        assert env.step(0)[4]["episode"]["r"] == 1.0
-    assert shared == {"episode": 3}
-
-
 @pytest.mark.parametrize("recorder", [RecordEpisodeStatistics, Monitor])
 def test_the_record_of_the_environment_is_kept(recorder):
     env = recorder(gym.wrappers.TimeLimit(constant_env(2.0), 5))

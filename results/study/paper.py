@@ -1,16 +1,24 @@
-"""The paper's tables beside ours: what `python analyze.py --compare results/paper` adds.
+"""The paper's tables beside those of a folder of runs: python -m results.study.paper RUNS OUT.
 
 Rows match by algorithm, environment without version, noise as run, rate and step.
 """
 
+import sys
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
+from analysis.comparisons import compare_all, results
+from analysis.folders import SEARCH, script_name
 from analysis.luck import add_luck, draw_differences, highest
-from analysis.runs import KEYS, STUDY, VERSION, script_name
+from analysis.runs import KEYS, STUDY, read_runs
+from analysis.studies import make_studies
+from analysis.tables import COLUMNS, consistency_rows, early_rows
 from noisy_wrappers import BASELINE, Configuration
+from results.study.returns import RESULTS
+
+VERSION = r"(?P<name>.*?)(?:-v(?P<version>\d{1,9}))?$"  # of an environment's id, if it has one
 
 PAPER_SEEDS = {"SAC": 5, "TD3": 5, "PPO": 10}
 PAPER_ENVIRONMENTS = 5
@@ -38,11 +46,11 @@ def read_paper(folder):
         pairs = zip(table["noise"], table["noise_rate"], strict=True)
         table["noise_rate"] = [Configuration.parse(*pair).noise_rate for pair in pairs]
         names = [script_name(algorithm) for algorithm in table["algorithm"]]
-        tables[name.rstrip("*")] = table.assign(exp_name=names, phase="")
+        tables[name.rstrip("*")] = table.assign(exp_name=names, phase="", tested="")
     return tables
 
 
-def compare_tables(paper, lengths, alone, consistency, early):
+def beside(paper, lengths, alone, consistency, early):
     """Yield (name, table) for each table of `paper`, a dict from read_paper.
 
     `lengths` has the steps of each study, by the values of its columns STUDY: final returns after
@@ -56,7 +64,7 @@ def compare_tables(paper, lengths, alone, consistency, early):
     best = pd.concat([noisy, baseline.drop(columns=LUCK)], ignore_index=True)
     for name, theirs in (paper | {"best": best}).items():
         ours = {"best": alone, "early_performance": early}.get(name, consistency)
-        table = compare_table(ours, theirs)
+        table = side_by_side(ours, theirs)
         if name != "early_performance":  # whose rows are of the same step
             others = pd.MultiIndex.from_frame(table[STUDY]).map(lengths) != PAPER_STEPS
             table.loc[others, "difference_se"] = np.nan
@@ -81,7 +89,7 @@ def add_luck_of_paper(best, seeds=PAPER_SEEDS):
     return add_luck(best.assign(difference=best["noisy_mean"] - best["baseline_mean"]), lucks)
 
 
-def compare_table(ours, paper):
+def side_by_side(ours, paper):
     """Set our figures beside every row of the paper's table that has them, once for each study.
 
     `ours` holds every configuration. The difference is in standard errors: (ours - paper) /
@@ -91,7 +99,7 @@ def compare_table(ours, paper):
     keys = [name for name in (*KEYS, "steps_millions") if name in paper]
     numbers = [name for name in (mean, std, number, "steps_millions") if name in ours]
     ours = ours.astype(dict.fromkeys(numbers, float))  # a table without rows has no types
-    shared = [name for name in keys if name not in ("exp_name", "phase", "environment")]
+    shared = [name for name in keys if name not in ("exp_name", "phase", "tested", "environment")]
     if "environment" in keys:
         shared.append("place")
         ours, paper = (
@@ -109,3 +117,24 @@ def compare_table(ours, paper):
     columns = [*keys, number, mean, std, f"paper_{mean}", f"paper_{std}"]
     columns += ["difference_se", *(f"paper_{name}" for name in LUCK if f"paper_{name}" in table)]
     return table.sort_values(keys, kind="stable")[columns]
+
+
+def tables_of(runs_dir):
+    """Return {name: the paper's table beside that of the runs in a folder}."""
+    studies, _ = make_studies(read_runs(runs_dir))
+    compared = compare_all(studies)
+    alone = results(studies, compared)
+    alone = alone[alone["phase"] != SEARCH]
+    rows = consistency_rows(alone, compared.rates_together)
+    consistency = pd.DataFrame(rows, columns=COLUMNS["consistency"])
+    rows = [row for study in studies for row in early_rows(study)]
+    early = pd.DataFrame(rows, columns=COLUMNS["early_performance"])
+    lengths = {study.key: study.steps[-1] for study in studies}
+    return dict(beside(read_paper(RESULTS / "paper"), lengths, alone, consistency, early))
+
+
+if __name__ == "__main__":
+    runs_dir, out = map(Path, sys.argv[1:])
+    out.mkdir(parents=True, exist_ok=True)
+    for name, table in tables_of(runs_dir).items():
+        table.to_csv(out / f"compare_{name}.csv", index=False, float_format="%.10g")

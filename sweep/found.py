@@ -1,0 +1,134 @@
+"""What a sweep finds in the folders of its runs: finished runs, damage, and runs of another kind.
+
+A finished run counts if its arguments are those that the sweep would give it, and its release is
+this one. A script that was changed since does not hinder it: that is said.
+"""
+
+import os
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import NamedTuple
+
+from analysis.errors import fail
+from analysis.folders import DamageError, Run, logged, read_run, runs_of
+from noisy_wrappers import MAY_DIFFER_IN_A_RUN, __version__, different_arguments, release
+from sweep.grid import PlannedRun
+from sweep.scripts import PROJECT, is_same, read, scripts_in, spelt
+from sweep.words import counted
+
+NOW = release({"versions": {"noisy_wrappers": __version__}})
+NOT_COMPARED = MAY_DIFFER_IN_A_RUN | {"noise", "noise_rate"}  # the name of a folder tells these
+ADVICE = "give this sweep another --exp-name, at the end after --, or another --runs-dir"
+
+
+class Found(NamedTuple):
+    """What lies in a run's folder."""
+
+    finished: bool = False  # with the arguments and the release that the sweep wants
+    damage: str = ""
+    run: Run | None = None
+    differences: tuple[str, ...] = ()  # of its arguments from those that the sweep wants
+    other_release: str = ""  # that made it
+    other_text: bool = False  # of the script made it
+
+
+def look(planned, with_curve=False):
+    """Return what lies in the folder of a run."""
+    if planned.damage or not os.path.exists(planned.folder / "config.json"):
+        return Found(damage=planned.damage)
+    try:
+        run = read_run(planned.folder, with_curve=with_curve)
+    except DamageError as error:
+        return Found(damage=f"{planned.folder}/{error}; move its folder away to run it again")
+    if run.release != NOW:
+        return Found(run=run, other_release=run.release, finished=run.finished)
+    differences = tuple(differences_of(run, planned)) if planned.args is not None else ()
+    sha256 = run.config.get("script_sha256")
+    other_text = bool(planned.script and sha256) and sha256 != planned.script.sha256
+    finished = run.finished and not differences
+    return Found(finished, "", run, differences, "", other_text)
+
+
+def differences_of(run, planned):
+    """Yield the arguments in which a run differs from what the sweep would give it, in words."""
+    defaults = planned.script.defaults
+    wanted = {"args": dict(defaults), "defaults": defaults}
+    for name, words in planned.args.items():
+        made = run.args.get(name, defaults.get(name))
+        wanted["args"][name] = made if is_same(made, words) else words
+    for name, (made, words) in different_arguments(run.config, wanted, NOT_COMPARED).items():
+        if name != "eval_frequency" or words is not None:  # without one, a run keeps its own
+            said = " ".join(map(str, words)) if isinstance(words, list) else words
+            yield f"{spelt(name)} {made}, not {said}"
+
+
+def remarks(found, place):
+    """Return lines about runs that the sweep cannot continue, and lines about others.
+
+    found: of all its runs; place: their folder, for people.
+    """
+    found, hindrances, notes = list(found), [], []
+    others = [one for one in found if one.differences]
+    if others:
+        counts = Counter(text for one in others for text in one.differences)
+        said = ", ".join(text for text, _ in counts.most_common(3)) + ", ..." * (len(counts) > 3)
+        first = others[0].run.folder.name
+        what = f"{runs_were(len(others))} made in {place} with other arguments: {said}"
+        hindrances.append(f"{what} (as {first}); {ADVICE}")
+    for old in sorted({one.other_release for one in found if one.other_release}):
+        number = sum(one.other_release == old for one in found)
+        text = (
+            f"{runs_were(number)} made in {place} by release {old}, and this is {NOW}: runs of "
+            f"two releases are two studies. Finish them with {old}, or {ADVICE}"
+        )
+        whole = all(one.finished and one.other_release == old for one in found)
+        (notes if whole else hindrances).append(text)
+    changed = [one.run.script for one in found if one.other_text]
+    for script, number in Counter(changed).items():
+        notes.append(
+            f"{runs_were(number)} made in {place} by another text of {script} than today's; "
+            f"if the change matters, {ADVICE}"
+        )
+    return hindrances, notes
+
+
+def runs_were(number):
+    """Begin a sentence: "1 run was", "3 runs were"."""
+    return f"{counted(number, 'run')} {'was' if number == 1 else 'were'}"
+
+
+def refuse_others(runs, place):
+    """Look at runs before any is started; exit if there are some that cannot be continued.
+
+    Returns what was found, run by run; says what else there is to know.
+    """
+    found = list(map(look, runs))
+    hindrances, notes = remarks(found, place)
+    if hindrances:
+        fail("\nerror: ".join(hindrances))
+    for line in notes:
+        print(f"note: {line}", file=sys.stderr)
+    return found
+
+
+def runs_in(folder, caller):
+    """Return the runs that a folder or its logs tell of, for a status that names no grid."""
+    folders = {*runs_of(Path(folder)), *logged(Path(folder))}
+    if not folders:
+        fail(f"no runs in {folder}; name their folder with --runs-dir")
+    known = {**scripts_in(Path(caller)), **scripts_in(PROJECT)}
+    paths = {path.name: path for path in known.values()}
+    runs = []
+    for path in sorted(folders):
+        planned = PlannedRun(path, ("", ""), 0, 0, [])  # unknown: it has failed before it began
+        if os.path.exists(path / "config.json"):
+            try:
+                run = read_run(path, with_curve=False)
+                kind, steps = (run.exp_name, run.environment), run.total_timesteps
+                script = read(paths[run.script]) if run.script in paths else None
+                planned = planned._replace(kind=kind, total_timesteps=steps, script=script)
+            except DamageError as error:
+                planned = planned._replace(damage=f"{path}/{error}")
+        runs.append(planned)
+    return runs

@@ -1,0 +1,217 @@
+"""Training scripts as a sweep sees them: where they are, and what their source says of options.
+
+A script is read with `ast`. Importing it would take seconds, and it may be anybody's: what an
+option means, and whether a value is good, the script says itself.
+"""
+
+import ast
+import difflib
+import functools
+import hashlib
+import os
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from analysis.errors import fail
+
+PROJECT = Path(__file__).resolve().parent.parent
+ENDING = "_continuous_noisy.py"  # of a script's file name; what stands before it is the algorithm
+
+
+class Option(NamedTuple):
+    """A field of a script's Args."""
+
+    kind: str  # its annotation, as text
+    default: Any = None
+    has_default: bool = False  # is the default known? An expression is not: only the script knows
+
+
+class Script(NamedTuple):
+    """A training script."""
+
+    algorithm: str  # in lower case, as on a command line
+    path: str  # as a command names it: relative in the project's folder
+    options: dict[str, Option]
+    sha256: str  # of its text
+    constants: dict[str, int]  # whole numbers that it defines
+
+    @property
+    def file(self):
+        """Its file name."""
+        return os.path.basename(self.path)
+
+    @property
+    def exp_name(self):
+        """The name of the experiment that it gives its runs by default."""
+        option = self.options.get("exp_name", Option(""))
+        return option.default if option.has_default else self.file.removesuffix(".py")
+
+    @property
+    def defaults(self):
+        """The defaults that are known: {argument: value}."""
+        known = self.options.items()
+        return {name: option.default for name, option in known if option.has_default}
+
+
+def find(algorithm, caller):
+    """Return an algorithm's script from the project's folder or the caller's; exits without one."""
+    places = [folder for folder in (PROJECT, Path(caller)) if algorithm in scripts_in(folder)]
+    found = [read(scripts_in(folder)[algorithm]) for folder in dict.fromkeys(places)]
+    if not found:
+        known = sorted({*scripts_in(PROJECT), *scripts_in(Path(caller))})
+        where = PROJECT if Path(caller) == PROJECT else f"{PROJECT} or {caller}"
+        fail(
+            f"unknown algorithm {algorithm!r}: there is no {algorithm}{ENDING} in {where}; "
+            f"choose from {', '.join(known)}"
+        )
+    if len({script.sha256 for script in found}) > 1:
+        paths = " and ".join(script.path for script in found)
+        fail(f"{paths} differ: give one of them another name, because both are {algorithm!r}")
+    return found[0]
+
+
+@functools.cache
+def scripts_in(folder):
+    """Return the training scripts of a folder: {algorithm: path}."""
+    found = {}
+    try:
+        for path in sorted(folder.glob(f"*{ENDING}")):
+            name = path.name.removesuffix(ENDING)
+            if re.fullmatch(r"\w+", name):
+                found.setdefault(name.lower(), path)
+    except OSError:  # a folder that may not be listed
+        pass
+    return found
+
+
+@functools.cache
+def read(path):
+    """Read a script from its source; exits where that is no Python, or has no class Args."""
+    content = path.read_bytes()
+    try:
+        nodes = ast.parse(content).body
+    except (SyntaxError, ValueError) as error:
+        fail(f"{path}: {error}")
+    classes = {node.name: node for node in nodes if isinstance(node, ast.ClassDef)}
+    if "Args" not in classes:
+        fail(f"{path} has no class Args, whose fields are a script's options")
+    inside = path.is_relative_to(PROJECT)
+    return Script(
+        algorithm=path.name.removesuffix(ENDING).lower(),
+        path=str(path.relative_to(PROJECT) if inside else path),
+        options=fields(classes, "Args"),
+        sha256=hashlib.sha256(content).hexdigest(),
+        constants=dict(constants(nodes)),
+    )
+
+
+def fields(classes, name):
+    """Return the fields of a dataclass {name: Option}, those of its bases in this file first."""
+    found = {}
+    for base in classes[name].bases:
+        if isinstance(base, ast.Name) and base.id in classes and base.id != name:
+            found |= fields(classes, base.id)
+    for node in classes[name].body:
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            kind = ast.unparse(node.annotation).strip("'\"")
+            found[node.target.id] = Option(kind, *literal(node.value))
+    return found
+
+
+def literal(node):
+    """Return the value of an expression and True, or None and False where it is no literal."""
+    try:
+        return ast.literal_eval(node), True
+    except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
+        return None, False
+
+
+def constants(nodes):
+    """Yield (name, number) of the whole numbers that a module defines."""
+    for node in nodes:
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            value, is_known = literal(node.value)
+            if is_known and type(value) is int:
+                yield node.targets[0].id, value
+
+
+# ------------------------------------------------------------------------- words of a command line
+
+
+def read_words(script, words):
+    """Read a script's options from the words after "--".
+
+    Returns {argument: its words, or True or False of a switch}, and the words for the command, with
+    whole numbers such as 1e6 written out. Exits with one line about a name that the script does not
+    have: a typing error is not worth 9,100 failed runs.
+    """
+    given, command = {}, []
+    switches = {name for name, option in script.options.items() if option.kind == "bool"}
+    flags = {spelt(name): name for name in script.options}
+    flags |= {f"--no-{spelt(name)[2:]}": name for name in switches}
+    for word in words:
+        if re.match("--[A-Za-z]", word):
+            flag, equals, value = word.partition("=")
+            flag = flag.replace("_", "-")
+            if flag not in flags:
+                fail(f"{script.file} has no option {flag}{did_you_mean(flag, flags)}")
+            name = flags[flag]
+            given[name] = flag == spelt(name) if name in switches else []
+            command.append(flag)
+            if equals:
+                value = whole(value, script.options[name].kind)
+                given[name] = [value]
+                command[-1] += f"={value}"
+        elif not given:
+            fail(f"{script.file} has no option {word}; after -- comes the name of an option")
+        else:
+            value = whole(word, script.options[name].kind)
+            given[name] = [*given[name], value] if isinstance(given[name], list) else [value]
+            command.append(value)
+    return given, command
+
+
+def did_you_mean(flag, flags):
+    """Name the most similar flag, or nothing."""
+    near = difflib.get_close_matches(flag, flags, n=1)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+def spelt(name):
+    """Return how an argument is written on a command line."""
+    return f"--{name.replace('_', '-')}"
+
+
+def whole(text, kind):
+    """Write a whole number such as 1e6 with digits, where a script wants one."""
+    if not re.search(r"\bint\b", kind) or re.search(r"\b(float|str)\b", kind):
+        return text
+    try:
+        return str(int(float(text))) if "e" in text.lower() and float(text).is_integer() else text
+    except (ValueError, OverflowError):
+        return text
+
+
+def is_same(value, words):
+    """Tell whether a value of config.json is what an option's words say.
+
+    words: text, a list of text, or True or False; what they mean only the script knows for certain.
+    """
+    if isinstance(words, list):
+        values = value if isinstance(value, list | tuple) else [value]
+        return len(values) == len(words) and all(map(is_same, values, words))
+    if value is None or isinstance(value, bool | dict):
+        return str(value) == str(words)
+    if isinstance(value, int | float):
+        return value == number(words)
+    return value == words or str(value).endswith(f".{words}")  # as of an enumeration
+
+
+def number(words, otherwise=None):
+    """Return the number that an option's words are, if they are one."""
+    text = words[0] if isinstance(words, list) and len(words) == 1 else words
+    try:
+        return float(text) if re.search("[.e]", str(text)) else int(text)
+    except (ValueError, TypeError):
+        return otherwise

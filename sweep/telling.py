@@ -1,0 +1,232 @@
+"""What `./benchmark.sh choose` says: its plan, where it stands, its verdicts."""
+
+import csv
+import itertools
+import math
+from pathlib import Path
+
+from analysis.choice import CHOICE_COLUMNS, choice_file
+from analysis.errors import fail, in_words
+from analysis.folders import SUCCESS, rewritten
+from analysis.formatting import counted, p_value, rounded, two_digits
+from analysis.power import detectable_shift
+from analysis.statistics import LEVEL
+from analysis.verdicts import POINTS, difference_in_words, excluded, smallest
+from noisy_wrappers import BASELINE
+from sweep import halving
+from sweep.environment import time_left
+from sweep.looks import nominal_levels
+from sweep.options import from_caller
+
+UNITS = {"return": "", SUCCESS: POINTS}  # of a difference, by the metric
+
+# ---------------------------------------------------------------------------------- before a batch
+
+
+def before_a_batch(found, args):
+    """Return lines that say, before a batch starts, what it is for and what all of it will take.
+
+    They also say what gain can be confirmed; before any run only in standard deviations.
+    """
+    if not any(choice.state.due for choice in found):
+        return []
+    lines = []
+    if not any(choice.returns for choice in found):
+        lines += [question(choice) for choice in found]
+    lines += [*map(describe, found), total(found, args)]
+    lines += filter(None, (detectable_gain(choice, args) for choice in found))
+    place = from_caller(args, args.runs_dir)
+    return [*dict.fromkeys(lines), f"runs, logs and the verdict are stored in {place}"]
+
+
+def question(choice):
+    """Say what a choice will decide, and how."""
+    which = f"the best of {choice.number} configurations" if choice.number > 1 else "the noise"
+    *early, last = choice.plan.looks
+    looks = f", or fewer: after {', '.join(map(str, early))} it may be clear" if early else ""
+    return (
+        f"{choice.name}: is {which} better than no noise? {last} fresh seeds of each will decide"
+        f"{looks}"
+    )
+
+
+def total(found, args):
+    """Say how many runs all choices take, and what is left of them."""
+    search = sum(sum(choice.batches[: -len(choice.plan.looks)]) for choice in found)
+    confirm = sum(2 * choice.plan.looks[-1] for choice in found)
+    finished = sum(len(choice.returns) for choice in found)
+    most = any(len(choice.plan.looks) > 1 for choice in found)
+    text = f"at most {search + confirm} runs" if most else f"{search + confirm} runs in all"
+    text += f", {search} to search and {'up to ' * most}{confirm} to confirm; "
+    text += f"{finished} {'is' if finished == 1 else 'are'} done"
+    if any(choice.run_seconds is None for choice in found):
+        return text
+    left = []  # of each choice, the batches that are left: the seconds of their runs
+    for choice in found:
+        if choice.state.due:
+            done = len(choice.state.rounds) + max(1, choice.state.look)
+            runs = [len(choice.state.due), *choice.batches[done:]]
+            left.append([number * [choice.run_seconds] for number in runs])
+    batches = [sum(batch, []) for batch in itertools.zip_longest(*left, fillvalue=[])]
+    return f"{text}, {time_left(batches, args.jobs, args.elsewhere and not finished)}"
+
+
+def detectable_gain(choice, args):
+    """Say what gain the confirmation can show, or nothing once runs are done without a spread."""
+    seeds = choice.plan.looks[-1]
+    gain = detectable_shift(seeds, seeds, nominal_levels(choice.plan)[-1])
+    said = f"{seeds} fresh seeds confirm a true gain of"
+    power = "with 80 % power"
+    if verdicts := shared_level(choice.plan):
+        power += f", where {verdicts} verdicts share the level"
+    if not choice.returns:
+        return f"{said} {gain:.1f} standard deviations over seeds {power}"
+    spread = halving.spread(choice.returns)
+    if not spread > 0:
+        return ""
+    shift = rounded(gain * spread, gain * spread) + UNITS[args.metric]
+    deviations = f"{gain:.1f} standard deviations over seeds in the search"
+    return f"{choice.name}: {said} about {shift} ({deviations}) {power}"
+
+
+def shared_level(plan):
+    """Return how many verdicts share the level of 0.05, 0 if it is one verdict's own."""
+    share = round(LEVEL / plan.level)
+    return share if share > 1 else 0
+
+
+def describe(choice):
+    """Say where a choice stands."""
+    state = choice.state
+    rounds = len(choice.batches) - len(choice.plan.looks)
+    if not state.due:
+        return f"{choice.name}: all runs are done"
+    seeds = f"seeds {state.seeds[0]} to {state.seeds[-1]}" if len(state.seeds) > 1 else "seed 1"
+    due = f"{seeds}; runs to do: {len(state.due)}"
+    if not state.look:
+        left = f"{len(state.candidates)} of {counted(choice.number, 'configuration')}"
+        return f"{choice.name}, round {len(state.rounds) + 1} of {rounds}: {left}, {due}"
+    [winner] = state.candidates
+    looks = len(choice.plan.looks)
+    which = f", look {state.look} of {looks}" if looks > 1 else ""
+    return f"{choice.name}, confirmation{which}: {winner} against no noise, {due}"
+
+
+def standing(found, args):
+    """Yield lines that say where each choice stands, what is in the running, and what is left.
+
+    When all choices are finished, these are the verdicts.
+    """
+    if not any(choice.state.due for choice in found):
+        yield from (sentence_of(choice, args) for choice in found)
+        return
+    for choice in found:
+        yield describe(choice)
+        if choice.state.due and choice.state.rounds:
+            yield f"  mean {args.metric} after round {len(choice.state.rounds)}:"
+            scores = choice.state.rounds[-1].scores
+            for noise in sorted(choice.state.candidates, key=scores.get, reverse=True):
+                yield f"  {rounded(scores[noise]):>10}  {noise}"
+    yield total(found, args)
+
+
+# ------------------------------------------------------------------------------------- the verdicts
+
+
+def report(found, args):
+    """Print the verdicts, and write choice.csv; or, where runs are left, what to do about them."""
+    if any(choice.state.due for choice in found):
+        print(*(obstacle(choice, len(found)) for choice in found), sep="\n")
+        return
+    print(*(sentence_of(choice, args) for choice in found), sep="\n", flush=True)
+    rows = []
+    for choice in found:
+        verdict = judged(choice, args)
+        rows += halving.records(*choice.kind, choice.state, choice.returns, verdict.helps)
+    write_choice(Path(args.runs_dir, choice_file(args.metric)), rows)
+
+
+def sentence_of(choice, args):
+    """Say what a finished choice found."""
+    [winner] = choice.state.candidates
+    share, unit = shared_level(choice.plan), UNITS[args.metric]
+    return sentence(choice.name, winner, choice.number, judged(choice, args), share, unit)
+
+
+def judged(choice, args):
+    """Return the Verdict of a finished choice; a rate of success is one of so many episodes."""
+    episodes = next(iter(choice.runs.values())).number("eval_episodes", 10)
+    episodes = episodes if args.metric == SUCCESS else None
+    return halving.judge(choice.state, choice.plan, choice.returns, episodes)
+
+
+def sentence(name, winner, number, verdict, share=0, unit=""):
+    """Say in one plain sentence what came out.
+
+    name: the algorithm and the environment. number: of configurations that were searched. share:
+    how many verdicts share the level. unit: of the difference.
+    """
+    comparison = verdict.comparison
+    seeds = f"{verdict.seeds} fresh seeds"
+    if verdict.seeds < verdict.planned:
+        seeds = f"stopped after {verdict.seeds} of {verdict.planned} planned fresh seeds"
+    evidence = f"{seeds}, {difference_in_words(comparison, unit)}, p {p_value(comparison.p)}"
+    evidence += smallest(comparison)
+    if verdict.needed < LEVEL:
+        evidence += f", needed: {two_digits(verdict.needed)}"
+        evidence += f" (level shared by {share} verdicts)" if share else ""
+    none = f"none of {number} configurations could be shown to help; the best of them, {winner}"
+    said = none if number > 1 else f"{winner} could not be shown to help"
+    if verdict.helps:
+        said = f"{winner} beats no noise"
+    elif verdict.significant:
+        said = (
+            f"{none}, is worse than no noise" if number > 1 else f"{winner} is worse than no noise"
+        )
+    else:
+        evidence += excluded(comparison, unit)
+    return f"{name}: {said}: {evidence}.{borderline(verdict)}"
+
+
+def borderline(verdict):
+    """Say where the interval and p differ, or ""."""
+    low, high = verdict.comparison.difference_low, verdict.comparison.difference_high
+    excludes_zero = low > 0 or high < 0
+    if math.isnan(low) or excludes_zero == verdict.significant:
+        return ""
+    return f" Borderline: the interval {'excludes' if excludes_zero else 'includes'} zero."
+
+
+def obstacle(choice, choices):
+    """Say that a choice of so many cannot continue, and what to do."""
+    if not choice.state.due:
+        return f"{describe(choice)}; the verdict comes with the others"
+    failed = [run for run in choice.state.due if not choice.runs[run].damage]
+    text = f"{describe(choice)}."
+    if failed:
+        text += " These did not finish; run the same command again to retry them."
+    if failed and not choice.returns:  # then it is not the noise
+        return text + f"\n  If none ever finishes, leave {choice.name} out: see --algos and --envs"
+    for noise in dict.fromkeys(noise for noise, _ in failed if noise != BASELINE):
+        excluded = "+".join(f"{name}@{rate}" for name, rate in zip(*noise.texts, strict=True))
+        text += f'\n  If it fails every time, leave it out: --exclude "{excluded}"'
+        text += " (of all choices of the command, finished ones too)" if choices > 1 else ""
+    return text
+
+
+def write_choice(path, new):
+    """Write choice.csv; it keeps what other commands have chosen.
+
+    new: rows of halving.records.
+    """
+    rows, chosen_now = [CHOICE_COLUMNS], {row[:2] for row in new}
+    try:
+        with rewritten(path) as file:  # other commands may end at the same time
+            if path.exists():
+                with open(path, newline="", encoding="utf-8") as old:
+                    rows = [row for row in csv.reader(old) if tuple(row[:2]) not in chosen_now]
+            if rows[:1] != [CHOICE_COLUMNS]:
+                raise ValueError(f"its columns are not {','.join(CHOICE_COLUMNS)}")
+            csv.writer(file, lineterminator="\n").writerows(rows + new)
+    except (OSError, ValueError) as error:
+        fail(f"cannot write {path} ({in_words(error)})")

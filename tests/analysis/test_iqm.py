@@ -1,0 +1,185 @@
+"""IQM and probability of improvement: rliable's answers, and how often intervals are wrong."""
+
+import numpy as np
+import pytest
+from scipy import stats
+from sweeps import NAN, ROOT
+
+from analysis import statistics
+from analysis.iqm import bootstrap_iqm, iqm, probability_of_improvement
+
+DOCS = ROOT / "docs/statistics.md"
+
+# Inputs (5 x 3, 5 x 3 and 7 x 3) and outputs recorded from rliable 1.2.0.
+X = [[100, 109, 91.8], [73.3, 86.4, 70.3], [101.8, 140.2, 85.2], [81.4, 114.7, 110.7]]
+X = np.array([*X, [103.2, 72.1, 99.1]])
+Y = [[101.8, 49.7, 76.3], [33, 51.3, 91.8], [82.9, 52, 98.1], [94.7, 84.4, 14.5]]
+Y = np.array([*Y, [73.8, 88.5, 93.4]])
+Z = [[44.1, 75.7, 60.6], [65.7, 121.8, 65.8], [89, 116.5, 72.5], [86.6, 93.3, 91.9]]
+Z = np.array([*Z, [53.2, 92.3, 130.8], [43.6, 115.8, 93.6], [70.8, 150, 112.9]])
+
+
+def test_iqm_is_rliables():
+    recorded = [(X, 95.32222222222222), (Y, 77.15555555555555), (Z, 85.85454545454544)]
+    for scores, value in [*recorded, (Z[:, :1], 64.08)]:
+        assert iqm(scores.ravel()) == pytest.approx(value, rel=1e-12)
+        assert bootstrap_iqm(scores)[0] == pytest.approx(value, rel=1e-12)
+
+
+def test_probability_of_improvement_is_rliables():
+    recorded = [(X, Y, 0.72), (Y, X, 0.28), (X, Z, 0.5904761904761905), (X, X, 0.5)]
+    for x, y, probability in [*recorded, (X[:, :1], Z[:, :1], 0.8857142857142857)]:
+        p, low, high = probability_of_improvement(x, y)
+        assert p == pytest.approx(probability, rel=1e-12)
+        assert 0 <= low < p < high <= 1
+
+
+def test_a_missing_run_is_not_a_score():
+    padded = np.vstack([X, np.full((1, 3), NAN)])
+    assert bootstrap_iqm(padded, Y) == bootstrap_iqm(X, Y)
+    assert probability_of_improvement(padded, Y) == probability_of_improvement(X, Y)
+    assert statistics.compare(padded, Y) == pytest.approx(statistics.compare(X, Y), nan_ok=True)
+
+
+@pytest.mark.parametrize(("shift", "envs"), [(0, 1), (1.5, 1), (2.5, 1), (0, 5), (1.5, 5)])
+def test_coverage_of_the_probability_of_improvement(shift, envs):
+    rng = np.random.default_rng(1)
+    truth, inside, trials = stats.norm.cdf(shift / np.sqrt(2)), 0, 400
+    for _ in range(trials):
+        x, y = rng.normal(shift, 1, (5, envs)), rng.normal(0, 1, (5, envs))
+        _, low, high = probability_of_improvement(x, y)
+        inside += low - 1e-12 <= truth <= high + 1e-12
+    assert inside / trials >= 0.9
+
+
+def test_an_iqm_that_may_be_drawn_as_zero_has_no_interval_of_its_change(recwarn):
+    x, y = np.array([[0.0, 1, 1, 1, 1]] * 2).T, np.array([[0.0, 0, 1, 1, 1, 1, 1, 1]] * 2).T
+    value, low, high = bootstrap_iqm(x, y)
+    assert np.isfinite(value) and np.isnan([low, high]).all() and not recwarn.list
+
+
+def two_peaked(rng, shape, share, spread):
+    """Final returns of which a share lies around 1000, the others around 3000."""
+    return rng.normal(np.where(rng.random(shape) < share, 1000, 3000), spread)
+
+
+DISTRIBUTIONS = {
+    "normal": lambda rng, shape: rng.normal(3000, 500, shape),
+    "skewed": lambda rng, shape: 2000 * rng.lognormal(0, 0.5, shape),
+    "20 % low": lambda rng, shape: two_peaked(rng, shape, 0.2, 300),
+}
+MIXTURES = {  # the second is as narrow as the peaks of PPO on HalfCheetah
+    "40 % low": lambda rng, shape: two_peaked(rng, shape, 0.4, 300),
+    "40 % low, narrow": lambda rng, shape: two_peaked(rng, shape, 0.4, 100),
+}
+
+
+def covered(n, intervals, distributions=DISTRIBUTIONS, trials=500):
+    """Percent of samples of n seeds whose interval holds the true IQM: the worst distribution."""
+    worst = 100.0
+    for seed, draw in enumerate(distributions.values()):
+        rng = np.random.default_rng(seed)
+        truth = iqm(draw(rng, 400_000))
+        low, high = intervals(draw(rng, (trials, n)))
+        worst = min(worst, 100 * np.mean((low <= truth) & (truth <= high)))
+    return worst
+
+
+def ours(samples):
+    return np.array([bootstrap_iqm(sample[:, None])[1:] for sample in samples]).T
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("n", "usual", "mixtures"), [(3, 94, 75), (5, 96, 85), (10, 95, 89)])
+def test_coverage_of_the_iqm_is_what_the_page_says(n, usual, mixtures):
+    assert int(covered(n, ours)) == usual
+    assert int(covered(n, ours, MIXTURES)) == mixtures
+    page = " ".join(DOCS.read_text().split())
+    assert f"| {n} | {usual} % | {mixtures} % |" in page
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*DISTRIBUTIONS, *MIXTURES])
+def test_noise_that_does_nothing_improves_nothing(name):
+    """The IQM of skewed returns is not their mean; no improvement must come of that."""
+    rng, draw, found = np.random.default_rng(0), (DISTRIBUTIONS | MIXTURES)[name], []
+    for _ in range(200):
+        found.append(bootstrap_iqm(draw(rng, (10, 5)), draw(rng, (10, 5)), resamples=200))
+    known = np.isfinite(found).all(axis=1)  # a baseline that may be zero has no percent
+    estimate, low, high = np.array(found)[known].T
+    assert known.mean() > 0.98
+    assert abs(estimate.mean()) < 3 * estimate.std() / np.sqrt(len(estimate))
+    assert ((low > 0) | (high < 0)).mean() <= 0.08
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("spread", [500, 50])
+def test_ten_noisy_seeds_do_not_make_up_for_three_of_the_baseline(spread):
+    """Percent of useless noises said to help or harm: 10 noisy seeds, 3 of the baseline.
+
+    With degrees of freedom of the noisy seeds alone, as is usual, it is 10 and 20 %.
+    """
+    rng, trials, wrong = np.random.default_rng(0), 500, 0
+    for _ in range(trials):
+        x, y = rng.normal(3000, spread, (10, 1)), rng.normal(3000, 500, (3, 1))
+        _, low, high = bootstrap_iqm(x, y, resamples=300)
+        wrong += low > 0 or high < 0
+    assert 100 * wrong / trials <= 7
+
+
+def test_satterthwaites_interval_of_three_seeds_is_welchs():
+    """With three seeds the IQM is the mean, so the bootstrap has a known limit: Welch's interval.
+
+    The baseline's IQM is far from zero: dividing by it then adds nothing.
+    """
+    x, y = np.array([[10.0], [40.0], [10.0]]), np.array([[0.0], [1.0], [5.0]])
+    base = 1e6
+    value, low, high = bootstrap_iqm(x + base, y + base, resamples=400_000)
+    welch = stats.ttest_ind(x[:, 0], y[:, 0], equal_var=False).confidence_interval(0.95)
+    assert value == pytest.approx(100 * 18 / base, rel=1e-4)
+    np.testing.assert_allclose([low, high], 100 * np.array(welch) / base, rtol=0.01)
+
+
+def test_iqm_is_scipys():
+    rng = np.random.default_rng(0)
+    for n in range(1, 12):
+        scores = rng.normal(size=(2, 3, n))
+        expected = stats.trim_mean(scores, 0.25, axis=-1)
+        np.testing.assert_allclose(iqm(scores), expected, rtol=1e-12)
+        scores[0, 1, 0] = np.nan
+        assert np.isnan(iqm(scores)).sum() == 1
+
+
+def test_seeds_that_are_all_alike_have_an_interval_of_one_point():
+    assert bootstrap_iqm(np.full((5, 1), 30.0), np.full((3, 1), 20.0)) == (
+        50,
+        50,
+        50,
+    )
+
+
+def test_an_iqm_has_no_percent_of_what_may_be_zero():
+    x, y = np.full((3, 2), 5.0), np.array([[10.0, -1], [11, 1], [12, 2]])
+    assert np.isnan(bootstrap_iqm(x, y)).all()
+    assert np.isfinite(bootstrap_iqm(x[:, :1], y[:, :1])).all()
+
+
+def test_the_change_of_an_iqm_is_relative_to_the_baselines_iqm():
+    """All returns are positive, so it is above -100 %, whatever the baseline's mean is."""
+    x, y = np.full((5, 1), 30.0), np.array([[3000.0], [3000], [3000], [3000], [100]])
+    assert bootstrap_iqm(x, y)[0] == pytest.approx(-99)
+
+
+def test_no_change_of_positive_returns_is_below_minus_100_percent():
+    """Over environments, too, where the baseline's own IQM of changes is not zero."""
+    y = np.array([[145.0, 95], [196, 192], [69, 86], [87, 85], [141, 108]])
+    value, low, _ = bootstrap_iqm(0.01 * y[:3], y)
+    assert value == low == -100
+    found = bootstrap_iqm(np.array([[1.0], [2], [90]]), np.array([[100.0], [110], [120]]))
+    assert found[0] > found[1] == -100
+
+
+def test_an_iqm_has_no_percent_of_what_is_small_beside_the_span():
+    x, y = np.array([[92.0], [93], [94]]), np.array([[1.0], [1.1], [1.2]])
+    assert np.isnan(bootstrap_iqm(x, y)).all()
+    assert np.isfinite(bootstrap_iqm(x / 10, y)).all()

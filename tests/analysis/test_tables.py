@@ -1,0 +1,370 @@
+"""The tables of analyze.py, computed by hand."""
+
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+from sweeps import (
+    ENDING,
+    FINALS,
+    NAN,
+    PUSH,
+    SCALE,
+    drawn_of,
+    row,
+    run,
+    small_sweep,
+    write_pairs,
+    write_run,
+)
+
+import analysis.formatting
+from analysis.comparisons import compare_all
+from analysis.runs import read_runs
+from analysis.studies import make_studies
+from analysis.tables import COLUMNS, family_notes, split_consistency
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory):
+    path = tmp_path_factory.mktemp("sweep")
+    small_sweep(path / "runs")
+    return SimpleNamespace(path=path, tables=run(path))
+
+
+def read(sweep, name):
+    return (sweep.path / "results" / name).read_text()
+
+
+def test_summary(sweep):
+    table = sweep.tables["summary_SAC"]
+    assert list(table.columns) == COLUMNS["summary"] and len(table) == len(FINALS)
+    base = row(table, environment="Hopper-v5", noise="")
+    assert base[["algorithm", "noise_rate", "n", "mean"]].tolist() == ["SAC", "0.00", 4, 115]
+    assert base["std"] == pytest.approx(np.sqrt((15**2 + 5**2 + 5**2 + 15**2) / 3))
+    assert np.isnan(base["difference_percent"]) and base["steps_to_baseline"] == 50_000
+    best = row(table, environment="Hopper-v5", noise=SCALE, noise_rate="0.05")
+    assert best[["mean", "n_baseline", "baseline_mean", "difference"]].tolist() == [145, 4, 115, 30]
+    assert best["difference_percent"] == pytest.approx(100 * 30 / 115)
+    # Only the actual division and that with the two 130s exchanged are so good
+    assert best["p"] == pytest.approx(2 * 2 / 70)
+    assert best["steps_to_baseline"] == 40_000  # 0.8 * 145 = 116 >= 115
+    bad = row(table, environment="Pusher-v5", noise=SCALE, noise_rate="0.20")
+    assert bad["difference_percent"] == pytest.approx(100 * (-55 + 40) / 40)  # over |baseline|
+    assert np.isnan(bad["steps_to_baseline"])
+
+
+def test_a_noise_has_its_rates_together(sweep):
+    table = sweep.tables["noises"]
+    assert list(table.columns) == COLUMNS["noises"] and len(table) == 4
+    both = row(table, environment="Hopper-v5", noise=SCALE)
+    assert both["noise_rate"] == "0.05, 0.20" and both[["n", "n_baseline"]].tolist() == [8, 4]
+    assert both["difference"] == pytest.approx(130 - 115) and both["comparisons"] == 2
+    one = row(table, environment="Hopper-v5", noise=ENDING)
+    assert one["noise_rate"] == "0.05" and one["p"] == pytest.approx(2 / 70)  # C(8, 4) = 70
+    assert one["p_adjusted"] == pytest.approx(2 * 2 / 70)  # of two noises
+    alone = row(sweep.tables["statistics"], environment="Hopper-v5", noise=ENDING)
+    assert alone["p_adjusted"] == one["p_adjusted"]  # its only comparison
+    rates = sweep.tables["statistics"].query("environment == 'Hopper-v5' and noise == @SCALE")
+    assert rates["comparisons"].tolist() == [2, 2]  # a family of their own
+    together = row(sweep.tables["noises_together"], noise=SCALE)
+    assert together[["environments", "n", "n_baseline"]].tolist() == [2, 8, 4]
+
+
+def test_a_noise_that_helps_a_little_at_every_rate_is_found_by_no_single_rate(tmp_path):
+    """Six rates of five seeds each; a gain of one standard deviation."""
+    rng = np.random.default_rng(3)
+    for seed in range(1, 31):
+        write_run(tmp_path / "runs", [100 + 10 * rng.normal()], seed=seed)
+    for rate in (0.01, 0.05, 0.1, 0.2, 0.5, 1.0):
+        for seed in range(1, 6):
+            final = 110 + 10 * rng.normal()
+            write_run(tmp_path / "runs", [final], seed=seed, noise=SCALE, rate=rate)
+    tables = run(tmp_path)
+    assert tables["noises"]["verdict"].tolist() == ["better"]
+    rates = tables["statistics"].query("noise == @SCALE")
+    assert len(rates) == 6 and "better" not in set(rates["verdict"])
+
+
+def test_rates_with_too_few_of_all_seeds_have_no_verdict(tmp_path, capsys):
+    for seed in range(1, 21):
+        write_run(tmp_path / "runs", [100 + seed], seed=seed)
+        for rate in (0.1, 0.2):
+            if seed <= 5:
+                write_run(tmp_path / "runs", [200 + seed], seed=seed, noise=SCALE, rate=rate)
+    tables = run(tmp_path)
+    rates = tables["statistics"].query("noise == @SCALE")
+    assert rates[["p", "verdict"]].isna().all(axis=None) and rates["difference_low"].notna().all()
+    assert tables["noises"]["verdict"].tolist() == ["better"]  # 10 against 20
+    assert (
+        "with 5/20 seeds with and without noise single rates have no verdict"
+        in capsys.readouterr().out
+    )
+
+
+def test_a_runs_value_is_the_mean_of_its_tests_in_the_last_15_percent(tmp_path):
+    """result.json keeps the last test."""
+    write_run(tmp_path / "runs", 18 * [0] + [30, 60], every=50_000)
+    write_run(tmp_path / "runs", 17 * [0] + [30, 60, 90], every=50_000, noise=SCALE, rate=0.1)
+    means = run(tmp_path)["summary_SAC"]["mean"].tolist()
+    assert means == pytest.approx([30, 60])  # three tests: after 850,000 of 1,000,000 steps
+
+
+def test_best(sweep):
+    table = sweep.tables["best"]
+    assert list(table.columns) == COLUMNS["best"] and len(table) == 2
+    pusher = row(table, environment="Pusher-v5")
+    assert pusher[["noise", "noise_rate", "n_baseline", "n", "chosen_from"]].tolist() == [
+        *(SCALE, "0.05", 4, 4, 3)
+    ]
+    assert pusher[["baseline_mean", "noisy_mean", "difference"]].tolist() == [-40, -25, 15]
+    assert pusher["noisy_std"] == pytest.approx(np.sqrt(100 / 3))
+    assert pusher["difference_percent"] == pytest.approx(37.5)
+    # -30 -20 -30 -20 against -50 -40 -30 -40: one of the three -30 is in the baseline, whichever
+    assert pusher["p"] == pytest.approx(2 * 3 / 70) == pusher["p_adjusted"]  # the other's is equal
+
+
+def test_consistent(sweep):
+    good, bad = sweep.tables["consistent"], sweep.tables["consistently_worse"]
+    percents = [100 * 30 / 115, 37.5]
+    best = row(good, noise=SCALE, noise_rate="0.05")
+    assert len(good) == 1
+    assert best[["percent_of_environments", "environments", "n"]].tolist() == [100, 2, 4]
+    assert best["average_improvement_percent"] == pytest.approx(np.mean(percents))
+    assert best["std_improvement_percent"] == pytest.approx(np.std(percents, ddof=1))
+    worst = row(bad, noise=ENDING)  # SCALE at 0.2 matches Hopper's baseline: 50 %, in neither table
+    assert len(bad) == 1 and worst["percent_of_environments"] == 0
+    assert worst["average_improvement_percent"] == pytest.approx((-90 / 1.15 - 100) / 2)
+    together = row(sweep.tables["statistics_together"], noise=ENDING)
+    assert worst[["p", "p_adjusted"]].equals(together[["p", "p_adjusted"]])
+    said = f"Worse at every rate that was tried: {ENDING} (SAC)"
+    assert said in read(sweep, "consistently_worse.md")
+
+
+def test_consistent_is_80_percent_or_more_best_first():
+    shares = {"a": (80, 1), "b": (79.9, 9), "c": (100, 0.5), "d": (0.1, 9), "e": (80, 2)}
+    shares["f"] = (0, -9)
+    names = ("noise", "percent_of_environments", "average_improvement_percent")
+    rows = [dict(zip(names, (noise, *v), strict=True)) for noise, v in shares.items()]
+    study = {"algorithm": "SAC", "exp_name": "", "phase": "", "tested": ""}
+    rows = [study | {"environments": 5} | row for row in rows]
+    rows.append(rows[2] | {"noise": "in one environment only", "environments": 1})
+    good, bad = split_consistency(pd.DataFrame(rows, columns=COLUMNS["consistency"]))
+    assert list(good["noise"]) == ["c", "e", "a"] and list(bad["noise"]) == ["f"]
+
+
+def test_fails_at_every_rate_needs_every_rate(tmp_path):
+    configs = [((), (), 10), (SCALE, 0.1, 5), (SCALE, 0.2, 20), (ENDING, 0.1, 5), (ENDING, 0.2, 9)]
+    for noise, rate, final in configs:
+        for env in ("Hopper-v5", "Walker2d-v5"):
+            write_run(tmp_path / "runs", [final], env=env, noise=noise, rate=rate)
+    table = run(tmp_path)["consistently_worse"].set_index("noise")["fails_at_every_rate"]
+    assert table[SCALE] == "no" and set(table[[ENDING]]) == {"yes"}
+
+
+def test_early_performance(sweep):
+    table = sweep.tables["early_performance"]
+    assert list(table.columns) == COLUMNS["early_performance"]
+    assert set(table["steps_millions"]) == {0.01, 0.02, 0.03, 0.04, 0.05}  # fifths of a short run
+    where = {"environment": "Pusher-v5", "noise": SCALE, "steps_millions": 0.03}
+    early = row(table, noise_rate="0.05", **where)  # 2 final (1 - 0.6) + 0.6 final = 1.4 final
+    assert early["mean"] == pytest.approx(-25 * 1.4) and early["n"] == 4
+    assert early["std"] == pytest.approx(1.4 * np.sqrt(100 / 3))
+    assert row(table, noise_rate="0.00", **where)["mean"] == pytest.approx(-40 * 1.4)
+
+
+def test_early_performance_of_long_runs_is_every_200_000_steps_and_needs_noise(tmp_path):
+    for config in ({}, {"noise": SCALE, "rate": 0.5}):
+        write_run(tmp_path / "runs", range(24), every=50_000, **config)
+    write_run(tmp_path / "runs", range(24), every=50_000, env="Ant-v5")
+    table = run(tmp_path)["early_performance"]
+    assert set(table["environment"]) == {"Hopper-v5"}
+    table = table.query("noise_rate == '0.50'")
+    assert list(table["steps_millions"]) == [0.2, 0.4, 0.6, 0.8, 1.0, 1.2]
+    assert list(table["mean"]) == [3, 7, 11, 15, 19, 23] and table["std"].isna().all()
+
+
+def test_statistics(sweep):
+    table = sweep.tables["statistics"]
+    assert list(table.columns) == COLUMNS["statistics"]
+    base = row(table, environment="Hopper-v5", noise="")
+    assert base["iqm"] == 115 and np.isnan(base[["p", "n_baseline"]].astype(float)).all()
+    even = row(table, environment="Hopper-v5", noise=SCALE, noise_rate="0.20")
+    assert even[["iqm", "n", "n_baseline", "environments"]].tolist() == [107.5, 4, 4, 1]
+    assert even["iqm_change_percent"] == pytest.approx(100 * (107.5 - 115) / 115)
+    assert even["difference"] == even["difference_percent"] == 0 == even["t"] and even["p"] == 1
+    # 90 wins 0, 100 wins 0.5, 115 wins 2, 155 wins 4 of 4: 6.5 of 16
+    assert even["probability_of_improvement"] == pytest.approx(6.5 / 16)
+    worst = row(table, environment="Hopper-v5", noise=ENDING)
+    assert worst["probability_of_improvement"] == 0 < worst["probability_high"] < 0.5
+    assert worst["difference"] == 25 - 115 and np.isnan(worst["difference_low"])  # four seeds
+    spread = np.sqrt(500 / 3)  # of both
+    assert worst["pooled_std"] == pytest.approx(spread)
+    assert worst["effect_size"] == pytest.approx(-90 / spread)
+    assert worst["t"] == pytest.approx(-90 / (spread / np.sqrt(2)))
+    both = row(sweep.tables["statistics_together"], noise=ENDING)
+    assert both["environments"] == 2 and both["n"] == 4 and np.isnan(both["difference"])
+    assert both["effect_size"] == pytest.approx(np.mean([-90 / spread, -40 / np.sqrt(100 / 3)]))
+    assert both["difference_percent"] == pytest.approx(np.mean([-90 / 1.15, -100]))
+    assert both["p"] == pytest.approx(2 / 70**2) == both["smallest_p"]
+
+
+def test_names_of_environments_say_nothing_about_a_row(tmp_path):
+    """They may begin with "all", and no environment is left out of the aggregate."""
+    for env in ("allegro-v0", "allegro_gym:Hand-v0", "PusherHard-v0"):
+        write_pairs(tmp_path / "runs", [100, 101, 102], [130, 131, 132], env=env)
+    tables = run(tmp_path)
+    assert len(tables["noises"]) == 3 and tables["noises_together"]["environments"].tolist() == [3]
+    assert tables["noises_together"]["verdict"].tolist() == ["better"]
+
+
+def test_several_noises_are_one_configuration(tmp_path):
+    write_run(tmp_path / "runs", [10])
+    write_run(tmp_path / "runs", [20], noise=(ENDING, SCALE), rate=(0.05, 0.125))
+    best = run(tmp_path)["best"].iloc[0]
+    assert best["noise"] == f"{ENDING} + {SCALE}" and best["noise_rate"] == "0.05 + 0.125"
+
+
+def test_seeds_are_replicates_and_episodes_are_not(tmp_path):
+    for seed, final in enumerate([1, 2, 4]):
+        write_run(tmp_path / "runs", [final], seed=seed, spread=1000)
+    base = run(tmp_path)["summary_SAC"].iloc[0]
+    assert base["n"] == 3 and base["std"] == pytest.approx(np.std([1, 2, 4], ddof=1))
+
+
+@pytest.fixture(scope="module")
+def sparse(tmp_path_factory):
+    """Three environments: returns without noise of 100, of exactly 0, and of nearly 0."""
+    path = tmp_path_factory.mktemp("sparse")
+    finals = {"Hopper-v5": (100, 120, 90), "Maze-v0": (0, 0, -1), "Car-v0": (-1e-5, 92, -20)}
+    for env, (baseline, better, worse) in finals.items():
+        for seed in range(1, 6):
+            spread = {"Hopper-v5": seed, "Maze-v0": 0, "Car-v0": 1e-6 * seed}[env]
+            config = {"env": env, "seed": seed}
+            write_run(path / "runs", [baseline + spread], **config)
+            write_run(path / "runs", [better + seed / 10], noise=SCALE, rate=0.1, **config)
+            write_run(path / "runs", [worse - seed / 10], noise=ENDING, rate=0.1, **config)
+    return SimpleNamespace(path=path, tables=run(path))
+
+
+def test_an_environment_whose_baseline_is_nearly_zero_is_in_every_table(sparse):
+    best = sparse.tables["best"].set_index("environment")
+    assert set(best["noise"]) == {SCALE} and best["p_luck"].notna().all()
+    told = best["difference_percent"].notna().to_dict()
+    assert told == {"Hopper-v5": True, "Maze-v0": False, "Car-v0": False}
+    [bad] = sparse.tables["consistently_worse"].to_dict("records")
+    assert (bad["noise"], bad["environments"], bad["percent_of_environments"]) == (ENDING, 3, 0)
+    assert bad["without_percent"] == "Car-v0, Maze-v0"
+    assert bad["average_improvement_percent"] == pytest.approx(100 * (89.7 / 103 - 1))
+    every = row(sparse.tables["noises_together"], noise=ENDING)
+    assert every["environments"] == 3 and np.isnan(every["difference_percent"])
+    assert every["verdict"] == "worse" and every["effect_size"] < -1
+    zero = row(sparse.tables["statistics"], environment="Maze-v0", noise=ENDING)
+    assert zero["verdict"] == "worse" and zero["difference"] == pytest.approx(-1.3)
+    assert np.isnan(zero["iqm_change_percent"]) and zero["probability_of_improvement"] == 0
+
+
+def test_numbers_near_zero_are_readable_everywhere(sparse):
+    """In Markdown, LaTeX, figures and the report: no percentage of nothing."""
+    out = sparse.path / "results"
+    why = "No percentage, or not for every noise, on Car-v0 and Maze-v0: "
+    assert why in (out / "best.md").read_text() and why in (out / "report.html").read_text()
+    for name in ("best.md", "best.tex", "summary_SAC.md", "statistics.md", "noises.tex"):
+        text = (out / name).read_text()
+        assert not re.search(r"[0-9]{6}", text.replace(",", "")), name
+        assert "nan" not in text and "inf" not in text
+    effects = drawn_of(sparse.path / "runs")["effects_SAC"].draw()
+    marks = [line.get_xdata()[0] for line in effects.axes[2].lines if line.get_marker() == "o"]
+    assert marks == pytest.approx([-1.3, 0.3])
+
+
+@pytest.mark.parametrize("same", [0.0, -7.3])
+def test_an_environment_without_any_difference_says_nothing(same, tmp_path, capsys):
+    for env, finals in (("Hopper-v5", range(101, 106)), ("A-v0", [same] * 5), ("B-v0", [same] * 5)):
+        noisy = [final - 60 if env == "Hopper-v5" else final for final in finals]
+        write_pairs(tmp_path / "runs", finals, noisy, env=env, spread=0.0)
+    tables = run(tmp_path)
+    assert tables["consistent"].empty and tables["consistently_worse"].empty  # one is left
+    best = row(tables["best"], environment="A-v0")
+    assert (
+        best["difference"] == 0 and np.isnan(best[["difference_percent", "p"]].astype(float)).all()
+    )
+    assert row(tables["noises"], environment="B-v0")["verdict"] == "all equal"
+    assert "in 10,000 steps, so they say nothing about noise" in capsys.readouterr().out
+
+
+def test_five_against_five_cannot_reach_significance_alone_among_90(tmp_path):
+    noises = [f"RandomNormalNoisyReward({i}.0)" for i in range(1, 10)]
+    for noise in ("", *noises):
+        for seed in range(1, 6):
+            config = {"noise": noise, "rate": 0.5} if noise else {}
+            write_run(tmp_path, [bool(noise) * 100 + seed], seed=seed, **config)
+    compared = compare_all(make_studies(read_runs(tmp_path))[0])
+    smallest = compared.noises["smallest_p_adjusted"].iloc[0]
+    assert smallest == pytest.approx(9 * 2 / 252) and compared.noises["p_adjusted"].max() < 0.05
+    [note] = family_notes(compared.noises)
+    assert "with 5 seeds and 9 comparisons no difference alone can be significant" in note
+
+
+def test_two_seeds_have_no_interval(tmp_path):
+    write_pairs(tmp_path / "runs", [11, 12], [21, 22])
+    table = run(tmp_path)["statistics"]
+    assert table["iqm"].notna().all()
+    assert table.filter(regex="_(low|high)$").isna().all(axis=None)
+    assert table["smallest_p"].iloc[1] == pytest.approx(1 / 3)
+
+
+def test_rates_that_change_are_read_and_sorted(tmp_path):
+    for rate in (1.0, "1.0:0.0", 0.05, "0.0:1.0"):
+        write_run(tmp_path / "runs", [12], noise=PUSH, rate=rate)
+    write_run(tmp_path / "runs", [10])
+    write_run(tmp_path / "runs", [20], noise=(PUSH, SCALE), rate=(0.5, "1.0:0.0"))
+    tables = run(tmp_path)
+    rates = tables["summary_SAC"].query("noise == @PUSH")["noise_rate"].tolist()
+    assert rates == ["0.00 to 1.00", "0.05", "1.00 to 0.00", "1.00"]
+    combined = row(tables["summary_SAC"], noise=f"{PUSH} + {SCALE}")
+    assert combined["noise_rate"] == "0.50 + 1.00 to 0.00"
+
+
+# ------------------------------------------------------------------------------------------ as text
+
+
+def test_markdown_and_latex_tables(sweep):
+    markdown, latex = read(sweep, "best.md"), read(sweep, "best.tex")
+    assert "115 \u00b1 13 " in markdown and "+30 (+26 %)" in markdown
+    assert r"115 $\pm$ 13 " in latex and r"\caption{" in latex
+    assert latex.count(r"\begin{longtable}") == latex.count(r"\end{longtable}") == 1
+    body = re.sub(r"\\[%&_#]", "", latex)
+    assert "%" not in body and "_" not in body and latex.isascii()
+
+
+def test_captions_and_notes_are_escaped_as_cells_are(tmp_path):
+    text = r"a~b^c {d} <e> 5 % of $x_1$ & #1 \n"
+    table = analysis.formatting.Table("t", pd.DataFrame({"x": [text]}), text, "", note=text)
+    analysis.formatting.write_table(tmp_path, table, latex=True)
+    lines = (tmp_path / "t.tex").read_text()
+    escaped = (
+        r"a\textasciitilde{}b\^{}c \{d\} \ensuremath{<}e\ensuremath{>} 5 \% of \$x\_1\$ \& \#1 "
+        r"\textbackslash{}n"
+    )
+    assert lines.count(escaped) == 3
+
+
+def test_numbers_that_are_shown_as_one_have_the_digits_of_their_spread():
+    """That is half of an interval, or else a standard deviation."""
+    numbers = {"difference": [12.345, 12.345, NAN], "difference_low": [11.111, NAN, NAN]}
+    numbers |= {"difference_high": [13.579, NAN, NAN], "pooled_std": [0.1, 123.0, NAN]}
+    numbers |= {"baseline_mean": [12.345, 12.345, NAN], "baseline_std": [0.123, NAN, NAN]}
+    table = analysis.formatting.Table("", pd.DataFrame(numbers), "", "", only_csv=("pooled_std",))
+    text = analysis.formatting.shown(table)
+    assert "pooled std" not in text
+    assert list(text["difference"]) == ["12.3 [11.1, 13.6]", "12", "\u2013"]
+    assert list(text["no noise"]) == ["12.35 \u00b1 0.12", "12.35 \u00b1 \u2013", "\u2013"]
+
+
+def test_a_row_of_all_environments_shows_the_range_of_its_baselines():
+    columns = {"n_baseline": [10, 5], "n_baseline_most": [50, 5], "p": [0.5, 0.5]}
+    table = analysis.formatting.Table("t", pd.DataFrame(columns), "", "")
+    assert list(analysis.formatting.shown(table)["n baseline"]) == ["10 to 50", "5"]

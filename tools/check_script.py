@@ -1,0 +1,142 @@
+"""Check that a changed training script still keeps its promises. It takes about a minute.
+
+    python tools/check_script.py my_continuous_noisy.py
+    python tools/check_script.py my_continuous_noisy.py --hidden 64    # with an option of its own
+
+Trains short runs on Pendulum-v1, and prints a line for each promise: "ok", or "FAILED" and what to
+do. The exit status is 0 if all hold. docs/changing.md has the conventions behind them.
+"""
+
+import json
+import sys
+import tempfile
+import traceback
+from dataclasses import asdict
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import torch
+import watched_run
+from watched_run import ROOT, BrokenError, Trial, check, noisy
+
+from analysis.formatting import rounded
+
+
+def acts(trial):
+    """The policy that acts is the one that learns."""
+    assert trial.run  # PPO has a check of its own, which needs random numbers
+    with mock.patch.multiple(torch, randn=torch.zeros, randn_like=torch.zeros_like):
+        run = trial.train("mean_actions")  # in training, too
+    gap, policy = max(run.gaps), run.script.load_policy(run.folder)
+    advice = "act alike in both, and draw noise by torch.randn"
+    check(gap < 1e-4, f"actions in training are {gap:.2g} from those of load_policy(): {advice}")
+    actors = [update for update in run.updates if watched_run.is_saved(update.network, run)]
+    check(actors, "policy.pt has no network that an update learns: give log_test() that one")
+    for update in actors:
+        if found := watched_run.actions_in_loss(update, run):
+            gap = np.abs(np.stack([policy(row) for row in found[0]]) - found[1]).max()
+            advice = "let both call the same method of the network"
+            check(gap < 1e-4, f"{update.name}() learns actions {gap:.2g} from policy()'s: {advice}")
+
+
+def learns(trial):
+    """The learned networks have a gradient, and change."""
+    for update in trial.run.updates:
+        for name, parameter in update.parameters.items():
+            where, gradient = f"{name} in {update.name}()", parameter.grad
+            check(gradient is not None and gradient.any(), f"no gradient of {where}: use it there")
+            same = parameter.equal(update.before[name])
+            check(not same, f"{where} never changes: give the optimizer this network's parameters")
+
+
+def resumes(trial):
+    """Stopped and resumed, a run ends with the same bytes."""
+    for name in ("eval.csv", "policy.pt"):
+        same = trial.read(trial.resumed, name) == trial.read(trial.run, name)
+        check(same, f"another {name}: put all that training changes into `state`, see RESUME")
+
+
+def tests(trial):
+    """Tests do not move training."""
+    once = trial.train("one_test", eval_frequency=0)
+    same = trial.read(once, "policy.pt") == trial.read(trial.run, "policy.pt")
+    check(same, "fewer tests, another policy: play in test_env, and change nothing while testing")
+
+
+def compiles(trial):
+    """Compiled and not, the first updates agree."""
+    run = trial.train("compiled", episodes=3, compile=True)
+    if "not compiled" in run.said:
+        reason = run.said[run.said.index("not compiled") :].splitlines()[0]
+        check("InvalidCxxCompiler" in reason, f"{reason}: write losses in PyTorch alone")
+        return " (skipped: no C++ compiler)"
+    for update, other in zip(trial.run.updates, run.updates, strict=True):
+        for name, value in update.first.items():
+            gap = (other.first[name] - value).abs().max() / value.abs().max().clamp(0.1)
+            check(gap < 1e-4, f"{name} of {update.name}() is {gap:.2g} of it off: change that line")
+
+
+def options(trial):
+    """Options survive a resume, and with others it is another run."""
+    configs = [json.loads(trial.read(run, "config.json")) for run in (trial.run, trial.resumed)]
+    differing = noisy.different_arguments(*configs)
+    check(not differing, f"a resume changes {differing}: leave args as they are")
+    for name, value in asdict(trial.run.args).items():
+        if name not in noisy.MAY_DIFFER_IN_A_RUN and isinstance(value, int | float):
+            other = not value if isinstance(value, bool) else value + 1
+            try:
+                run = trial.train("whole", **{name: other})
+            except BrokenError:
+                continue  # refused
+            same = run.folder == trial.run.folder
+            check(not same, f"{name} {other} is taken for {name} {value}: see resumed_run() in Run")
+
+
+def sweeps(trial):
+    """The sweep knows the script."""
+    words = ["custom", "--algos", trial.algorithm, "--envs", "Pendulum-v1", "--seeds", "1"]
+    words += ["--total-timesteps", "150", "--runs-dir", trial.folder / "swept", "--dry-run"]
+    out = trial.command(
+        ROOT / "benchmark.sh", *words, *(["--", *trial.options] * bool(trial.options))
+    )
+    check(trial.path.name in out, "benchmark.sh --dry-run shows no command with this script")
+
+
+def evaluates(trial):
+    """evaluate.py plays the run's last test again, with the same returns."""
+    words = ["--seed", trial.run.script.TEST_SEED, "--episodes", trial.run.args.eval_episodes]
+    out = trial.command(sys.executable, ROOT / "evaluate.py", trial.run.folder, *words)
+    result = json.loads((trial.run.folder / "result.json").read_text())
+    mean = rounded(result["final_return_mean"])
+    check(mean in out.split(), f"not {mean}: let load_policy() build what config.json says\n{out}")
+
+
+def analyses(trial):
+    """analyze.py knows the run."""
+    out = trial.command(sys.executable, ROOT / "analyze.py", "--runs-dir", trial.run.folder.parent)
+    check(trial.algorithm.upper() in out, f"analyze.py does not name it:\n{out}")
+
+
+PROMISES = [acts, learns, resumes, tests, compiles, options, sweeps, evaluates, analyses]
+
+
+def main(path, *options):
+    """Print a line for each promise; return the exit status."""
+    kept = True
+    with tempfile.TemporaryDirectory() as folder:
+        trial = Trial(Path(path).resolve(), options, Path(folder))
+        for promise in PROMISES:
+            text = promise.__doc__.rstrip(".")
+            try:
+                print(f"ok      {text}{promise(trial) or ''}", flush=True)
+            except Exception as error:
+                if not isinstance(error, BrokenError):
+                    traceback.print_exc()
+                print(f"FAILED  {text}: {error}", flush=True)
+                kept = False
+    return int(not kept)
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

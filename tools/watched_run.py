@@ -1,0 +1,177 @@
+"""Short runs of a training script, trained in this process and watched while they learn."""
+
+import contextlib
+import functools
+import importlib.util
+import io
+import itertools
+import os
+import subprocess
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+import tyro
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+import noisy_wrappers as noisy  # noqa: E402
+
+# A test and the end of a rollout fall within an episode; the buffer is filled twice.
+SMALL = {"env_id": "Pendulum-v1", "total_timesteps": 150, "max_episode_steps": 20}
+SMALL |= {"eval_frequency": 50, "eval_episodes": 2, "compile": False, "buffer_size": 80}
+SMALL |= {"matmul_precision": "highest", "learning_starts": 40, "batch_size": 16}
+SMALL |= {"num_steps": 50, "num_minibatches": 2, "update_epochs": 2}
+
+
+class BrokenError(Exception):
+    """A promise is broken: what is wrong, and what to do."""
+
+
+def check(holds, text):
+    """Raise BrokenError unless something holds."""
+    if not holds:
+        raise BrokenError(text)
+
+
+class Trial:
+    """A script, options of its own, and a folder to try it in."""
+
+    def __init__(self, path, options, folder):
+        self.path, self.options, self.folder = path, options, folder
+        self.algorithm = path.name.removesuffix("_continuous_noisy.py").lower()
+
+    def train(self, name, **kwargs):
+        """Return a short run, watched, in a folder of runs."""
+        return train(self.path, self.options, self.folder / name, **kwargs)
+
+    @functools.cached_property
+    def run(self):
+        """The run that others are compared with."""
+        return self.train("whole")
+
+    @functools.cached_property
+    def resumed(self):
+        """The same run, stopped and resumed."""
+        stopped = self.train("resumed", episodes=4)
+        check(not stopped.finished, "it did not stop after four episodes: ask stop() there")
+        return self.train("resumed")
+
+    def read(self, run, name):
+        """Return a file of a run."""
+        return (run.folder / name).read_bytes()
+
+    def command(self, *words):
+        """Return what a command prints that is started beside the script."""
+        kwargs = {"cwd": self.path.parent, "env": os.environ | {"PYTHON": sys.executable}}
+        result = subprocess.run(list(map(str, words)), capture_output=True, text=True, **kwargs)
+        check(result.returncode == 0, result.stderr.strip() or result.stdout.strip())
+        return result.stdout
+
+
+def train(path, options, runs_dir, episodes=0, **changed):
+    """Train by a script, imported anew as in a new process, and stop after a number of episodes.
+
+    Return what was seen: `updates`, of each updater the loss, the network, its parameters before,
+    its first curves and gradient and its last inputs; and `gaps`, how far the first action after
+    each test was from that of load_policy().
+    """
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    sys.modules[path.stem] = script = importlib.util.module_from_spec(spec)
+    seen = SimpleNamespace(script=script, updates=[], gaps=[], observations=set())
+    said, ended = io.StringIO(), itertools.count(1)
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        try:
+            spec.loader.exec_module(script)
+            args = script.Args()
+            small = {name: value for name, value in SMALL.items() if hasattr(args, name)}
+            args = tyro.cli(script.Args, args=options, default=replace(args, **small))
+            seen.args = replace(args, **{"runs_dir": str(runs_dir)} | changed)
+            seen.folder = noisy.run_folder(asdict(seen.args))
+            script.updater = watch_updates(script.updater, seen)
+            script.learn = watch_actions(script.learn, seen)
+            seen.finished = script.train(seen.args, lambda: next(ended) == episodes)
+        except SystemExit as error:
+            raise BrokenError(said.getvalue().strip().splitlines()[-1]) from error
+    seen.said = said.getvalue()
+    return seen
+
+
+def watch_updates(updater, seen):
+    """Return a script's updater, which notes what it updates."""
+
+    def watched_updater(loss, network, *others):
+        update, name = updater(loss, network, *others), getattr(loss, "__name__", "a loss")
+        parameters = {name: p for name, p in network.named_parameters() if p.requires_grad}
+        before = {name: p.detach().clone() for name, p in parameters.items()}
+        seen.updates.append(SimpleNamespace(name=name, loss=loss, network=network, first={}))
+        vars(seen.updates[-1]).update(parameters=parameters, before=before)
+
+        def watched(*inputs, mine=seen.updates[-1]):
+            curves, mine.inputs = update(*inputs), inputs
+            if not mine.first:
+                mine.first = curves | {name: p.grad.clone() for name, p in parameters.items()}
+            return curves
+
+        return watched
+
+    return watched_updater
+
+
+def watch_actions(learn, seen):
+    """Return a script's learn(), which compares actions with the policy of the last test."""
+
+    def watched_learn(args, env, *others):
+        step, policy_pt, written, observation = env.step, seen.folder / "policy.pt", 0, None
+
+        def watched_step(action):
+            nonlocal written, observation
+            time = policy_pt.stat().st_mtime_ns if policy_pt.exists() else 0
+            if time != written and observation is not None:  # nothing was learned since the test
+                with noisy.kept_generators():
+                    wanted = seen.script.load_policy(seen.folder)(observation)
+                seen.gaps.append(np.abs(wanted - action).max())
+            written, result = time, step(action)
+            observation = None if result[2] or result[3] else result[0]
+            seen.observations.add(np.float32(result[0]).tobytes())
+            return result
+
+        env.step = watched_step
+        return learn(args, env, *others)
+
+    return watched_learn
+
+
+def is_saved(network, seen):
+    """Tell whether policy.pt has a network as it is now."""
+    state, saved = network.state_dict(), seen.script.read_state(seen.folder / "policy.pt")
+    parts = [part for part in saved.values() if isinstance(part, dict)]
+    alike = [part for part in parts if part.keys() == state.keys()]
+    return any(all(map(torch.equal, part.values(), state.values())) for part in alike)
+
+
+def actions_in_loss(update, seen):
+    """Return the observations of an actor's last update, and the actions that it gave critics.
+
+    Nothing is returned where it asked no other network about actions, as in PPO, or where the
+    observations are not as the environment gave them.
+    """
+    inputs = [
+        x
+        for group in update.inputs
+        for x in (group if isinstance(group, list | tuple) else [group])
+    ]
+    batches = [x for x in inputs if torch.is_tensor(x) and x.ndim == 2]
+    raw = [x for x in batches if any(row.tobytes() in seen.observations for row in x.numpy())]
+    own, asked = set(update.network.modules()), []
+
+    def note(module, given):
+        if module not in own:
+            asked.extend(given[1:2])
+
+    with torch.no_grad(), torch.nn.modules.module.register_module_forward_pre_hook(note):
+        update.loss(update.network, *update.inputs)
+    return (raw[0].numpy(), asked[0].numpy()) if raw and asked else ()
