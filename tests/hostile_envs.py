@@ -9,8 +9,6 @@ it is closed: HOSTILE_LOG names it.
 import multiprocessing
 import os
 import random
-import signal
-import sys
 
 import gymnasium as gym
 import numpy as np
@@ -84,12 +82,6 @@ class Hostile(gym.Env):
         log(f"closed {os.getpid()}")
 
 
-class Refused(Hostile):
-    """Its actions are refused."""
-
-    action_space = gym.spaces.Discrete(2)
-
-
 class Broken(Hostile):
     """Its step fails."""
 
@@ -97,82 +89,6 @@ class Broken(Hostile):
         if self.steps == 3:
             raise KeyError("broken")
         return super().step(action)
-
-
-class Exits(Hostile):
-    """Ends the program, as pygame's examples do when their window is closed."""
-
-    def step(self, action):
-        sys.exit()
-
-
-class ExitsAtOnce(Hostile):
-    """Ends the program when it is made."""
-
-    def __init__(self, workers):
-        sys.exit(0)
-
-
-class OfOldAPI(Hostile):
-    """Returns four values."""
-
-    def step(self, action):
-        observation, reward, terminated, _, info = super().step(action)
-        return observation, float(reward[0]), bool(terminated[0]), info
-
-
-class ResetOfOldAPI(Hostile):
-    """Returns an observation alone."""
-
-    def reset(self, **kwargs):
-        return np.append(super().reset(**kwargs)[0], 0.0)
-
-
-class ResetOfNothing(Hostile):
-    """Knows neither seeds nor options."""
-
-    def reset(self):
-        return super().reset()
-
-
-class OtherReward(Hostile):
-    """Returns what is no number, or several."""
-
-    def __init__(self, reward):
-        super().__init__(workers=0)
-        self.reward = reward
-
-    def step(self, action):
-        observation, _, *others = super().step(action)
-        return observation, self.reward, *others
-
-
-class NoInfo(Hostile):
-    """Returns None as info."""
-
-    info = None
-
-
-class BadClose(Hostile):
-    """Cannot be closed."""
-
-    def close(self):
-        raise OSError("no window")
-
-
-class OwnSignals(Hostile):
-    """Takes the signals over, as robots' middleware does."""
-
-    def __init__(self):
-        super().__init__(workers=0)
-        signal.signal(signal.SIGTERM, lambda number, frame: None)
-
-
-class OwnCompiler(Hostile):
-    """Compiles something itself, which fails."""
-
-    def step(self, action):
-        raise torch._dynamo.exc.Unsupported("a graph of its own")
 
 
 class OtherShape(Hostile):
@@ -187,13 +103,8 @@ def register(entry_point, name="", **kwargs):
     gym.register(f"{name or entry_point.__name__}-v0", entry_point, kwargs=kwargs)
 
 
-for entry_point in (Hostile, Refused, Broken, OfOldAPI, ResetOfOldAPI, ResetOfNothing, OtherShape):
-    register(entry_point)
-for entry_point in (NoInfo, BadClose, OwnCompiler, Exits, ExitsAtOnce):
-    register(entry_point, workers=0)
-register(OwnSignals)
+register(Hostile)
+register(Broken)
+register(OtherShape)
 register(Hostile, "HostileAlone", workers=0)
 register(Hostile, "HostileHalf", workers=0, dtype=np.float16)
-register(Hostile, "HostileDouble", workers=0, dtype=np.float64)
-register(OtherReward, "NoReward", reward=None)
-register(OtherReward, "TwoRewards", reward=np.ones(2))

@@ -111,29 +111,6 @@ class Buggy(Count):
         return super().step(action)
 
 
-class BadValue(Count):
-    """Its constructor raises a ValueError."""
-
-    def __init__(self):
-        raise ValueError("of the environment's own")
-
-
-class Overflow(Count):
-    """NumPy is told to raise its own FloatingPointError."""
-
-    def step(self, action):
-        with np.errstate(all="raise"):
-            np.float64(1e308) * 10
-
-
-class TextReward(Count):
-    """Its rewards are texts."""
-
-    def step(self, action):
-        observation, _, terminated, truncated, info = super().step(action)
-        return observation, "1.0", terminated, truncated, info
-
-
 class Parts(Count):
     """Observes a dictionary of the step: as a number, twice, and perhaps as a category."""
 
@@ -151,14 +128,6 @@ class Parts(Count):
             "phase": np.int64(self.steps % 3),
         }
         return {name: observation[name] for name in self.observation_space}
-
-
-class ArrayReward(Count):
-    """Its rewards are arrays of shape (1,), as those of environments made for batches."""
-
-    def step(self, action):
-        observation, reward, terminated, truncated, info = super().step(action)
-        return observation, np.array([reward], np.float32), terminated, truncated, info
 
 
 class Endless(Count):
@@ -237,23 +206,17 @@ register("Count", Count, 8)
 register("Square", Count, 8, shape=(2, 2))
 register("NanReward", Count, 8, break_reward_at=70)
 register("NanObservation", Count, 8, break_observation_at=70)
-register("NanLate", Count, 8, break_reward_at=130)
 register("DictObservation", Parts, 8)
 register("OneHotObservation", Parts, 8, categories=True)
 register("CategoryObservation", Category, 8, observation_space=gym.spaces.Discrete(3))
 register("SequenceObservation", Other, 8, observation_space=sequence)
-register("ArrayReward", ArrayReward, 8)
 register("Endless", Endless, None)
 register("NoLimit", Endless, None, length=20)
 register("DiscreteAction", Other, 8, action_space=gym.spaces.Discrete(3))
 register("Unbounded", Other, 8, action_space=Box(-np.inf, np.inf, (1,)))
-register("Heater", Other, 8, action_space=Box(15, 30, (1,)))
 register("BuggyConstructor", Buggy, 8, where="constructor")
 register("BuggyReset", Buggy, 8, where="reset")
 register("BuggyStep", Buggy, 8, where="step")
-register("BadValue", BadValue, 8)
-register("Overflow", Overflow, 8)
-register("TextReward", TextReward, 8)
 register("Slow", Slow, 100)
 register("OneReset", OneReset, 8)
 register("Talks", Talks, 8)

@@ -300,19 +300,6 @@ def test_observations_become_vectors(env_id, tmp_path):
     assert env.action_space.contains(ppo.load_policy(run_dir)(env.reset()[0]))
 
 
-def test_returns_are_recorded_before_reward_noise(tmp_path):
-    noises = ("RandomUniformScaleReward(100, 100)", "RandomEarlyTermination(3)")
-    run_dir = run("PPO", tmp_path, env_id="toy_envs:Count-v0", noise=noises, noise_rate=(1.0,))
-    assert read_json(run_dir / "result.json")["train_return_mean_last_100"] == 3  # of 3 steps
-    assert {row[2:] for row in evaluations(run_dir)} == {(8.0, 8)}
-
-
-def test_rewards_of_shape_1_are_numbers(tmp_path):
-    array = run("TD3", tmp_path / "array", env_id="toy_envs:ArrayReward-v0")
-    plain = run("TD3", tmp_path / "plain", env_id="toy_envs:Count-v0")
-    torch.testing.assert_close(policy(array), policy(plain), rtol=0, atol=0)
-
-
 def test_time_limits(tmp_path, monkeypatch):
     limit = {"env_id": "toy_envs:Endless-v0", "max_episode_steps": 5}
     run_dir = run("PPO", tmp_path / "own", **limit)
