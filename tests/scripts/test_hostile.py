@@ -8,6 +8,7 @@ import random
 import select
 import signal
 import termios
+import time
 from pathlib import Path
 
 import commands
@@ -158,11 +159,13 @@ class Terminal:
         self.wait_for(b"eval_return=")
 
     def wait_for(self, text):
+        limit = time.monotonic() + commands.LIMIT
         while text not in self.shown:
             if select.select([self.master], [], [], 1)[0]:
                 self.shown += os.read(self.master, 1000)
             else:
-                assert self.process.is_alive(), f"{text} is not in {self.shown}"
+                lives = self.process.is_alive() and time.monotonic() < limit
+                assert lives, commands.kill(self.process) or f"{text} is not in {self.shown}"
 
 
 @pytest.mark.slow

@@ -508,7 +508,8 @@ def test_a_second_process_is_refused_while_the_first_one_lives(tmp_path):
         assert first.is_alive()
         time.sleep(0.01)
     for overwrite in (False, True):
-        second = command("SAC", tmp_path, overwrite=overwrite, **long, learning_starts=10**9)
+        more = {"overwrite": overwrite, "learning_starts": 10**9}
+        second = command("SAC", tmp_path, (TRAINING_STEP, 30, die), **long | more)
         assert second.code == 2
         assert second.err.startswith(f"error: {folder(tmp_path)} is in use by another process")
         assert second.err.count("\n") == 1
