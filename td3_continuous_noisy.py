@@ -422,7 +422,7 @@ class Run:
     """The run's folder: what is written into it, and read again to resume."""
 
     FILES = ["result.json", "checkpoint.pt", "policy.pt", "policy_*.pt", "eval.csv", "config.json"]
-    FILES += ["robustness.csv", "events.out.tfevents.*", "*.tmp"]
+    FILES += ["robustness.csv", "events.out.tfevents.*"]
 
     def __init__(self, args, env):
         """Open the folder; exit if another process uses it, or if it holds a different run."""
@@ -435,7 +435,7 @@ class Run:
         with fail_on(BlockingIOError, f"{self.folder} is in use by another process"):
             fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
         if args.overwrite:
-            self._delete(*self.FILES)
+            self._delete(*self.FILES, *(f"{name}.tmp" for name in self.FILES))
         self.config = noisy.describe_run(__file__, asdict(args), asdict(Args()), env)
         self.config["versions"]["torch"] = torch.__version__
         self.config["matmul_precision"] = torch.get_float32_matmul_precision()
@@ -619,7 +619,7 @@ def read_state(file):
     numpy, types = np._core.multiarray, {type(np.dtype(code)) for code in np.typecodes["All"]}
     types |= {np.ndarray, np.dtype, numpy._reconstruct, numpy.scalar, bytes}
     with torch.serialization.safe_globals(list(types)):
-        return torch.load(file, "cpu", weights_only=True)  # from a GPU, too
+        return torch.load(file, weights_only=True)
 
 
 def stop_at_signals():
