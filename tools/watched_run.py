@@ -37,11 +37,6 @@ def check(holds, text):
         raise BrokenError(text)
 
 
-def last_line(text):
-    """Return the last line of a text."""
-    return text.strip().rpartition("\n")[2]
-
-
 class Trial:
     """A script, options of its own, and a folder to try it in."""
 
@@ -73,7 +68,7 @@ class Trial:
         """Return what a command prints that is started beside the script."""
         kwargs = {"cwd": self.path.parent, "env": os.environ | {"PYTHON": sys.executable}}
         result = subprocess.run(list(map(str, words)), capture_output=True, text=True, **kwargs)
-        check(result.returncode == 0, last_line(result.stderr or result.stdout))
+        check(result.returncode == 0, (result.stdout + result.stderr).strip()[-400:])
         return result.stdout
 
 
@@ -102,7 +97,7 @@ def train(path, options, runs_dir, episodes=0, **changed):
             script.learn = watch_actions(script.learn, seen)
             seen.finished = script.train(seen.args, lambda: next(ended) == episodes)
         except SystemExit as error:
-            raise BrokenError(last_line(said.getvalue())) from error
+            raise BrokenError(said.getvalue().strip().rpartition("\n")[2]) from error
     seen.said = said.getvalue()
     return seen
 
