@@ -2133,7 +2133,7 @@ def check_numbers(args: Mapping[str, Any]) -> None:
 
     >>> check_numbers({"gamma": 1.1})
     Traceback (most recent call last):
-    ValueError: --gamma must be from 0 to 1, not 1.1
+    ValueError: --gamma must be at most 1, not 1.1
 
     Raises:
         ValueError: one is out of its range, or NaN.
@@ -2142,12 +2142,12 @@ def check_numbers(args: Mapping[str, Any]) -> None:
         if not isinstance(value, int | float):
             continue
         option = f"--{name.replace('_', '-')}"
-        if name in _FRACTIONS and not 0 <= value <= 1:
-            raise ValueError(f"{option} must be from 0 to 1, not {value}")
-        if name in _COUNTS and not 1 <= value < 2**63:
-            raise ValueError(f"{option} must be at least 1, and below 2**63, not {value}")
-        if name in _NOT_NEGATIVE and not 0 <= value < 2**63:
-            raise ValueError(f"{option} must be at least 0, and below 2**63, not {value}")
+        low = 1 if name in _COUNTS else 0
+        high = 1 if name in _FRACTIONS else 2**63 - 1
+        if name not in _COUNTS | _NOT_NEGATIVE | _FRACTIONS or low <= value <= high:
+            continue
+        wanted = f"at most {high}" if value > high else f"at least {low}"
+        raise ValueError(f"{option} must be {wanted}, not {value}")
 
 
 def canonical_arguments(args: Mapping[str, Any]) -> dict[str, Any]:

@@ -619,7 +619,7 @@ def read_state(file):
     numpy, types = np._core.multiarray, {type(np.dtype(code)) for code in np.typecodes["All"]}
     types |= {np.ndarray, np.dtype, numpy._reconstruct, numpy.scalar, bytes}
     with torch.serialization.safe_globals(list(types)):
-        return torch.load(file, weights_only=True)
+        return torch.load(file, "cpu", weights_only=True)  # from a GPU, too
 
 
 def stop_at_signals():

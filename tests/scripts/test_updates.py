@@ -357,7 +357,6 @@ def plain_ppo_training(plain, env, args):
     env = wrappers.NormalizeReward(env, gamma=args.gamma)
     env = wrappers.TransformReward(env, lambda reward: np.clip(reward, -10, 10))
     T, rng, ends, epochs = args.num_steps, np.random.default_rng(args.seed), set(), []
-    torch.randn(8, 2), torch.randn(8, 3)  # for the check of acting()
     next_obs, _ = env.reset(seed=args.seed)
     next_done = 0.0
     iterations = args.total_timesteps // T
