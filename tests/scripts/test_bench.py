@@ -179,7 +179,8 @@ def test_an_interpreter_may_be_relative(tmp_path, monkeypatch):
         ("--jobs 2 --against-checkout .", "--jobs compares runs of this version only"),
     ],
 )
-def test_bad_arguments(arguments, message, capsys):
+def test_bad_arguments(arguments, message, monkeypatch, capsys):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1})
     with pytest.raises(SystemExit) as exit_:
         bench.main(arguments.split())
     error = capsys.readouterr().err

@@ -26,6 +26,7 @@ from small_runs import (
     policy,
     refused,
     run,
+    td3_is_slow,
 )
 
 import ppo_continuous_noisy as ppo
@@ -219,18 +220,21 @@ def forget_seeds():
     torch.seed()
 
 
-@each_script
-def test_a_seed_seeds_all_that_is_random(algorithm, tmp_path):
+@td3_is_slow
+def test_a_seed_seeds_all_that_is_random_also_after_a_stop(algorithm, tmp_path):
     runs = {}
-    for name, seed in (("one", 1), ("same", 1), ("other", 2)):
+    for name, seed in (("stopped", 1), ("other", 2), ("one", 1)):
+        forget_seeds()
+        if name == "stopped":
+            run(algorithm, tmp_path / name, episodes=6, seed=seed, **ALONE)
         forget_seeds()
         runs[name] = run(algorithm, tmp_path / name, seed=seed, **ALONE)
     rows = {name: (run_dir / "eval.csv").read_bytes() for name, run_dir in runs.items()}
-    assert rows["one"] == rows["same"] != rows["other"]
-    torch.testing.assert_close(policy(runs["one"]), policy(runs["same"]), rtol=0, atol=0)
+    assert rows["one"] == rows["stopped"] != rows["other"]
+    torch.testing.assert_close(policy(runs["one"]), policy(runs["stopped"]), rtol=0, atol=0)
 
 
-@each_script
+@td3_is_slow
 def test_a_seed_reaches_the_action_space_of_training(algorithm, tmp_path, monkeypatch):
     """An environment may draw from it; that of tests may be the same object."""
     seeds, seed_of_box = [], gym.spaces.Box.seed
@@ -244,24 +248,21 @@ def test_a_seed_reaches_the_action_space_of_training(algorithm, tmp_path, monkey
     assert [seed for seed in seeds if seed is not None] == [7]
 
 
-@each_script
+@td3_is_slow
 def test_tests_neither_notice_training_nor_are_noticed(algorithm, tmp_path):
-    seldom, often = (run(algorithm, tmp_path / str(n), eval_frequency=n, **ALONE) for n in (0, 14))
+    half = {"env_id": "hostile_envs:HostileHalf-v0"}
+    seldom, often = (run(algorithm, tmp_path / str(n), eval_frequency=n, **half) for n in (0, 14))
     assert len(evaluations(often)) > len(evaluations(seldom)) == 3
     torch.testing.assert_close(policy(seldom), policy(often), rtol=0, atol=0)
+    networks = {name: x for name, x in policy(often).items() if "stats" not in name}
+    assert {x.dtype for x in networks.values()} == {torch.float32}  # and actions are float16
     script, results = SCRIPTS[algorithm], []
     for _ in range(2):
         forget_seeds()
-        with script.noisy.make_noisy(script.make_env(ALONE["env_id"]), [], []) as env:
+        with script.noisy.make_noisy(script.make_env(half["env_id"]), [], []) as env:
             env.unwrapped.offset = 0.0
             results.append(script.noisy.play(env, script.load_policy(often), 3, 1))
     np.testing.assert_array_equal(*results)
-
-
-@each_script
-def test_it_resumes_exactly(algorithm, tmp_path, capsys):
-    run(algorithm, tmp_path / "runs", episodes=6, **ALONE, eval_frequency=0)
-    assert_resumes(algorithm, tmp_path / "runs", capsys, **ALONE, eval_frequency=0)
 
 
 # ACTIONS
@@ -285,13 +286,6 @@ def test_actions_at_the_bounds_are_inside_the_space(algorithm, dtype, tmp_path):
             before = action.copy()
             env.step(action)
             np.testing.assert_array_equal(action, before)  # what a buffer stores
-
-
-@each_script
-def test_a_run_with_other_floats_has_networks_of_float32(algorithm, tmp_path):
-    saved = policy(run(algorithm, tmp_path, env_id="hostile_envs:HostileHalf-v0"))
-    networks = {name: tensor for name, tensor in saved.items() if "stats" not in name}
-    assert {tensor.dtype for tensor in networks.values()} == {torch.float32}
 
 
 # THE FOLDER
