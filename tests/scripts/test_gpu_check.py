@@ -21,7 +21,7 @@ def rehearse(folder, **variables):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", ["sac"])  # three CPU minutes each: td3, ppo by hand
+@pytest.mark.parametrize("algorithm", ["sac"])  # five CPU minutes each: td3, ppo by hand
 def test_a_rehearsal_passes(algorithm, tmp_path):
     result = rehearse(tmp_path, ALGORITHMS=algorithm, ENVIRONMENTS="Pendulum-v1")
     assert (result.returncode, result.stderr) == (0, "")
