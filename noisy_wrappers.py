@@ -1688,12 +1688,19 @@ def make_environments(
     constructors draw from the global generators depends on the run's seed, or on ``test_seed``.
 
     Raises:
-        SpaceError: as :func:`make_flat`, or a noise cannot act in this environment.
+        SpaceError: as :func:`make_flat`; the environment is no gymnasium.Env, or does not take one
+            of ``env_kwargs``; or a noise cannot act in it.
     """
     kwargs = parse_env_kwargs(args["env_kwargs"])
     kwargs["max_episode_steps"] = args["max_episode_steps"]
     seed_globals(test_seed)
-    test_env = make_env(args["env_id"], **kwargs)
+    try:
+        test_env = make_env(args["env_id"], **kwargs)
+    except TypeError as error:  # Gymnasium's words for what the user can mend on the command line
+        known = ("unexpected keyword argument", "must inherit from the gymnasium.Env")
+        if not any(text in str(error) for text in known):
+            raise
+        raise SpaceError(str(error)) from error
     seed_globals(args["seed"])
     env = make_env(args["env_id"], **kwargs)
     try:

@@ -447,8 +447,12 @@ def train(args, stop=lambda: 0):
         args.eval_frequency = max(1, min(EVAL_FREQUENCY, args.total_timesteps // 10))
     torch.compiler.reset()  # forget what earlier runs of this process compiled
     torch.set_num_threads(args.torch_threads)
-    precision, with_amx = args.matmul_precision, torch.cpu.get_capabilities().get("amx_tile")
-    if with_amx or args.cuda or precision == "bf16":  # "medium" is bf16 with AMX, TF32 on a GPU
+    precision, processor = args.matmul_precision, torch.cpu.get_capabilities()
+    has_bf16 = any(processor.get(name) for name in ("avx512_bf16", "amx_bf16", "bf16", "sve_bf16"))
+    if precision == "bf16" and not (has_bf16 or args.cuda):
+        fail("--matmul-precision bf16: this processor has no bfloat16, so it would be slower")
+    # "medium" is bfloat16 where there is AMX, and TF32 on a GPU
+    if precision == "bf16" or processor.get("amx_tile") or args.cuda:
         precision = "highest"
     torch.set_float32_matmul_precision(precision)
     with fail_on((gym.error.Error, noisy.SpaceError), f"--env-id {args.env_id}"):
