@@ -28,7 +28,7 @@ lint: $(BIN)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	for script in benchmark.sh sweep/executors.sh .ci/run; do bash -n $$script || exit; done
-	$(BIN)/shellcheck --external-sources --check-sourced benchmark.sh .ci/run
+	$(BIN)/shellcheck --external-sources --check-sourced benchmark.sh .ci/run tools/gpu_check.sh
 
 # The tables that results/study computes from results/data, and the tables in the pages. Those of a
 # finished study were computed once, at the commit that results/tables/README.md names.

@@ -66,12 +66,8 @@ import operator
 import os
 import random
 import re
-import signal
 import subprocess
 import sys
-import tempfile
-import time
-import traceback
 import warnings
 import zlib
 from collections import deque
@@ -1692,12 +1688,19 @@ def make_environments(
     constructors draw from the global generators depends on the run's seed, or on ``test_seed``.
 
     Raises:
-        SpaceError: as :func:`make_flat`, or a noise cannot act in this environment.
+        SpaceError: as :func:`make_flat`; the environment is no gymnasium.Env, or does not take one
+            of ``env_kwargs``; or a noise cannot act in it.
     """
     kwargs = parse_env_kwargs(args["env_kwargs"])
     kwargs["max_episode_steps"] = args["max_episode_steps"]
     seed_globals(test_seed)
-    test_env = make_env(args["env_id"], **kwargs)
+    try:
+        test_env = make_env(args["env_id"], **kwargs)
+    except TypeError as error:  # Gymnasium's words for what the user can mend on the command line
+        known = ("unexpected keyword argument", "must inherit from the gymnasium.Env")
+        if not any(text in str(error) for text in known):
+            raise
+        raise SpaceError(str(error)) from error
     seed_globals(args["seed"])
     env = make_env(args["env_id"], **kwargs)
     try:
@@ -2119,6 +2122,41 @@ def as_json(value: Any) -> Any:
     return json.loads(json.dumps(value, default=str))
 
 
+_COUNTS = {
+    *("total_timesteps", "max_episode_steps", "checkpoint_frequency", "eval_episodes"),
+    *("torch_threads", "buffer_size", "batch_size", "policy_frequency"),
+    *("target_network_frequency", "num_steps", "num_minibatches", "update_epochs"),
+}
+_NOT_NEGATIVE = {
+    *("seed", "eval_frequency", "learning_starts", "policy_lr", "q_lr", "learning_rate", "alpha"),
+    *("exploration_noise", "policy_noise", "noise_clip", "clip_coef", "ent_coef", "vf_coef"),
+    *("max_grad_norm", "target_kl"),
+}
+_FRACTIONS = {"gamma", "gae_lambda", "tau"}
+
+
+def check_numbers(args: Mapping[str, Any]) -> None:
+    """Check the numbers among a script's arguments, {name: value}, of those that it knows.
+
+    >>> check_numbers({"gamma": 1.1})
+    Traceback (most recent call last):
+    ValueError: --gamma must be at most 1, not 1.1
+
+    Raises:
+        ValueError: one is out of its range, or NaN.
+    """
+    for name, value in args.items():
+        if not isinstance(value, int | float):
+            continue
+        option = f"--{name.replace('_', '-')}"
+        low = 1 if name in _COUNTS else 0
+        high = 1 if name in _FRACTIONS else 2**63 - 1
+        if name not in _COUNTS | _NOT_NEGATIVE | _FRACTIONS or low <= value <= high:
+            continue
+        wanted = f"at most {high}" if value > high else f"at least {low}"
+        raise ValueError(f"{option} must be {wanted}, not {value}")
+
+
 def canonical_arguments(args: Mapping[str, Any]) -> dict[str, Any]:
     """Check a script's arguments, {name: value}; return those that have one way to be written.
 
@@ -2493,237 +2531,3 @@ def _without_arrays(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _without_arrays(part) for name, part in value.items()}
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
-
-
-# ------------------------------------------------------------------------------------- going away
-
-
-def rounded(value: float, spread: float | None = None) -> str:
-    """Return a number as text, with two significant digits of its spread.
-
-    ``spread`` is what the number may be off by, in its own units: a standard deviation, or half the
-    width of an interval. The whole part is never cut. Without a spread (none, NaN, zero, or within
-    the rounding errors of floating point) the text has four significant digits.
-
-    >>> rounded(9512.34, 210.0), rounded(0.8712, 0.0342), rounded(-40.0, 8.165)
-    ('9,512', '0.871', '-40.0')
-    >>> rounded(0.8712345), rounded(1234567.8), rounded(0.0, 0.0), rounded(3.2e-7, 1.1e-8)
-    ('0.8712', '1,234,568', '0', '3.20e-07')
-    """
-    if not abs(value) < 1e15:  # beyond the precision of floats, infinite, or NaN
-        return f"{value:.3e}"
-    known = spread is not None and math.isfinite(spread) and spread > 1e-9 * abs(value)
-    digits, scale = (2, spread) if known else (4, abs(value))
-    if not scale:
-        return "0"
-    # "e" rounds first: 0.0996 has the two significant digits of 0.10, not of 0.09
-    decimals = max(0, digits - 1 - int(f"{scale:.{digits - 1}e}".partition("e")[2]))
-    if decimals <= 6:
-        return f"{value:z,.{decimals}f}"
-    if abs(value) < 0.5 * 10.0**-decimals:
-        return "0"
-    exponent = int(f"{value:e}".partition("e")[2])
-    return f"{value:.{max(0, exponent + decimals)}e}"
-
-
-def _raise_if_of_mujoco(error: Exception, name: str) -> None:
-    """Raise ValueError if MuJoCo could not be imported with the renderer that MUJOCO_GL names."""
-    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
-    packages = {frame.f_globals.get("__name__", "").partition(".")[0] for frame in frames}
-    renderer = os.environ.get("MUJOCO_GL")
-    if renderer and packages & {"mujoco", "dm_control"}:
-        raise ValueError(
-            f"{name} imports MuJoCo, which fails with MUJOCO_GL={renderer} ({error}): training "
-            "draws nothing, so unset it; drawing needs the library that it names"
-        ) from error
-
-
-def remarks(env_id: str, env: Env, step_limit: int) -> list[str]:
-    """Return what is worth knowing before training in a :func:`make_flat` environment."""
-    found = []
-    if not isinstance(env.unwrapped.observation_space, gym.spaces.Box):
-        found.append(f"{env_id}: observations are flattened to {env.observation_space}")
-    registered = gym.spec(env_id.rpartition(":")[2]).max_episode_steps
-    if registered is None and env.spec and env.spec.max_episode_steps == step_limit:
-        found.append(f"{env_id} declares no time limit, so --max-episode-steps is {step_limit:,}")
-    if _layers(env, gym.wrappers.NormalizeObservation | gym.wrappers.NormalizeReward):
-        found.append(f"{env_id} normalizes with statistics of its own, which tests do not share")
-    return found
-
-
-def remark_on_bounds(env_id: str, space: gym.spaces.Box) -> str:
-    """Return a remark if N(0, 1), as PPO's first actions are, reaches little of the actions.
-
-    That is: from -2 to 2, less than a tenth of a dimension's range. Where a bound is infinite, or
-    as good as that, nothing is said.
-
-    >>> remark_on_bounds("Heater-v0", gym.spaces.Box(15, 30))  # doctest: +ELLIPSIS
-    "Heater-v0: PPO's first actions are about N(0, 1), which reaches little of these bounds; ..."
-    """
-    low, high = space.low.astype(float), space.high.astype(float)
-    reached = np.clip(2, low, high) - np.clip(-2, low, high)
-    if max(abs(low).max(), abs(high).max()) > 1e6 or (reached >= (high - low) / 10).all():
-        return ""
-    return (
-        f"{env_id}: PPO's first actions are about N(0, 1), which reaches little of these bounds; "
-        "wrap it in gymnasium.wrappers.RescaleAction(env, -1, 1) where it is registered"
-    )
-
-
-def refusals(env_id: str) -> tuple[type[BaseException], ...]:
-    """Return the errors that ``make_flat(gymnasium.make(env_id))`` raises on purpose.
-
-    They are Gymnasium's and this module's. Of Gymnasium's own environments a missing dependency is
-    an ImportError, and some of Gymnasium-Robotics fail an assertion where MuJoCo is too new. An
-    exit is refused, too. Any other error comes from the environment's code. :func:`reason` puts
-    them into words.
-    """
-    spec = gym.registry.get(env_id.rpartition(":")[2])
-    maker: Any = spec.entry_point if spec else ""  # "package.module:Class" or a function
-    package = getattr(maker, "__module__", str(maker)).partition(".")[0]
-    more = {"gymnasium": (ImportError,), "gymnasium_robotics": (AssertionError,)}
-    return (gym.error.Error, SpaceError, SystemExit, *more.get(package, ()))
-
-
-def reason(error: BaseException) -> str:
-    r"""Return what an error says, as one line.
-
-    >>> reason(ValueError("low must not\nexceed high")), reason(KeyError())
-    ('low must not exceed high', 'KeyError')
-    >>> reason(SystemExit(1))
-    'the environment called sys.exit(1)'
-    """
-    if isinstance(error, SystemExit):
-        return f"the environment called sys.exit({error.code!r})"
-    if isinstance(error, RuntimeError) and isinstance(error.__context__, OSError):
-        error = error.__context__  # torch.save hides that the disk is full, say
-    text = " ".join(str(error).split())
-    if not text and isinstance(error, AssertionError) and "gymnasium_robotics" in sys.modules:
-        packages = ("gymnasium-robotics", "mujoco")
-        now = " and ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)
-        text = f'{now} do not work together here; try pip install "mujoco<3.12" (docs/training.md)'
-    return text or type(error).__name__
-
-
-def check_numbers(args: Mapping[str, Any]) -> None:
-    """Check the numbers among a script's arguments, {name: value}.
-
-    >>> check_numbers({"gamma": 1.1})
-    Traceback (most recent call last):
-    ValueError: --gamma must be at most 1, not 1.1
-
-    Raises:
-        ValueError: one is out of its range, or NaN.
-    """
-    at_most = {"gamma": 1, "gae_lambda": 1, "tau": 1, "torch_threads": os.cpu_count()}
-    for name, value in args.items():
-        if type(value) not in (int, float):
-            continue
-        may_be_zero = type(value) is float or name in ("seed", "eval_frequency", "learning_starts")
-        low, high = 0 if may_be_zero else 1, at_most.get(name, 2**63 - 1)
-        if not low <= value <= high:
-            wanted = f"at most {high}" if value > high else f"at least {low}"
-            raise ValueError(f"--{name.replace('_', '-')} must be {wanted}, not {value}")
-    if "num_steps" in args:  # PPO's
-        steps, least, most = args["num_steps"], 2 * args["num_minibatches"], args["total_timesteps"]
-        if not least <= steps <= most:
-            limits = f"2 * --num-minibatches ({least}) to --total-timesteps ({most})"
-            raise ValueError(f"--num-steps must be from {limits}, not {steps}")
-
-
-def note_versions(config: dict[str, Any], matmul_precision: str) -> list[str]:
-    """Note in a run's configuration which versions it uses; say what changed since it began.
-
-    Noted are the versions of Python and of the main packages, the commit of this folder, and the
-    precision of float32 products. Of what changed, all values are kept: ``"2.12.0, 2.13.0"``.
-    """
-    describe = 'git describe --always --dirty --abbrev=40 --exclude="*"'
-    folder = Path(__file__).parent
-    git = subprocess.run(describe, shell=True, cwd=folder, capture_output=True, text=True)
-    now = {"matmul_precision": matmul_precision, "git_commit": git.stdout.strip() or None}
-    modules = [sys.modules.get(name) for name in ("torch", "gymnasium", "mujoco", "numpy")]
-    versions = {module.__name__: module.__version__ for module in modules if module}
-    versions["python"] = sys.version.split()[0]
-    changes = []
-    for old, new in ((config, now), (config.setdefault("versions", {}), versions)):
-        for name, value in new.items():
-            used = str(old.setdefault(name, value))
-            if str(value) not in used.split(", "):
-                changes.append(f"{name} is {value} now; this run had {used} so far")
-                old[name] = f"{used}, {value}"
-    return changes
-
-
-def clean_compiler_cache() -> None:
-    """Remove the empty libraries that a killed PyTorch leaves in its cache (pytorch#102539)."""
-    from torch._inductor.runtime.cache_dir_utils import cache_dir  # which takes seconds
-
-    with contextlib.suppress(OSError):  # another process removed a folder
-        for path in Path(cache_dir()).rglob("*.so"):
-            with contextlib.suppress(OSError):  # or it
-                if path.stat().st_size == 0 and time.time() - path.stat().st_mtime > 60:
-                    path.unlink()
-
-
-def start_again_if_not_compiled(error: Exception) -> None:
-    """Start the program again if an error of a script says that PyTorch could not compile.
-
-    At first with a new cache for the compiler, then, or where there is no compiler, without it.
-    """
-    compiling = type(error).__module__.startswith(("torch._dynamo", "torch._inductor"))
-    if not compiling or "--no-compile" in sys.argv:  # then it is of the environment
-        return
-    text = str(getattr(error, "inner_exception", error)).strip()
-    reason = text.partition("\n")[0] or type(error).__name__
-    try:
-        print(f"not compiled, starting again: {reason}", flush=True)
-    except OSError:  # nobody is left to read it, nor what comes
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    cache, options = f"torchinductor_{os.getpid()}_", []  # os.execv keeps the process number
-    if "No working" in reason or cache in os.environ.get("TORCHINDUCTOR_CACHE_DIR", ""):
-        options = ["--no-compile"]
-    else:
-        os.environ["TORCHINDUCTOR_CACHE_DIR"] = tempfile.mkdtemp(prefix=cache)
-    os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:], *options])
-
-
-def stop_at_signals() -> Callable[[], int]:
-    """Handle SIGTERM, SIGINT and SIGHUP, but a SIGHUP that is ignored, as by nohup.
-
-    Returns stop(), which a script asks whenever an episode ends: it returns the number of the first
-    signal, or 0. A second signal exits at once, but SIGTERM or SIGHUP within a second of the first:
-    pkill and timeout signal a program as well as the one that passes the signal on to it. In worker
-    processes that an environment forks, SIGTERM and SIGHUP act as by default, as ``terminate()``
-    asks, and SIGINT is ignored: Ctrl-C is the script's.
-    """
-    received: list[int] = []
-    time_of_first = 0.0
-
-    def remember(number: int, frame: Any) -> None:
-        nonlocal time_of_first
-        if received:
-            if number == signal.SIGINT or time.monotonic() - time_of_first > 1:
-                os._exit(128 + number)
-            return
-        time_of_first = time.monotonic()  # first: another signal may arrive between the two lines
-        received.append(number)
-        told = b"stopping at the end of this episode; Ctrl-C again to stop without a checkpoint\n"
-        with contextlib.suppress(OSError):  # nobody may be left to read it; print is not safe here
-            os.write(1, told)
-
-    def stop() -> int:
-        # again and again, because the environment may take the signals over
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
-                signal.signal(number, remember)
-        return received[0] if received else 0
-
-    def reset_in_worker() -> None:
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            if callable(signal.getsignal(number)):
-                signal.signal(number, signal.SIG_DFL)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    stop()
-    os.register_at_fork(after_in_child=reset_in_worker)
-    return stop

@@ -389,7 +389,8 @@ def compiled(function):
             fail("a number that a loss reads from args changes too often: pass it to the update", 1)
         except torch._dynamo.exc.TorchDynamoException as error:
             cache = torch._inductor.runtime.cache_dir_utils.cache_dir()
-            say(f"not compiled, so it is slower: {error} (the compiler's cache is {cache})")
+            reason = str(error).strip().partition("\n")[0]
+            say(f"not compiled, so it is slower: {reason} (the compiler's cache is {cache})")
             graph = function
             return function(*inputs)
 
@@ -408,8 +409,12 @@ def train(args, stop=lambda: 0):
         args.eval_frequency = max(1, min(EVAL_FREQUENCY, args.total_timesteps // 10))
     torch.compiler.reset()  # forget what earlier runs of this process compiled
     torch.set_num_threads(args.torch_threads)
-    precision, with_amx = args.matmul_precision, torch.cpu.get_capabilities().get("amx_tile")
-    if with_amx or args.cuda or precision == "bf16":  # "medium" is bf16 with AMX, TF32 on a GPU
+    precision, processor = args.matmul_precision, torch.cpu.get_capabilities()
+    has_bf16 = any(processor.get(name) for name in ("avx512_bf16", "amx_bf16", "bf16", "sve_bf16"))
+    if precision == "bf16" and not (has_bf16 or args.cuda):
+        fail("--matmul-precision bf16: this processor has no bfloat16, so it would be slower")
+    # "medium" is bfloat16 where there is AMX, and TF32 on a GPU
+    if precision == "bf16" or processor.get("amx_tile") or args.cuda:
         precision = "highest"
     torch.set_float32_matmul_precision(precision)
     with fail_on((gym.error.Error, noisy.SpaceError), f"--env-id {args.env_id}"):
@@ -422,7 +427,7 @@ class Run:
     """The run's folder: what is written into it, and read again to resume."""
 
     FILES = ["result.json", "checkpoint.pt", "policy.pt", "policy_*.pt", "eval.csv", "config.json"]
-    FILES += ["robustness.csv", "events.out.tfevents.*", "*.tmp"]
+    FILES += ["robustness.csv", "events.out.tfevents.*"]
 
     def __init__(self, args, env):
         """Open the folder; exit if another process uses it, or if it holds a different run."""
@@ -435,7 +440,7 @@ class Run:
         with fail_on(BlockingIOError, f"{self.folder} is in use by another process"):
             fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
         if args.overwrite:
-            self._delete(*self.FILES)
+            self._delete(*self.FILES, *(f"{name}.tmp" for name in self.FILES))
         self.config = noisy.describe_run(__file__, asdict(args), asdict(Args()), env)
         self.config["versions"]["torch"] = torch.__version__
         self.config["matmul_precision"] = torch.get_float32_matmul_precision()

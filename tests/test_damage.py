@@ -101,7 +101,7 @@ def case(searched, tmp_path, monkeypatch):
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(analyze, "figures", lambda *_: [])
     monkeypatch.setattr(evaluate, "load", lambda *_: nullcontext((gym.make("Pendulum-v1"), None)))
-    monkeypatch.setattr(evaluate, "play_episodes", lambda *_: [(1.0, 1, 0.0)])
+    monkeypatch.setattr(evaluate, "played", lambda *_: [(1.0, 1, 0.0)])
     choice = Path(shutil.copytree(searched, tmp_path / "choice"))
     runs = Path(shutil.copytree(searched / "search", tmp_path / "runs"))
     name = "p1.0_s1_NormalNoisyReward_1.0__Pendulum-v1__ppo_continuous_noisy"

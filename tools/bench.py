@@ -120,7 +120,9 @@ def start_child(core, folder, child, *arguments):
     """Prepare this process before it imports any library, and become a child in a folder."""
     os.chdir(folder)
     os.sched_setaffinity(0, {int(core)})
-    os.environ.update(OMP_NUM_THREADS="1", CUDA_VISIBLE_DEVICES="", JAX_PLATFORMS="cpu")
+    os.environ.update(OMP_NUM_THREADS="1", JAX_PLATFORMS="cpu")
+    if "--cuda" not in arguments:
+        os.environ["CUDA_VISIBLE_DEVICES"] = ""
     of_script = os.path.dirname(arguments[0])
     sys.path[:1] = [of_script, os.path.dirname(of_script)]  # CleanRL's scripts import from its root
     CHILDREN[child](*arguments)

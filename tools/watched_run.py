@@ -68,21 +68,23 @@ class Trial:
         """Return what a command prints that is started beside the script."""
         kwargs = {"cwd": self.path.parent, "env": os.environ | {"PYTHON": sys.executable}}
         result = subprocess.run(list(map(str, words)), capture_output=True, text=True, **kwargs)
-        check(result.returncode == 0, result.stderr.strip() or result.stdout.strip())
+        check(result.returncode == 0, (result.stdout + result.stderr).strip()[-400:])
         return result.stdout
 
 
 def train(path, options, runs_dir, episodes=0, **changed):
     """Train by a script, imported anew as in a new process, and stop after a number of episodes.
 
-    Return what was seen: `updates`, of each updater the loss, the network, its parameters before,
-    its first curves and gradient and its last inputs; and `gaps`, how far the first action after
-    each test was from that of load_policy().
+    Return what was seen: `updates`, for each loss the network that it learns, its parameters before
+    the first update, the curves and the gradient of the first and the inputs of the last; and
+    `gaps`, how far the first action after each test was from that of load_policy().
     """
     spec = importlib.util.spec_from_file_location(path.stem, path)
     sys.modules[path.stem] = script = importlib.util.module_from_spec(spec)
     seen = SimpleNamespace(script=script, updates=[], gaps=[], observations=set())
     said, ended = io.StringIO(), itertools.count(1)
+    if str(path.parent) not in sys.path:
+        sys.path.append(str(path.parent))  # for what it imports
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         try:
             spec.loader.exec_module(script)
@@ -95,7 +97,7 @@ def train(path, options, runs_dir, episodes=0, **changed):
             script.learn = watch_actions(script.learn, seen)
             seen.finished = script.train(seen.args, lambda: next(ended) == episodes)
         except SystemExit as error:
-            raise BrokenError(said.getvalue().strip().splitlines()[-1]) from error
+            raise BrokenError(said.getvalue().strip().rpartition("\n")[2]) from error
     seen.said = said.getvalue()
     return seen
 
@@ -107,13 +109,14 @@ def watch_updates(updater, seen):
         update, name = updater(loss, network, *others), getattr(loss, "__name__", "a loss")
         parameters = {name: p for name, p in network.named_parameters() if p.requires_grad}
         before = {name: p.detach().clone() for name, p in parameters.items()}
-        seen.updates.append(SimpleNamespace(name=name, loss=loss, network=network, first={}))
-        vars(seen.updates[-1]).update(parameters=parameters, before=before)
+        own = SimpleNamespace(name=name, loss=loss, network=network, parameters=parameters)
 
-        def watched(*inputs, mine=seen.updates[-1]):
-            curves, mine.inputs = update(*inputs), inputs
-            if not mine.first:
-                mine.first = curves | {name: p.grad.clone() for name, p in parameters.items()}
+        def watched(*inputs):
+            curves, own.inputs = update(*inputs), inputs
+            if not hasattr(own, "first"):
+                seen.updates.append(own)
+                own.before = before
+                own.first = curves | {name: p.grad.clone() for name, p in parameters.items()}
             return curves
 
         return watched
@@ -159,14 +162,11 @@ def actions_in_loss(update, seen):
     Nothing is returned where it asked no other network about actions, as in PPO, or where the
     observations are not as the environment gave them.
     """
-    inputs = [
-        x
-        for group in update.inputs
-        for x in (group if isinstance(group, list | tuple) else [group])
-    ]
+    inputs, own, asked = [], set(update.network.modules()), []
+    for given in update.inputs:
+        inputs.extend(given if isinstance(given, list | tuple) else [given])
     batches = [x for x in inputs if torch.is_tensor(x) and x.ndim == 2]
     raw = [x for x in batches if any(row.tobytes() in seen.observations for row in x.numpy())]
-    own, asked = set(update.network.modules()), []
 
     def note(module, given):
         if module not in own:

@@ -4,7 +4,7 @@ The other tables are of finished studies, see results/tables/README.md.
 """
 
 from results.study import baselines, claims, physics, pooled
-from results.study.compare import comparisons
+from results.study.compare import comparisons, in_looks
 from results.study.returns import RESULTS, read_returns
 
 SETS = ("ppo_hopper", "sac_200k", "td3_200k", "ppo_walker2d")  # of plans.md, as they finish
@@ -15,6 +15,7 @@ def tables():
     sets = {name: read_returns(name) for name in SETS}
     sets = {name: runs for name, runs in sets.items() if len(runs) and runs["seed"].nunique() > 1}
     found = {name: comparisons(runs) for name, runs in sets.items()}
+    found["ppo_walker2d"] = in_looks(found["ppo_walker2d"])
     return found | {
         "all_runs_batches": pooled.batches(),
         "all_runs_best_noises": pooled.best_noises(),

@@ -131,6 +131,31 @@ def in_words(effect, p):
     return "helps" if effect > 0 else "harms"
 
 
+# Set E of plans.md: after so many seeds a side, the nominal level of p, and what t must reach
+LOOKS = {
+    10: (0.0000011, 0.0),
+    20: (0.00079, 0.3),
+    30: (0.0074, 0.75),
+    40: (0.0220, 1.3),
+    50: (0.0423, np.inf),
+}
+
+
+def in_looks(table):
+    """Return comparisons with the verdict of set E's rule in place of that of one look."""
+    table = table.copy()
+    for index, row in table.iterrows():
+        n = row["n"]
+        t = row["difference"] / np.sqrt(row["sd"] ** 2 / n + row["sd_without"] ** 2 / n)
+        level, least_t = LOOKS.get(n, (0.0, 0.0))
+        if row["p"] <= level:
+            verdict = "helps" if row["difference"] > 0 else "harms"
+        else:
+            verdict = "undecided" if abs(t) < least_t else "under way"
+        table.loc[index, "verdict"] = verdict
+    return table
+
+
 def judge_claim(tests, claimed=1, of=all):
     """Judge a claim by its tests: a list of (effect, corrected p), one for each case.
 

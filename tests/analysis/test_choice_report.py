@@ -97,10 +97,10 @@ def test_a_choice_in_a_folder_of_its_own_disturbs_no_other_sweep(tmp_path):
     for seed in (1, 2, 3):
         write_run(tmp_path / "runs", [100.0 + seed], "PPO", seed=seed)
         write_run(tmp_path / "runs", [110.0 + seed], "PPO", noise=SCALE, rate=1.0, seed=seed)
-    before = [run.folder for run in evaluate.find_runs([tmp_path / "runs"])[0]]
+    before = [run.folder for run in evaluate.find_players([tmp_path / "runs"])[0]]
     tables = run(tmp_path)
     write_choice(tmp_path / "runs/choose")
-    assert [run.folder for run in evaluate.find_runs([tmp_path / "runs"])[0]] == before
+    assert [run.folder for run in evaluate.find_players([tmp_path / "runs"])[0]] == before
     again = run(tmp_path, out="again")
     assert tables.keys() == again.keys() and "choice" not in again
     for name, table in tables.items():

@@ -254,3 +254,25 @@ def test_the_papers_tables_stand_beside_ours(tmp_path):
     half = sweeps.row(early, environment="Hopper-v5", noise_rate="0.05", steps_millions=0.4)
     assert half["paper_mean"] == 2863 and half["n"] == 5 and np.isfinite(half["difference_se"])
     assert len(early) == 75 and len(tables["consistent"]) == 29  # the paper's rows
+
+
+def test_set_e_is_judged_by_its_looks():
+    """Numbers of plans.md: p against the look's level, then t against the limit of futility."""
+    rows = [
+        (10, 0.0000011, 5.0, "harms"),
+        (10, 0.0072, 3.2, "under way"),
+        (11, 0.0000001, 9.0, "under way"),  # no look
+        (20, 0.0008, 0.29, "undecided"),
+        (20, 0.0008, 0.31, "under way"),
+        (30, 0.0074, 2.8, "harms"),
+        (40, 0.0221, 1.29, "undecided"),
+        (50, 0.0424, 2.03, "undecided"),
+    ]
+    table = pd.DataFrame(
+        [
+            {"n": n, "p": p, "difference": -t, "sd": np.sqrt(n / 2), "sd_without": np.sqrt(n / 2)}
+            for n, p, t, _ in rows
+        ]
+    )
+    verdicts = compare.in_looks(table.assign(verdict=""))["verdict"]
+    assert list(verdicts) == [verdict for *_, verdict in rows]

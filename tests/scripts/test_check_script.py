@@ -27,6 +27,11 @@ def reason(promise, trial):
     return str(error.value)
 
 
+def test_a_script_that_never_learns(tmp_path):
+    trial = broken(tmp_path, "td3", ("if global_step > args.learning_starts:", "if False:"))
+    assert "nothing was updated" in reason(check_script.trains, trial)
+
+
 def test_a_formula_of_acting_alone(tmp_path):
     old = "squashed, _ = self.squash(observations, eps)\n        return self.to_bounds(squashed)"
     trial = broken(tmp_path, "sac", (old, old.replace("(squashed)", "(squashed.clamp(0.3, 0.4))")))
@@ -36,7 +41,7 @@ def test_a_formula_of_acting_alone(tmp_path):
 def test_a_formula_of_learning_alone(tmp_path):
     old = "z = (actions - self.actor_mean(observations)) / self"
     trial = broken(tmp_path, "ppo", (old, old.replace("(observations)", "(observations).relu()")))
-    assert "acts with one policy and learns another" in reason(check_script.acts, trial)
+    assert "acts with one policy and learns another" in reason(check_script.trains, trial)
 
 
 def test_acting_with_an_old_copy(tmp_path):
@@ -87,7 +92,7 @@ def test_a_compiled_loss_that_is_another(tmp_path):
     old = "return -q1.mean(), {"
     new = "q1 = q1 * (1.001 if torch.compiler.is_compiling() else 1.0)\n    " + old
     trial = broken(tmp_path, "td3", (old, new))
-    assert "of actor_loss() is" in reason(check_script.compiles, trial)
+    assert "of actor_loss() by" in reason(check_script.compiles, trial)
 
 
 @pytest.mark.slow
@@ -113,7 +118,7 @@ def test_an_option_whose_default_changes(tmp_path):
 def test_options_that_are_not_compared(tmp_path):
     old = "self.config = noisy.resumed_run(json.loads(config.read_text()), self.config)"
     trial = broken(tmp_path, "ppo", (old, "pass"))
-    assert "is taken for" in reason(check_script.options, trial)
+    assert "leave resumed_run() in Run" in reason(check_script.options, trial)
 
 
 @pytest.mark.slow
@@ -161,3 +166,9 @@ def test_a_line_for_each_promise(tmp_path, capsys, monkeypatch):
     assert "ZeroDivisionError" in err
     monkeypatch.setattr(check_script, "PROMISES", [holds])
     assert check_script.main(path) == 0
+
+
+def test_no_more_than_a_line_where_it_does_not_train(tmp_path, capsys):
+    old = "    # SETUP\n"
+    assert check_script.main(broken(tmp_path, "ppo", (old, "    fail('no', 1)\n" + old)).path) == 1
+    assert capsys.readouterr().out == "FAILED  It trains: error: no\n"

@@ -56,13 +56,13 @@ class Plain(Sensors):
         return super().observe()["arm"]
 
 
-class Unbounded(Plain):
+class HalfBounded(Plain):
     """One action is bounded on one side only; for PPO."""
 
     action_space = Box(np.float32([-np.inf, -0.01]), np.float32([0.01, np.inf]))
 
 
-for environment in (Sensors, Plain, Unbounded):
+for environment in (Sensors, Plain, HalfBounded):
     gym.register(f"{environment.__name__}-v0", environment, max_episode_steps=20)
 
 
@@ -127,7 +127,7 @@ def follow_page(algorithm, env_id, folder):
 @pytest.mark.parametrize(
     ("algorithm", "env_id"),
     [(algorithm, env_id) for algorithm in SMALL for env_id in ("Pendulum-v1", "Plain-v0")]
-    + [("ppo", "Unbounded-v0")],
+    + [("ppo", "HalfBounded-v0")],
 )
 def test_numpy_alone_plays_a_policy(algorithm, env_id, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -137,7 +137,7 @@ def test_numpy_alone_plays_a_policy(algorithm, env_id, tmp_path, monkeypatch):
     np.testing.assert_allclose(played, actions, rtol=0, atol=1e-5)
     assert played.dtype == actions.dtype
     assert (np.ptp(actions, 0) > 1e-3).all()  # or this shows less than it seems to
-    if env_id == "Unbounded-v0":
+    if env_id == "HalfBounded-v0":
         assert names["low"].tolist() == [-np.inf, np.float32(-0.01)]
         assert (actions[:, 0] == np.float32(0.01)).any()  # and it is clipped there
 

@@ -341,3 +341,28 @@ def test_links_in_the_folder_are_not_followed(run_dir, tmp_path):
     run("PPO", tmp_path / "runs", overwrite=True, **ALONE)
     assert target.read_text() == "mine"
     assert not any(path.is_symlink() for path in run_dir.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("source", "options", "message"),
+    [
+        ("class Strange: pass", {}, "must inherit from the gymnasium.Env class"),
+        (
+            "from gymnasium.envs.classic_control.pendulum import PendulumEnv as Strange",
+            {"env_kwargs": ("mass:2.0",)},
+            "unexpected keyword argument 'mass'",
+        ),
+    ],
+)
+def test_an_environment_that_cannot_be_made_is_one_line(
+    source, options, message, tmp_path, monkeypatch, capsys
+):
+    module = f"strange_{len(options)}"
+    register = f"import gymnasium as gym\n{source}\ngym.register('{module}-v0', Strange)\n"
+    (tmp_path / f"{module}.py").write_text(register)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as exit:
+        ppo.train(ppo.Args(env_id=f"{module}:{module}-v0", compile=False, **options))
+    error = capsys.readouterr().err
+    assert exit.value.code == 2 and error.count("\n") == 1 and message in error
+    assert not Path("runs").exists()

@@ -425,6 +425,19 @@ def test_options_are_the_scripts_own_business(words, made, elsewhere, tmp_path):
     assert other.code == 2 and "not other" in other.err
 
 
+def test_the_noise_of_tests_is_part_of_a_runs_name(tmp_path):
+    """However it is spelt."""
+    grid = ["baseline", *GRID, "--total-timesteps", "9", "--runs-dir", tmp_path, "--"]
+    grid += ["--test-noise", "RandomNormalNoisyAction(.10)", "--test-noise-rate", "0.50"]
+    [folder] = folders(*grid)
+    assert folder.name.endswith("__tests_p0.5_NormalNoisyAction_0.1")
+    stored = {"test_noise": ["RandomNormalNoisyAction(0.1)"], "test_noise_rate": [0.5]}
+    finish(folder, 9, env_id="Pendulum-v1", exp_name="sac_continuous_noisy", **stored)
+    assert "1 run, 0 to do" in view("list", *grid).err
+    wrong = view("list", *grid[:-4], "--test-noise", "Nope(1)", "--test-noise-rate", "1")
+    assert wrong.code == 2 and "error: --test-noise: bad noise 'Nope(1)'" in wrong.err
+
+
 def test_names_of_options_are_checked_where_nothing_is_to_do(one):
     grid, folder = one
     finish(folder, env_id="Pendulum-v1")

@@ -3,7 +3,6 @@
 import re
 import sys
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from cases import A, B, C, hypothesis_settings
@@ -15,8 +14,6 @@ from noisy_wrappers import (
     Configuration,
     canonical_env_id,
     parse_env_kwargs,
-    reason,
-    refusals,
     run_name,
 )
 from sweep.grid import NOISES as NOISES_OF_THE_PAPER
@@ -231,22 +228,3 @@ def test_a_module_may_add_to_the_path(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="Nothing"):
         canonical_env_id("my_path:Nothing-v0")
     assert sys.path == [*path, "/opt/simulator"]
-
-
-def test_an_assertion_is_a_refusal_only_of_a_package_that_asserts_its_versions():
-    gym.register("Asserting-v0", "gymnasium_robotics.fetch:Env")
-    gym.register("Own-v0", "my_envs:Env")
-    assert AssertionError in refusals("Asserting-v0")
-    assert not {AssertionError, ImportError} & set(refusals("my_envs:Own-v0"))
-
-
-def test_an_assertion_without_words_is_told_with_versions(monkeypatch):
-    assert reason(AssertionError()) == "AssertionError"
-    monkeypatch.setitem(sys.modules, "gymnasium_robotics", sys)
-    monkeypatch.setattr(
-        "importlib.metadata.version", {"gymnasium-robotics": "1.4", "mujoco": "3.15"}.get
-    )
-    told = reason(AssertionError())
-    assert told.startswith("gymnasium-robotics 1.4 and mujoco 3.15 do not work together")
-    assert 'pip install "mujoco<3.12"' in told and "\n" not in told
-    assert reason(AssertionError("its own words")) == "its own words"

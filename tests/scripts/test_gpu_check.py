@@ -1,0 +1,60 @@
+"""tools/gpu_check.sh: a rehearsal on the CPU, with the fewest steps that take every branch."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import bench
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+def rehearse(folder, **variables):
+    variables |= {"PYTHON": sys.executable, "RUNS_DIR": str(folder), "STEPS": "320"}
+    command = [ROOT / "tools" / "gpu_check.sh", "--rehearse"]
+    result = subprocess.run(command, env=os.environ | variables, capture_output=True, text=True)
+    print(result.stdout, result.stderr)
+    return result
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algorithm", ["sac"])  # five CPU minutes each: td3, ppo by hand
+def test_a_rehearsal_passes(algorithm, tmp_path):
+    result = rehearse(tmp_path, ALGORITHMS=algorithm, ENVIRONMENTS="Pendulum-v1")
+    assert (result.returncode, result.stderr) == (0, "")
+    assert "FAILED" not in result.stdout
+    title, *parts = result.stdout.split("\n## ")
+    assert title.startswith("rehearsed on the CPU, ")
+    rows = [re.findall(r"^\| .+", part, re.MULTILINE)[1:] for part in parts]
+    assert len(rows[0]) == 2  # eager and compiled
+    compiled, eager, resumed = rows[1]
+    assert resumed.endswith("eval.csv as without a stop |")
+    speeds = [[cell.strip() for cell in row.split("|")[2:-1]] for row in rows[2]]
+    assert len(speeds) == (5 if algorithm == "ppo" else 6)
+    assert all(float(one.replace(",", "")) > 0 for one, _ in speeds)
+    assert all(two for _, two in speeds[:2]) and not any(two for _, two in speeds[2:])
+    log = (tmp_path / f"{algorithm}-Pendulum-v1-resumed.log").read_text()
+    assert "resumed at step 192" in log
+
+
+@pytest.mark.slow
+def test_what_fails_is_told(tmp_path):
+    result = rehearse(tmp_path, ALGORITHMS="td3", ENVIRONMENTS="NoSuch-v0")
+    assert result.returncode == 1 and result.stdout.count("| FAILED: see ") == 3
+    assert "\nFAILED in " in result.stdout
+
+
+@pytest.mark.parametrize(("flags", "seen"), [([], "''"), (["--cuda"], "'0'")])
+def test_bench_shows_the_gpu_only_to_programs_with_cuda(flags, seen, tmp_path, monkeypatch):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
+    script = tmp_path / "script.py"
+    script.write_text("import os, sys; sys.exit(repr(os.environ['CUDA_VISIBLE_DEVICES']))")
+    core = min(os.sched_getaffinity(0))
+    with (
+        bench.Program("it", core, "_script", script, *flags) as program,
+        pytest.raises(SystemExit, match=f"^{seen}\n"),
+    ):
+        bench.advance(program)
