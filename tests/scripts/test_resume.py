@@ -11,6 +11,8 @@ import random
 import resource
 import shutil
 import signal
+import subprocess
+import sys
 import time
 import zipfile
 from dataclasses import field, make_dataclass
@@ -405,7 +407,7 @@ def test_a_damaged_checkpoint_is_noticed(stopped, capsys):
     with zipfile.ZipFile(path) as archive:
         members = [member for member in archive.infolist() if member.file_size]
     damaged = [whole[:1000], whole[: len(whole) // 2], whole[:-1], whole[100:], b"", b"an essay"]
-    for member in members[:: max(1, len(members) // 8)] + members[-3:]:
+    for member in members[:: max(1, len(members) // 4)] + members[-3:]:
         header = whole[member.header_offset :][:30]
         lengths = int.from_bytes(header[26:28], "little") + int.from_bytes(header[28:], "little")
         damaged.append(bytearray(whole))
@@ -560,6 +562,23 @@ def test_a_run_of_0_3_is_not_resumed(algorithm, tmp_path, capsys):
     line = refused(capsys, SCRIPTS[algorithm].train, args)
     assert "a run of version 0.3, whose numbers differ: finish it with that one" in line
     assert "--exp-name" in line and files(run_dir) == before
+
+
+@pytest.mark.slow
+def test_tools_read_runs_of_0_3(tmp_path):
+    for run_dir in OLD_RUNS.values():
+        shutil.copytree(run_dir, tmp_path / run_dir.name)
+    names = [run_dir.name for run_dir in OLD_RUNS.values()]
+    tested = commands.run(ROOT / "evaluate.py", ["--episodes", "1", *names], cwd=tmp_path)
+    analysed = commands.run(ROOT / "analyze.py", ["--runs-dir", "."], cwd=tmp_path)
+    for algorithm in SCRIPTS:
+        assert f"Pendulum-v1    {algorithm}  " in tested.out
+        assert f"{algorithm}: 600 steps, seeds: 1, " in analysed.out
+    assert tested.code == analysed.code == 0 and tested.err == analysed.err == ""
+    line = [ROOT / "benchmark.sh", "status", "--runs-dir", tmp_path]
+    environment = os.environ | {"PYTHON": sys.executable}
+    counted = subprocess.check_output(line, text=True, env=environment)
+    assert "3 runs: 3 done, " in counted and "by release 0.3, and this is 0.4" in counted
 
 
 # WHY AT THE END OF AN EPISODE

@@ -431,7 +431,7 @@ def test_nan_stops_the_run(what, tmp_path):
     assert not list(tmp_path.glob("*/result.json")) + list(tmp_path.glob("*/policy.pt"))
 
 
-@each_script
+@td3_is_slow
 def test_a_loss_that_is_not_finite_stops_the_run(algorithm, tmp_path):
     rate = {
         "SAC": {
@@ -460,7 +460,7 @@ CHARTS += "noise/RandomNormalNoisyReward/applied_fraction noise/RandomNormalNois
 CHARTS += "noise/RandomEarlyTermination/applied_fraction noise/RandomEarlyTermination/rate"
 
 
-@each_script
+@td3_is_slow
 def test_curves(algorithm, tmp_path):
     noise = {"noise": NOISES, "noise_rate": (0.5, 0.25), "total_timesteps": 120}
     noise |= {} if algorithm == "PPO" else {"learning_starts": 95}

@@ -246,7 +246,7 @@ def assert_equal_networks(state, *networks):
     "case",
     [
         pytest.param({}, marks=pytest.mark.slow),
-        {"autotune": False, "alpha": 0.4},
+        pytest.param({"autotune": False, "alpha": 0.4}, marks=pytest.mark.slow),
         {"policy_frequency": 3, "target_network_frequency": 2, "q_lr": 3e-3, **NOISE},
     ],
 )
@@ -269,11 +269,14 @@ def test_sac_trains_as_a_plain_implementation(case, tmp_path):
     assert (alpha != pytest.approx(args.alpha)) == args.autotune
 
 
+LOUD = {"policy_frequency": 3, "policy_noise": 1.0, "noise_clip": 0.7, "exploration_noise": 0.8}
+
+
 @pytest.mark.parametrize(
     "case",
     [
         pytest.param({}, marks=pytest.mark.slow),
-        {"policy_frequency": 3, "policy_noise": 1.0, "noise_clip": 0.7, "exploration_noise": 0.8},
+        pytest.param(LOUD, marks=pytest.mark.slow),
         {"policy_frequency": 1, "learning_rate": 1e-3, **NOISE},
     ],
 )
@@ -392,14 +395,21 @@ def plain_ppo_training(plain, env, args):
     return normalizing, epochs
 
 
-LOOSE = {"norm_adv": False, "clip_vloss": False, "anneal_lr": False, "max_grad_norm": 100.0}
+LOOSE = {
+    "num_minibatches": 5,
+    "norm_adv": False,
+    "clip_vloss": False,
+    "anneal_lr": False,
+    "max_grad_norm": 100.0,
+}
 TIGHT = {"bootstrap_truncated": True, "clip_coef": 0.02, "vf_coef": 1.0, "max_grad_norm": 0.1}
 STOPS = {"target_kl": 0.004, "learning_rate": 3e-3}
 
 
-@pytest.mark.parametrize(
-    "case", [{"ent_coef": 0.01}, LOOSE | {"num_minibatches": 5}, TIGHT, STOPS | NOISE]
-)
+SLOW = [pytest.param(c, marks=pytest.mark.slow) for c in ({"ent_coef": 0.01}, LOOSE)]
+
+
+@pytest.mark.parametrize("case", [*SLOW, TIGHT, STOPS | NOISE])
 def test_ppo_trains_as_a_plain_implementation(case, tmp_path):
     args = ppo.Args(**ON_POLICY | case)
     env = make_env(args)
