@@ -640,13 +640,11 @@ def test_a_number_of_args_that_changes_too_often_says_what_to_do(graphs, capsys)
 
 @pytest.mark.slow
 def test_what_cannot_be_compiled_is_computed_without(monkeypatch, capsys):
-    (network, other, x), real = two_networks(), torch.compile
+    network, other, x = two_networks()
     plain = copy.deepcopy(network)
-
-    def backend(graph, inputs):
-        raise RuntimeError("no compiler:\nnone of five works")
-
-    monkeypatch.setattr(torch, "compile", lambda f, **kwargs: real(f, backend=backend, **kwargs))
+    monkeypatch.setattr(torch._inductor.config.cpp, "cxx", (None, "/no/compiler"))
+    monkeypatch.setattr(torch._inductor.config, "force_disable_caches", True)
+    torch.compiler.reset()
     for learned in (network, plain):
         optimizer = torch.optim.SGD(learned.parameters(), lr=0.1)
         args = sac.Args(compile=learned is network)
@@ -655,7 +653,7 @@ def test_what_cannot_be_compiled_is_computed_without(monkeypatch, capsys):
             with torch.no_grad():
                 update(other, x, 0.3)
     out = capsys.readouterr().out
-    assert "not compiled, so it is slower: " in out and "no compiler: none of five works" in out
+    assert out.startswith("not compiled, so it is slower: ") and "/no/compiler" in out
     assert "the compiler's cache is " in out and out.count("\n") == 1
     torch.testing.assert_close(network.state_dict(), plain.state_dict(), rtol=0, atol=0)
 
