@@ -148,6 +148,26 @@ def test_a_signal_to_the_group_ends_all_processes(tmp_path, log):
     assert_closed(log())
 
 
+def interrupt_twice(*args):
+    for _ in range(2):
+        os.kill(0, signal.SIGINT)  # of the group, as a terminal does
+        time.sleep(0.2)  # or the two are one for a worker that is not running
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason="workers ignore the second Ctrl-C as well as the first")
+def test_a_second_ctrl_c_ends_the_workers_too(tmp_path, log):
+    assert commands.ended(start(tmp_path, (STEP, 50, interrupt_twice))).code == -signal.SIGINT
+    workers = [int(line.split()[1]) for line in log() if line.startswith("worker")]
+    try:
+        for _ in range(50):
+            time.sleep(0.1 * any(map(is_alive, workers)))
+        assert not any(map(is_alive, workers))
+    finally:
+        for worker in filter(is_alive, workers):
+            os.kill(worker, signal.SIGKILL)
+
+
 class Terminal:
     """A terminal with a script in it, and what it shows."""
 
