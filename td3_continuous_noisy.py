@@ -389,7 +389,7 @@ def compiled(function):
             fail("a number that a loss reads from args changes too often: pass it to the update", 1)
         except torch._dynamo.exc.TorchDynamoException as error:
             cache = torch._inductor.runtime.cache_dir_utils.cache_dir()
-            reason = str(error).strip().partition("\n")[0]
+            reason = " ".join(str(error).split())[:200]
             say(f"not compiled, so it is slower: {reason} (the compiler's cache is {cache})")
             graph = function
             return function(*inputs)

@@ -288,7 +288,7 @@ def test_a_signal_ends_the_episode_and_the_run_resumes(numbers, code, tmp_path):
     result = command("PPO", tmp_path, (TRAINING_STEP, 65, send(*numbers)), **hopper("PPO"))
     assert (result.code, result.err) == (code, "")
     told = "stopping after this episode; Ctrl-C again stops without a checkpoint\n"
-    assert result.out.count(told) == len(numbers)
+    assert 1 <= result.out.count(told) <= len(numbers)  # two that arrive at once may be one
     assert result.out.endswith("\nstopped; run the same command again to resume\n")
     checkpoint = ppo.read_state(folder(tmp_path) / "checkpoint.pt")
     assert 65 <= checkpoint["step"] < 100
