@@ -8,8 +8,8 @@ SHELL := bash
 .PHONY: demo test changes lint results clean
 
 demo: $(BIN)/.run
-	@echo "Ten runs of PPO, five of them with noise: about three minutes on one core"
-	PYTHON=$(BIN)/python ./benchmark.sh demo
+	@echo "Ten runs of PPO, five of them with noise: about two minutes on one core"
+	PYTHON=$(BIN)/python ./benchmark.sh demo -- --no-compile  # so short that compiling does not pay
 	$(BIN)/python analyze.py --runs-dir runs/demo >runs/demo/logs/analysis.txt
 	@echo
 	@sed '/^$$/q' runs/demo/logs/analysis.txt  # the verdict

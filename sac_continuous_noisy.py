@@ -483,6 +483,8 @@ class Run:
         self.config["versions"]["torch"] = torch.__version__
         self.config["matmul_precision"] = torch.get_float32_matmul_precision()
         self.is_finished = (self.folder / "result.json").exists()
+        if self.is_finished:
+            self._delete("checkpoint.pt")  # of a process that was killed before it could
         config = self.folder / "config.json"
         if config.exists():
             with fail_on(ValueError, str(self.folder)):
@@ -636,7 +638,7 @@ class Run:
         }
         self._write("result.json", json.dumps(self.result, indent=2) + "\n")
         self._delete("checkpoint.pt")
-        say(f"{self.folder} is finished: {self.last_test}")
+        say(f"{self.folder} is finished: {self.last_test.rstrip()}")
         say(f"See its curves with: tensorboard --logdir {self.args.runs_dir}")
 
     def _delete(self, *patterns):
@@ -670,14 +672,14 @@ def stop_at_signals():
     received, script = [], os.getpid()
 
     def remember(number, frame):
-        if os.getpid() != script:  # a process that the environment has forked
-            if number != signal.SIGINT:  # Ctrl-C is for the script
-                os._exit(128 + number)
-            return
         received.append(number)
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # a second Ctrl-C ends the program at once
-        with contextlib.suppress(OSError):  # print() is not safe in here
-            os.write(1, b"stopping after this episode; Ctrl-C again stops without a checkpoint\n")
+        is_forked = os.getpid() != script  # by the environment; the first Ctrl-C is for the script
+        is_second_ctrl_c = number == signal.SIGINT and len(received) > 1
+        if is_second_ctrl_c or (is_forked and number != signal.SIGINT):
+            os._exit(128 + number)
+        if not is_forked:
+            with contextlib.suppress(OSError):  # print() is not safe in here
+                os.write(1, b"stopping after this episode; Ctrl-C again: without a checkpoint\n")
 
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         if signal.getsignal(number) != signal.SIG_IGN:  # as nohup has it

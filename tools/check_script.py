@@ -32,7 +32,7 @@ def trains(trial):
 
 def acts(trial):
     """The policy that acts is the one that learns."""
-    with mock.patch.multiple(torch, randn=torch.zeros, randn_like=torch.zeros_like):
+    with mock.patch.multiple(torch, randn=watched_run.zeros, randn_like=torch.zeros_like):
         run = trial.train("mean_actions")  # in training, too
     check(run.gaps, "it was not tested before its end: see TEST in learn()")
     gap, policy = max(run.gaps), run.script.load_policy(run.folder)

@@ -31,6 +31,11 @@ class BrokenError(Exception):
     """A promise is broken: what is wrong, and what to do."""
 
 
+def zeros(*size, generator=None, **options):
+    """Stand in for torch.randn."""
+    return torch.zeros(*size, **options)
+
+
 def check(holds, text):
     """Raise BrokenError unless something holds."""
     if not holds:
