@@ -65,7 +65,7 @@ PRESETS = {  # what a preset sets: its noises with their rates, and grid options
         "algos": ["ppo"],
         "envs": ["InvertedPendulum-v5"],
         "seeds": [range(1, 6)],
-        "total_timesteps": 16_384,
+        "total_timesteps": 20_480,
         "runs_dir": "runs/demo",  # never into a sweep's folders: these runs are shorter
     },
     "baseline": {},

@@ -115,7 +115,7 @@ def test_other_presets():
     assert all(line.endswith("--runs-dir runs/choose/search") for line in chosen.out.splitlines())
     assert view("status", *C.split()).out.startswith("runs/choose: ")
     assert [(x.seed, x.noise, x.total_timesteps) for x in dry_run("demo")] == [
-        (seed, noise, 16_384)
+        (seed, noise, 20_480)
         for seed in range(1, 6)
         for noise in ([], ["RandomNormalNoisyObservation(1.0)"])
     ]
