@@ -9,7 +9,7 @@ SHELL := bash
 
 demo: $(BIN)/.run
 	@echo "Ten runs of PPO, five of them with noise: about two minutes on one core"
-	PYTHON=$(BIN)/python ./benchmark.sh demo -- --no-compile --learning-rate 1e-3  # as short as it can be
+	PYTHON=$(BIN)/python ./benchmark.sh demo
 	$(BIN)/python analyze.py --runs-dir runs/demo >runs/demo/logs/analysis.txt
 	@echo
 	@sed '/^$$/q' runs/demo/logs/analysis.txt  # the verdict

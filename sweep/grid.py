@@ -59,13 +59,15 @@ ABLATION += [
 # Times as many seeds without noise as with it, at most: with more, a test of few seeds claims too
 # much where noise widens the spread, and the analysis gives no verdict (analysis/verdicts.py)
 MOST_BASELINES = 2.6
-PRESETS = {  # what a preset sets: its noises with their rates, and grid options
+PRESETS = {  # what a preset sets: its noises with their rates, grid options, the scripts' options
     "demo": {
         "pairs": [("RandomNormalNoisyObservation(1.0)", 1.0)],  # harms with any five seeds
         "algos": ["ppo"],
         "envs": ["InvertedPendulum-v5"],
         "seeds": [range(1, 6)],
         "total_timesteps": 20_480,
+        # compiling would take longer than learning, which is faster than by default
+        "options": ["--no-compile", "--learning-rate", "1e-3"],
         "runs_dir": "runs/demo",  # never into a sweep's folders: these runs are shorter
     },
     "baseline": {},

@@ -56,6 +56,7 @@ def parse_args(view, caller, argv):
     if preset not in PRESETS and not (preset is None and view == "status"):
         named = words[0] if words else ""
         fail(f"unknown preset {named!r}; choose one of {', '.join(PRESETS)}")
+    extra = [*PRESETS.get(preset, {}).get("options", []), *extra]
     known = flags(parser)
     given = {word.partition("=")[0] for word in words if word.startswith("--")}
     for name in sorted(given.difference(known)):

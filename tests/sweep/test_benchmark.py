@@ -1060,4 +1060,4 @@ def test_an_environment_and_runs_in_the_callers_folder(tmp_path, stub):
     assert shown.code == 0 and shown.out.startswith(f"{tmp_path / python} ppo_"), shown.err
     # In the project, the path stays relative.
     inside = run("demo", "--dry-run", cwd=ROOT / "docs", script=ROOT / "benchmark.sh")
-    assert inside.out.splitlines()[0].endswith("--runs-dir docs/runs/demo")
+    assert " --runs-dir docs/runs/demo " in inside.out.splitlines()[0]

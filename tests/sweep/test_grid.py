@@ -45,6 +45,8 @@ def dry_run(*args):
         parser.add_argument(option, required=True, type=int)
     parser.add_argument("--noise", nargs="+", default=[])
     parser.add_argument("--noise-rate", nargs="+", default=[])
+    parser.add_argument("--no-compile", action="store_true")  # the demo's
+    parser.add_argument("--learning-rate")
     return [parser.parse_args(shlex.split(line), argparse.Namespace(text=line)) for line in lines]
 
 
