@@ -9,7 +9,6 @@ import json
 import math
 import os
 import re
-import shlex
 from collections.abc import Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -19,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from analysis.errors import fail
-from analysis.logs import STOPPED, Log, is_locked, read_log  # noqa: F401  until sweep/ has moved
 from noisy_wrappers import BASELINE, MAY_DIFFER_IN_A_TABLE, Configuration, release
 
 SEARCH, CONFIRMATION = PHASES = ("search", "confirmation")  # the folders of a choice
@@ -320,41 +318,3 @@ def rewritten(path):
             os.replace(new, path)
         finally:
             new.unlink(missing_ok=True)
-
-
-# ------------------------------------------------------------------------- until sweep/ has moved
-
-
-def read_config(folder):
-    """Read config.json as sweep/ did before there was read_run."""
-    run = read_identity(folder)
-    return {
-        "algorithm": run.algorithm,
-        "environment": run.environment,
-        "exp_name": run.exp_name,
-        "configuration": run.configuration,
-        "seed": run.seed,
-        "episodes": run.args["eval_episodes"],
-        "total": run.total_timesteps,
-        "args": run.args,
-        "settings": {name: run.args[name] for name in run.args if name not in NOT_SETTINGS},
-        "versions": run.versions,
-        "run": run,
-    }
-
-
-def read_result(folder, config):
-    """Read result.json as sweep/ did; config: from read_config."""
-    return read_result_of(config["run"])
-
-
-def flat_choice(runs_dir):
-    """Say how to sort the runs of a choice that an earlier version left side by side."""
-    fresh = "*_s1[0-9][0-9][0-9]_*"  # the seeds of its confirmation
-    steps = [f"cd {shlex.quote(str(runs_dir))}", f"mkdir {SEARCH} {CONFIRMATION}"]
-    steps += [f"mv {fresh} {CONFIRMATION}/"] if any(runs_dir.glob(fresh)) else []
-    steps += [f"mv *__*__* {SEARCH}/"]
-    return (
-        f"{runs_dir} holds the runs of a choice side by side, as earlier versions left them. They "
-        f"have two folders now: {' && '.join(steps)}"
-    )

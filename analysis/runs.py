@@ -13,8 +13,7 @@ from pathlib import Path
 import pandas as pd
 
 from analysis import folders
-from analysis.choice import CHOICE_COLUMNS, choice_file  # noqa: F401  until sweep/ has moved
-from analysis.folders import NOT_SETTINGS, SEARCH, SUCCESS, DamageError, Run, script_name  # noqa
+from analysis.folders import NOT_SETTINGS, SEARCH, DamageError, Run, script_name
 from analysis.logs import STOPPED, read_log
 from noisy_wrappers import BASELINE, different_arguments
 
@@ -259,17 +258,3 @@ def ranges(numbers):
         else:
             parts.append([number, number])
     return ", ".join(f"{low}" if low == high else f"{low}-{high}" for low, high in parts)
-
-
-# ------------------------------------------------------------------------- until sweep/ has moved
-
-
-def read_run(folder):
-    """Read one run folder as sweep/choose.py did before there was folders.read_run."""
-    entry = read_entry(Path(folder), "")
-    row = {"status": entry.status, "reason": entry.reason}
-    if entry.status == "finished":
-        curve = entry.run.curve
-        row |= {"steps": curve.steps, "returns": curve.returns}
-        row["success_rates"] = curve.success_rates
-    return row

@@ -271,6 +271,3 @@ def headlines(by_noise, best):
             luck = luck_sentence(best[rows_of(best, key)])
         lines.append({"name": study_name(*key), "tried": tried, "counts": counts, "luck": luck})
     return lines
-
-
-difference = difference_in_words  # until sweep/ has moved
