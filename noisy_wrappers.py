@@ -85,18 +85,41 @@ from numpy.typing import NDArray
 
 __version__ = "0.4.0"
 
-# fmt: off
 __all__ = [
-    "NoiseWrapper", "ObservationNoise", "RewardNoise", "RandomNormalNoisyObservation",
-    "RandomUniformNoisyObservation", "RandomUniformScaleObservation", "RandomMixupObservation",
-    "RandomDropoutObservation", "RandomObservationBias", "RandomObservationDelay",
-    "RandomNormalNoisyReward", "RandomUniformNoisyReward", "RandomUniformScaleReward",
-    "RandomNormalNoisyAction", "RandomActionDelay", "RandomEarlyTermination", "RandomDynamics",
-    "WRAPPERS", "signatures", "parse_noise", "make_noisy", "Configuration", "BASELINE",
-    "set_progress", "noise_wrappers", "noise_statistics", "make_flat", "FiniteNumbers",
-    "NotFiniteError", "SpaceError", "EnvState", "kept_generators", "run_name",
+    "NoiseWrapper",
+    "ObservationNoise",
+    "RewardNoise",
+    "RandomNormalNoisyObservation",
+    "RandomUniformNoisyObservation",
+    "RandomUniformScaleObservation",
+    "RandomMixupObservation",
+    "RandomDropoutObservation",
+    "RandomObservationBias",
+    "RandomObservationDelay",
+    "RandomNormalNoisyReward",
+    "RandomUniformNoisyReward",
+    "RandomUniformScaleReward",
+    "RandomNormalNoisyAction",
+    "RandomActionDelay",
+    "RandomEarlyTermination",
+    "RandomDynamics",
+    "WRAPPERS",
+    "signatures",
+    "parse_noise",
+    "make_noisy",
+    "Configuration",
+    "BASELINE",
+    "set_progress",
+    "noise_wrappers",
+    "noise_statistics",
+    "make_flat",
+    "FiniteNumbers",
+    "NotFiniteError",
+    "SpaceError",
+    "EnvState",
+    "kept_generators",
+    "run_name",
 ]
-# fmt: on
 
 Env = gym.Env[Any, Any]
 Info = dict[str, Any]
@@ -417,9 +440,15 @@ class RandomNormalNoisyObservation(ObservationNoise):
     """
 
     def __init__(
-        self, env: Env, noise_rate: Rate, scale: Scale, *,
-        loc: float = 0.0, relative: bool = False, keys: Keys = None
-    ):  # fmt: skip
+        self,
+        env: Env,
+        noise_rate: Rate,
+        scale: Scale,
+        *,
+        loc: float = 0.0,
+        relative: bool = False,
+        keys: Keys = None,
+    ):
         self.scale, self.loc = _scale_or_scales(scale), _number("loc", loc)
         parameters = {"scale": self.scale, "loc": self.loc, "relative": relative}
         super().__init__(env, noise_rate, **parameters, keys=keys)
@@ -443,9 +472,15 @@ class RandomUniformNoisyObservation(ObservationNoise):
     """
 
     def __init__(
-        self, env: Env, noise_rate: Rate, low: float, high: float, *,
-        relative: bool = False, keys: Keys = None
-    ):  # fmt: skip
+        self,
+        env: Env,
+        noise_rate: Rate,
+        low: float,
+        high: float,
+        *,
+        relative: bool = False,
+        keys: Keys = None,
+    ):
         self.low, self.high = _interval(low, high)
         parameters = {"low": self.low, "high": self.high, "relative": relative}
         super().__init__(env, noise_rate, **parameters, keys=keys)
@@ -470,9 +505,15 @@ class RandomUniformScaleObservation(ObservationNoise):
     """
 
     def __init__(
-        self, env: Env, noise_rate: Rate, low: float, high: float, *,
-        per_dimension: bool = False, keys: Keys = None
-    ):  # fmt: skip
+        self,
+        env: Env,
+        noise_rate: Rate,
+        low: float,
+        high: float,
+        *,
+        per_dimension: bool = False,
+        keys: Keys = None,
+    ):
         self.low, self.high = _interval(low, high)
         self.per_dimension = _flag("per_dimension", per_dimension)
         parameters = {"low": self.low, "high": self.high, "per_dimension": per_dimension}
@@ -827,9 +868,15 @@ class RandomEarlyTermination(NoiseWrapper):
     kind = "dynamics"
 
     def __init__(
-        self, env: Env, noise_rate: Rate, low: int | None = None, high: int | None = None, *,
-        each_step: bool = False, truncate: bool = False
-    ):  # fmt: skip
+        self,
+        env: Env,
+        noise_rate: Rate,
+        low: int | None = None,
+        high: int | None = None,
+        *,
+        each_step: bool = False,
+        truncate: bool = False,
+    ):
         of_recorders = ("return_queue", "get_episode_rewards")  # Gymnasium's, Stable-Baselines3's
         if any(env.has_wrapper_attr(name) for name in of_recorders):
             raise ValueError(
@@ -905,9 +952,14 @@ class RandomDynamics(NoiseWrapper):
     kind = "dynamics"
 
     def __init__(
-        self, env: Env, noise_rate: Rate, low: float, high: float, *,
-        fields: tuple[str, ...] = ("body_mass", "geom_friction")
-    ):  # fmt: skip
+        self,
+        env: Env,
+        noise_rate: Rate,
+        low: float,
+        high: float,
+        *,
+        fields: tuple[str, ...] = ("body_mass", "geom_friction"),
+    ):
         self.low, self.high = _interval(low, high, least=0)
         self.fields = _fields(fields)
         super().__init__(env, noise_rate, low=self.low, high=self.high, fields=self.fields)
@@ -1005,11 +1057,18 @@ class RandomDynamics(NoiseWrapper):
             scaled.undo()
 
 
-# fmt: off
 # Fields of MuJoCo's model that are usually randomized.
 _USUAL_FIELDS = (
-    "body_mass", "body_inertia", "geom_friction", "jnt_stiffness", "dof_armature", "dof_damping",
-    "dof_frictionloss", "actuator_gainprm", "actuator_forcerange", "actuator_gear",
+    "body_mass",
+    "body_inertia",
+    "geom_friction",
+    "jnt_stiffness",
+    "dof_armature",
+    "dof_damping",
+    "dof_frictionloss",
+    "actuator_gainprm",
+    "actuator_forcerange",
+    "actuator_gear",
 )
 _FRICTIONS = ("geom_friction", "pair_friction")
 _SCALED_ALONG = {"body_mass": "body_inertia", "actuator_gainprm": "actuator_biasprm"}
@@ -1020,14 +1079,29 @@ _STRENGTH_IN_GAIN = {0: _PARAMETER < 3, 1: _PARAMETER < 3, 2: np.isin(_PARAMETER
 _STRENGTH_IN_BIAS = {0: _PARAMETER < 0, 1: np.isin(_PARAMETER, (1, 2)), 2: _STRENGTH_IN_GAIN[2]}
 # What mj_setConst computes from others (engine_setconst.c), in the model and in model.stat.
 _DERIVED_FIELDS = (
-    "body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "dof_length",
-    "actuator_acc0", "actuator_length0", "tendon_invweight0", "tendon_length0",
-    "tendon_lengthspring", "eq_data", "cam_pos0", "cam_poscom0", "cam_mat0", "light_pos0",
-    "light_poscom0", "light_dir0", "flexedge_length0", "flexedge_invweight0", "flex_vertmetric",
+    "body_subtreemass",
+    "body_invweight0",
+    "dof_invweight0",
+    "dof_M0",
+    "dof_length",
+    "actuator_acc0",
+    "actuator_length0",
+    "tendon_invweight0",
+    "tendon_length0",
+    "tendon_lengthspring",
+    "eq_data",
+    "cam_pos0",
+    "cam_poscom0",
+    "cam_mat0",
+    "light_pos0",
+    "light_poscom0",
+    "light_dir0",
+    "flexedge_length0",
+    "flexedge_invweight0",
+    "flex_vertmetric",
     "flex_vert0",
 )
 _DERIVED_STATISTICS = ("meaninertia", "meanmass")  # others are of the picture
-# fmt: on
 
 
 class _ScaledModel:
@@ -1134,15 +1208,22 @@ def _check_fields(model: Any, fields: tuple[str, ...]) -> None:
 # -------------------------------------------------------------------- noises in words, and combined
 
 
-# fmt: off
 _IN_ORDER = (
-    RandomNormalNoisyObservation, RandomUniformNoisyObservation, RandomUniformScaleObservation,
-    RandomMixupObservation, RandomDropoutObservation, RandomNormalNoisyReward,
-    RandomUniformNoisyReward, RandomUniformScaleReward, RandomEarlyTermination,
-    RandomNormalNoisyAction, RandomActionDelay, RandomDynamics, RandomObservationBias,
+    RandomNormalNoisyObservation,
+    RandomUniformNoisyObservation,
+    RandomUniformScaleObservation,
+    RandomMixupObservation,
+    RandomDropoutObservation,
+    RandomNormalNoisyReward,
+    RandomUniformNoisyReward,
+    RandomUniformScaleReward,
+    RandomEarlyTermination,
+    RandomNormalNoisyAction,
+    RandomActionDelay,
+    RandomDynamics,
+    RandomObservationBias,
     RandomObservationDelay,
 )
-# fmt: on
 WRAPPERS: dict[str, type[NoiseWrapper]] = {wrapper.__name__: wrapper for wrapper in _IN_ORDER}
 
 
@@ -2063,13 +2144,16 @@ def safe_name(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9._=+-]", lambda match: "-" if match[0] == "/" else "--", text)
 
 
-# fmt: off
 # The scripts' arguments that change nothing about what a run learns. A run may be resumed with
 # others, and a finished one counts as done whatever it had.
 MAY_DIFFER_IN_A_RUN = {
-    "runs_dir", "overwrite", "torch_threads", "compile", "checkpoint_frequency", "keep_policies",
+    "runs_dir",
+    "overwrite",
+    "torch_threads",
+    "compile",
+    "checkpoint_frequency",
+    "keep_policies",
 }
-# fmt: on
 # Runs with other values of these may stand in one row of a table, too: a GPU rounds otherwise, and
 # tests do not touch training. But a run keeps to the ones that it began with.
 MAY_DIFFER_IN_A_TABLE = MAY_DIFFER_IN_A_RUN | {"cuda", "eval_frequency"}
