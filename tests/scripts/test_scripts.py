@@ -531,7 +531,7 @@ def test_command_line(tmp_path):
     assert len(lines) == 2  # not a terminal: plain lines, of each test
     mean = read_json(run_dir / "result.json")["final_return_mean"]
     assert re.fullmatch(rf"step=60/60 sps=\d+ eval_return={mean:.2f} eta=00:00", last)
-    assert finished.rstrip() == f"{run_dir} is finished: eval_return={mean:.2f}"
+    assert finished.rstrip() == f"{run_dir} is finished after 60 steps: eval_return={mean:.2f}"
     assert tensorboard == f"See its curves with: tensorboard --logdir {tmp_path}"
     again = command("PPO", *flags(args))
     assert (again.code, again.out, again.err) == (0, f"{run_dir} is finished\n", "")
