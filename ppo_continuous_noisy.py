@@ -37,15 +37,14 @@ from tqdm import tqdm
 
 import noisy_wrappers as noisy
 
-TEST_SEED = 1_000_000  # of the first test episode; the same in every test of every run
-STEP_LIMIT = 10_000  # of an episode, where neither the environment nor the user sets one
-EVAL_FREQUENCY = 50_000  # default of --eval-frequency; at most a tenth of the run
-NUMBERS = (int, float, np.float64)  # which an update makes tensors of
+TEST_SEED = 1_000_000  # seed of the first test episode, in every test of every run
+STEP_LIMIT = 10_000  # time limit of episodes, if neither the environment nor the user sets one
+EVAL_FREQUENCY = 50_000  # default of --eval-frequency, or a tenth of the run if that is less
 
 
 @dataclass
 class Args:
-    """Command-line arguments; the algorithm's are those of CleanRL and the paper (Appendix A.2)."""
+    """Command-line arguments; the algorithm's are CleanRL's, as in the paper on noise."""
 
     env_id: str = "HalfCheetah-v5"  # RUN: Gymnasium environment, Name-v0, or module:Name-v0
     seed: int = 1  # seed of everything that is random
@@ -56,12 +55,12 @@ class Args:
     runs_dir: str = "runs"  # folder in which the run's own folder is made
     overwrite: bool = False  # delete the files in the run's folder and start again
     checkpoint_frequency: int = 50_000  # environment steps between two checkpoints
-    noise: tuple[str, ...] = ()  # NOISE: noises of the training environment; the baseline has none
-    noise_rate: tuple[float | str, ...] = ()  # probability of each noise; 1.0:0.0 falls linearly
-    test_noise: tuple[str, ...] = ()  # TESTS: noises of the test environment; it has none
+    noise: tuple[str, ...] = ()  # NOISE: noises of the training environment; none: a baseline
+    noise_rate: tuple[float | str, ...] = ()  # probability of each; 1.0:0.0 falls during training
+    test_noise: tuple[str, ...] = ()  # TESTS: noises of the test environment; none by default
     test_noise_rate: tuple[float, ...] = ()  # probability of each test noise
     eval_episodes: int = 10  # episodes in each test
-    eval_frequency: int | None = None  # steps between tests; None: up to 50,000; 0: only at the end
+    eval_frequency: int | None = None  # steps between tests; None: 50,000 or less; 0: only the last
     keep_policies: bool = False  # keep the policy of every test as policy_STEP.pt
 
     cuda: bool = False  # SPEED: train on a GPU (not tested on one yet); these networks are small
@@ -89,13 +88,13 @@ class Args:
 
 
 def make_env(env_id, **kwargs):
-    """Make the clean environment: observations and actions are vectors, and every episode ends."""
+    """Make the environment, with vectors as observations and actions; train() adds the noise."""
     env = gym.make(env_id, disable_env_checker=True, **kwargs)
     return noisy.make_flat(env, STEP_LIMIT)
 
 
 def mlp(inputs, outputs, std):
-    """Two hidden layers of 64 tanh units, with orthogonal weights; the last of scale `std`."""
+    """Two hidden layers of 64 tanh units; orthogonal weights, with gain `std` in the last layer."""
     layers = [nn.Linear(inputs, 64), nn.Linear(64, 64), nn.Linear(64, outputs)]
     for layer, gain in zip(layers, (math.sqrt(2), math.sqrt(2), std), strict=True):
         nn.init.orthogonal_(layer.weight, gain)
@@ -126,7 +125,7 @@ class Agent(nn.Module):
 
 
 class Saved:
-    """Base of a class whose attributes, numbers and arrays, are all saved."""
+    """Base class: state_dict() holds every attribute, numbers and arrays."""
 
     def state_dict(self):
         """Return the attributes by name."""
@@ -158,7 +157,7 @@ class Normalizer(Saved):
 
 
 class RewardScaler(Saved):
-    """Running variance of the discounted return, as in Gymnasium's NormalizeReward, in floats."""
+    """Running variance of the discounted return, as in Gymnasium's NormalizeReward."""
 
     def __init__(self):
         self.discounted_return, self.mean, self.var, self.count = 0.0, 0.0, 1.0, 1e-4
@@ -179,7 +178,7 @@ class Rollout(Saved):
     def __init__(self, steps, env):
         self.observations = np.zeros((steps + 1, *env.observation_space.shape), np.float32)
         self.eps, self.actions = np.zeros((2, steps, *env.action_space.shape), np.float32)
-        self.rewards, self.dones = np.zeros((2, steps), np.float32)  # done: ended in whatever way
+        self.rewards, self.dones = np.zeros((2, steps), np.float32)  # done: terminated or truncated
 
 
 def compute_gae(rewards, values, dones, gamma, gae_lambda):
@@ -196,8 +195,8 @@ def compute_gae(rewards, values, dones, gamma, gae_lambda):
     return torch.tensor(advantages)
 
 
-# LOSS. The first argument is the network that is learned: the gradient is that of its parameters.
-# It returns (loss, {curve: value}).
+# LOSS. It returns (loss, {curve: value}). updater() differentiates it with respect to the
+# parameters of the first argument.
 
 
 def ppo_loss(agent, minibatch, args):
@@ -222,9 +221,10 @@ def ppo_loss(agent, minibatch, args):
     return policy_loss - args.ent_coef * entropy + args.vf_coef * value_loss, curves
 
 
-@torch.no_grad()  # updater() takes the gradients; nothing else needs any
+@torch.no_grad()  # only the functions that updater() returns compute gradients
 def learn(args, env, test_env, stop):
-    """Train one agent; return False if stop(), asked whenever an episode ends, ended it early."""
+    """Train in the noisy `env` and test in `test_env`; return False if stop() ended it early."""
+    # of one step alone, the advantage has no standard deviation
     least, most = 2 * args.num_minibatches, args.total_timesteps
     if not least <= args.num_steps <= most:
         limits = f"2 * --num-minibatches ({least}) to --total-timesteps ({most})"
@@ -245,24 +245,15 @@ def learn(args, env, test_env, stop):
     agent = Agent(env).to(device)
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     update = updater(ppo_loss, agent, optimizer, args)
+    check_acting(agent, env, device)
 
-    # CHECK: in NumPy the agent acts as in PyTorch it learns, so log-probabilities are those of eps
-    act, std = agent.acting()
-    generator = torch.Generator().manual_seed(0)
-    eps = torch.randn(8, *env.action_space.shape, generator=generator)
-    inputs = torch.randn(8, *env.observation_space.shape, generator=generator)
-    actions = np.stack([act(x) for x in inputs.numpy()]) + std * eps.numpy()
-    log_probs, _, _ = agent(inputs.to(device), torch.from_numpy(actions).to(device))
-    expected = (-0.5 * eps.square() - 0.5 * math.log(2 * math.pi)).sum(1) - np.log(std).sum()
-    if (log_probs.cpu() - expected).abs().max() > 1e-3:
-        fail("the agent acts with one policy and learns another: see acting() and forward()", 1)
-
-    # RESUME: all that training changes belongs in `state`. What is missing there starts afresh when
-    # the run is resumed, and nothing says so (tools/check_script.py finds out).
+    # RESUME: all that training changes belongs in `state`. What is missing there starts anew when a
+    # run is resumed, without a warning: tools/check_script.py finds it. Random numbers are drawn on
+    # the CPU, because the generator of a GPU is not saved.
     state = {"agent": agent, "optimizer": optimizer, "rollout": rollout}
     state |= {"observation_stats": observation_stats, "reward_scaler": reward_scaler}
     start = run.resume(state | {"env": noisy.EnvState(env, rng)})
-    if start > 0:
+    if start > 0:  # the checkpoint was written between two episodes
         noisy.set_progress(env, start / total_steps)
         observation, _ = env.reset()
 
@@ -290,7 +281,7 @@ def learn(args, env, test_env, stop):
             value = in_numpy(agent.critic)(observation_stats.normalize(observation))
             rollout.rewards[step] += args.gamma * value[0]
 
-        done = global_step == total_steps
+        is_last = global_step == total_steps
         if step == args.num_steps - 1:
             # LEARN: advantages
             rollout.observations[-1] = observation_stats.normalize(observation)
@@ -326,10 +317,10 @@ def learn(args, env, test_env, stop):
 
             # TEST: if one fell due during the rollout; eval.csv has the step at which it fell due
             due = global_step - global_step % max(1, args.eval_frequency)
-            if done or (args.eval_frequency > 0 and due > global_step - args.num_steps):
+            if is_last or (args.eval_frequency > 0 and due > global_step - args.num_steps):
                 policy = make_policy(agent, observation_stats, env)
                 results = noisy.play(test_env, policy, args.eval_episodes, TEST_SEED)
-                due = args.total_timesteps if done else due
+                due = args.total_timesteps if is_last else due  # up to a rollout more than trained
                 saved = {"agent": agent.state_dict()}
                 saved["observation_stats"] = observation_stats.state_dict()
                 run.log_test(global_step, results, saved, due)
@@ -337,7 +328,7 @@ def learn(args, env, test_env, stop):
         # NEXT EPISODE
         if terminated or truncated:
             run.log_episode(global_step, info)
-            if done:
+            if is_last:
                 break
             stopping = stop()
             if stopping or global_step - run.saved_step >= args.checkpoint_frequency:
@@ -352,14 +343,27 @@ def learn(args, env, test_env, stop):
     return True
 
 
+def check_acting(agent, env, device):
+    """Exit unless acting(), in NumPy, and forward(), in PyTorch, are the same policy."""
+    act, std = agent.acting()
+    generator = torch.Generator().manual_seed(0)
+    eps = torch.randn(8, *env.action_space.shape, generator=generator)
+    inputs = torch.randn(8, *env.observation_space.shape, generator=generator)
+    actions = np.stack([act(x) for x in inputs.numpy()]) + std * eps.numpy()
+    log_probs, _, _ = agent(inputs.to(device), torch.from_numpy(actions).to(device))
+    expected = (-0.5 * eps.square() - 0.5 * math.log(2 * math.pi)).sum(1) - np.log(std).sum()
+    if (log_probs.cpu() - expected).abs().max() > 1e-3:
+        fail("the agent acts with one policy and learns another: see acting() and forward()", 1)
+
+
 def make_policy(agent, observation_stats, env):
-    """Return the test policy, NumPy to NumPy: mean actions, observation statistics as they are."""
+    """Return the test policy, NumPy to NumPy: mean actions, frozen observation statistics."""
     act, normalize = in_numpy(agent.actor_mean), observation_stats.normalize
     return lambda observation: noisy.into_space(act(normalize(observation)), env.action_space)
 
 
 def load_policy(run_dir, env=None):
-    """Return the policy of a run's last test; `env` is for runs of 0.3, which tell no spaces."""
+    """Return the policy of a run's last test; version 0.3 saved no spaces, so it needs `env`."""
     config = json.loads(Path(run_dir, "config.json").read_text())
     env = env or noisy.Spaces(config)
     agent, observation_stats = Agent(env), Normalizer(env.observation_space.shape)
@@ -374,7 +378,7 @@ def load_policy(run_dir, env=None):
 
 
 class Learned(nn.Module):
-    """A loss and the network that it learns, whose parameters torch.func exchanges."""
+    """loss(network, ...) as a module: functional_call needs one to differentiate."""
 
     def __init__(self, loss, network):
         super().__init__()
@@ -389,7 +393,7 @@ def updater(loss, network, optimizer, args):
     """Return update(*inputs) -> curves: one step of the optimizer on loss(network, *inputs).
 
     Numbers among the inputs may change from one update to the next. The optimizer may be any whose
-    step() needs no closure. Taking the gradient in the compiled graph is faster than backward().
+    step() needs no closure. Loss and gradient in one compiled graph are faster than backward().
     """
     learned = Learned(loss, network)
     parameters = {name: p for name, p in learned.named_parameters() if p.requires_grad}
@@ -404,11 +408,12 @@ def updater(loss, network, optimizer, args):
     gradient_of = compiled(clipped_gradient) if args.compile else clipped_gradient
 
     def update(*inputs):
-        # a compiled graph would keep a number, and be compiled again for every other one
-        inputs = [torch.tensor(float(x)) if type(x) in NUMBERS else x for x in inputs]
+        # a compiled graph takes a Python number as a constant, and is compiled again for another
+        numbers = (int, float, np.float64)
+        inputs = [torch.tensor(float(x)) if type(x) in numbers else x for x in inputs]
         gradient, curves = gradient_of(parameters, tuple(inputs))
         for name, parameter in parameters.items():
-            # contiguous: the fused Adam of PyTorch 2.13 misreads any other strides, in silence
+            # the fused Adam of PyTorch 2.13 silently misreads gradients that are not contiguous
             parameter.grad = gradient[name].contiguous()
         optimizer.step()
         return curves
@@ -446,7 +451,8 @@ def in_numpy(network):
     return call
 
 
-# THE RUN: its environments, its folder, signals; word for word the same in the three scripts
+# THE RUN: environments, folder, signals. The three scripts have the same text, and you can change
+# one of them alone.
 
 
 def fail(message, code=2):
@@ -465,7 +471,7 @@ def fail_on(errors, message, code=2):
 
 
 def say(text):
-    """Print a line; training goes on if its reader has left, as in `... | head`."""
+    """Print a line; training goes on if nobody reads it any more, as in `... | head`."""
     try:
         print(text, flush=True)
     except OSError:
@@ -508,13 +514,13 @@ def train(args, stop=lambda: 0):
     has_bf16 = any(processor.get(name) for name in ("avx512_bf16", "amx_bf16", "bf16", "sve_bf16"))
     if precision == "bf16" and not (has_bf16 or args.cuda):
         fail("--matmul-precision bf16: this processor has no bfloat16, so it would be slower")
-    # "medium" is bfloat16 where there is AMX, and TF32 on a GPU
-    if precision == "bf16" or processor.get("amx_tile") or args.cuda:
+    # "medium" rounds to bfloat16 with AMX or on ARM, and to TF32 on a GPU
+    if precision == "bf16" or processor.get("amx_tile") or processor.get("bf16") or args.cuda:
         precision = "highest"
     torch.set_float32_matmul_precision(precision)
     with fail_on((gym.error.Error, noisy.SpaceError), f"--env-id {args.env_id}"):
         env, test_env = noisy.make_environments(make_env, asdict(args), TEST_SEED)
-    with env, test_env:  # which closes them
+    with env, test_env:  # they are closed at the end
         return learn(args, env, test_env, stop)
 
 
@@ -541,12 +547,12 @@ class Run:
         self.config["matmul_precision"] = torch.get_float32_matmul_precision()
         self.is_finished = (self.folder / "result.json").exists()
         if self.is_finished:
-            self._delete("checkpoint.pt")  # of a process that was killed before it could
+            self._delete("checkpoint.pt")  # left by a process that was killed before it did so
         config = self.folder / "config.json"
         if config.exists():
             with fail_on(ValueError, str(self.folder)):
                 self.config = noisy.resumed_run(json.loads(config.read_text()), self.config)
-        if "," in self.config["script_sha256"]:
+        if "," in self.config["script_sha256"]:  # resumed_run() has appended another one
             say("the script has changed since the run began; if it matters, use --exp-name")
         noises = " + ".join(map("{} at {}".format, args.noise, args.noise_rate)) or "no noise"
         begun = f"{self.config['algorithm']} on {args.env_id}, {noises}, seed {args.seed}"
@@ -573,7 +579,7 @@ class Run:
             say(f"resumed at step {step}")
         else:
             self._delete("events.out.tfevents.*")
-            for name, part in state.items():  # now, and not when it is needed
+            for name, part in state.items():  # fail now, and not when the run is resumed
                 with fail_on(Exception, f"the state of {name!r} cannot be saved and read back"):
                     file = io.BytesIO()
                     torch.save(part.state_dict(), file)
@@ -604,7 +610,7 @@ class Run:
 
     def save(self, step):
         """Write a checkpoint: all that resuming needs, between two episodes."""
-        self.writer.flush()  # to be no older than the checkpoint
+        self.writer.flush()  # so that the curves reach as far as the checkpoint
         checkpoint = {
             "step": step,
             "state": {name: part.state_dict() for name, part in self.state.items()},
@@ -624,7 +630,7 @@ class Run:
         if "losses" in groups and self.learning_since:
             first_step, since = self.learning_since
             tags["charts/SPS"] = (step - first_step) / (now - since)
-        elif "losses" in groups:  # the first ones: the time until now went into compiling
+        elif "losses" in groups:  # the first ones: compiling does not count
             self.learning_since = step, now
         if not all(map(math.isfinite, tags.values())):
             reason = f"step {step}: training diverged, some values are not finite: {tags}"
@@ -646,14 +652,14 @@ class Run:
             self.printed = now
 
     def log_episode(self, step, info):
-        """Log a training episode as the info of its last step tells it."""
+        """Log a training episode by the info of its last step; its return is without noise."""
         charts = {"episodic_return": info["episode"]["r"], "episodic_length": info["episode"]["l"]}
         self.log(step, charts=charts | noisy.success_rate([noisy.outcome(info)]))
 
     def log_test(self, step, results, policy, due=None):
         """Log the (N, 3) returns, lengths and outcomes of a test, and save the policy.
 
-        eval.csv has the step at which the test fell `due`, if that was an earlier one.
+        `due` is the step for eval.csv if it is not `step`: PPO tests after whole rollouts.
         """
         due = due or step
         for episode, (episodic_return, length, outcome) in enumerate(results.tolist()):
@@ -668,14 +674,14 @@ class Run:
         success = noisy.success_rate(results[:, 2])
         self.result = {"final_return_mean": mean, "final_return_std": std}
         self.result |= {f"final_{name}": rate for name, rate in success.items()}
-        self.last_test, self.printed = f"eval_return={mean:.2f} ", -math.inf
+        self.last_test, self.printed = f"eval_return={mean:.2f} ", -math.inf  # print a line now
         self.bar.set_description_str(self.last_test)
         test = {"episodic_return_mean": mean, "episodic_return_std": std}
         self.log(step, eval=test | {"episodic_length_mean": length} | success)
 
     def finish(self, step):
-        """Write, last of all, result.json; the checkpoint has served."""
-        _, _, session_end = hparams({}, {})  # HPARAMS: its status is success
+        """Write result.json, last of all, and delete the checkpoint."""
+        _, _, session_end = hparams({}, {})  # HPARAMS shows the run as successful
         self.writer.file_writer.add_summary(session_end)
         self.writer.close()
         self.bar.close()
@@ -717,11 +723,11 @@ class Run:
 
 
 def read_state(file):
-    """Read a checkpoint, which may hold NumPy's arrays and numbers, but no code."""
+    """Read a checkpoint that may hold arrays and numbers of NumPy, but never code."""
     numpy, types = np._core.multiarray, {type(np.dtype(code)) for code in np.typecodes["All"]}
     types |= {np.ndarray, np.dtype, numpy._reconstruct, numpy.scalar, bytes}
     with torch.serialization.safe_globals(list(types)):
-        return torch.load(file, "cpu", weights_only=True)  # from a GPU, too
+        return torch.load(file, "cpu", weights_only=True)  # also what was saved on a GPU
 
 
 def stop_at_signals():
@@ -730,25 +736,25 @@ def stop_at_signals():
 
     def remember(number, frame):
         received.append(number)
-        is_forked = os.getpid() != script  # by the environment; the first Ctrl-C is for the script
+        is_worker = os.getpid() != script  # of the environment: it needs them after a first Ctrl-C
         is_second_ctrl_c = number == signal.SIGINT and len(received) > 1
-        if is_second_ctrl_c or (is_forked and number != signal.SIGINT):
+        if is_second_ctrl_c or (is_worker and number != signal.SIGINT):
             os._exit(128 + number)
-        if not is_forked:
+        if not is_worker:
             with contextlib.suppress(OSError):  # print() is not safe in here
                 os.write(1, b"stopping after this episode; Ctrl-C again: without a checkpoint\n")
 
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        if signal.getsignal(number) != signal.SIG_IGN:  # as nohup has it
+        if signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP
             signal.signal(number, remember)
     return lambda: received[0] if received else 0
 
 
 if __name__ == "__main__":
-    import tyro  # only here: whoever plays a policy does not need it
+    import tyro  # here, because load_policy() does not need it
 
     stop = stop_at_signals()
-    sys.path.append(os.getcwd())  # for what the module of --env-id module:Name-v0 imports
+    sys.path.append(os.getcwd())  # so that the module of --env-id module:Name-v0 can import
     noises = "\n  ".join(["Noises:", *noisy.signatures()])
     args = tyro.cli(Args, description=f"{__doc__}\n{noises}")
     with fail_on((noisy.NotFiniteError, noisy.SpaceError), "training stopped", code=1):

@@ -37,15 +37,14 @@ from tqdm import tqdm
 
 import noisy_wrappers as noisy
 
-TEST_SEED = 1_000_000  # of the first test episode; the same in every test of every run
-STEP_LIMIT = 10_000  # of an episode, where neither the environment nor the user sets one
-EVAL_FREQUENCY = 10_000  # default of --eval-frequency; at most a tenth of the run
-NUMBERS = (int, float, np.float64)  # which an update makes tensors of
+TEST_SEED = 1_000_000  # seed of the first test episode, in every test of every run
+STEP_LIMIT = 10_000  # time limit of episodes, if neither the environment nor the user sets one
+EVAL_FREQUENCY = 10_000  # default of --eval-frequency, or a tenth of the run if that is less
 
 
 @dataclass
 class Args:
-    """Command-line arguments; the algorithm's are those of CleanRL and the paper (Appendix A.2)."""
+    """Command-line arguments; the algorithm's are CleanRL's, as in the paper on noise."""
 
     env_id: str = "HalfCheetah-v5"  # RUN: Gymnasium environment, Name-v0, or module:Name-v0
     seed: int = 1  # seed of everything that is random
@@ -56,12 +55,12 @@ class Args:
     runs_dir: str = "runs"  # folder in which the run's own folder is made
     overwrite: bool = False  # delete the files in the run's folder and start again
     checkpoint_frequency: int = 50_000  # environment steps between two checkpoints
-    noise: tuple[str, ...] = ()  # NOISE: noises of the training environment; the baseline has none
-    noise_rate: tuple[float | str, ...] = ()  # probability of each noise; 1.0:0.0 falls linearly
-    test_noise: tuple[str, ...] = ()  # TESTS: noises of the test environment; it has none
+    noise: tuple[str, ...] = ()  # NOISE: noises of the training environment; none: a baseline
+    noise_rate: tuple[float | str, ...] = ()  # probability of each; 1.0:0.0 falls during training
+    test_noise: tuple[str, ...] = ()  # TESTS: noises of the test environment; none by default
     test_noise_rate: tuple[float, ...] = ()  # probability of each test noise
     eval_episodes: int = 10  # episodes in each test
-    eval_frequency: int | None = None  # steps between tests; None: up to 10,000; 0: only at the end
+    eval_frequency: int | None = None  # steps between tests; None: 10,000 or less; 0: only the last
     keep_policies: bool = False  # keep the policy of every test as policy_STEP.pt
 
     cuda: bool = False  # SPEED: train on a GPU (not tested on one yet); these networks are small
@@ -71,7 +70,7 @@ class Args:
     # the updates are computed in bfloat16, even if this costs accuracy
     matmul_precision: Literal["highest", "medium", "bf16"] = "medium"
 
-    buffer_size: int = 1_000_000  # ALGORITHM: transitions in the replay buffer
+    buffer_size: int = 1_000_000  # ALGORITHM: rows of the replay buffer: steps, and one per episode
     gamma: float = 0.99  # discount factor
     tau: float = 0.005  # target smoothing coefficient
     batch_size: int = 256  # transitions in a minibatch
@@ -84,7 +83,7 @@ class Args:
 
 
 def make_env(env_id, **kwargs):
-    """Make the clean environment: observations and actions are vectors, and every episode ends."""
+    """Make the environment, with vectors as observations and actions; train() adds the noise."""
     env = gym.make(env_id, disable_env_checker=True, **kwargs)
     return noisy.make_flat(env, STEP_LIMIT)
 
@@ -137,9 +136,9 @@ class Actor(nn.Module):
 
 
 class ReplayBuffer:
-    """The last steps, with each observation stored once: a row's next one is that of the next row.
+    """The latest steps; the next observation of row i is the observation of row i + 1.
 
-    The last observation of an episode has a row of its own, which is no step and is never drawn.
+    The final observation of an episode has a row, too: it is no step, so it is never drawn.
     """
 
     ARRAYS = ("observations", "actions", "rewards", "terminated", "is_step")
@@ -152,7 +151,7 @@ class ReplayBuffer:
         self.is_step = np.zeros(rows, bool)
 
     def add(self, observation, action, reward, next_observation, terminated, truncated):
-        """Store a step in place of the oldest; the next one begins in the row after it."""
+        """Store a step in place of the oldest one; the next step goes into the row after it."""
         row, next_row = self.position, (self.position + 1) % self.rows
         self.observations[row], self.observations[next_row] = observation, next_observation
         self.actions[row], self.rewards[row], self.terminated[row] = action, reward, terminated
@@ -182,15 +181,16 @@ class ReplayBuffer:
             getattr(self, name)[: self.size] = state[name].numpy()
 
 
-# LOSSES. The first argument is the network that is learned: the gradient is that of its parameters.
-# All other networks and tensors are constants. A loss returns (loss, {curve: value}).
+# LOSSES. Each returns (loss, {curve: value}). updater() differentiates it with respect to the
+# parameters of the first argument, and of no other network.
 
 
 def critic_loss(critic, target_critic, target_actor, batch, eps, gamma):
     """Mean squared error of Q1 and Q2 to y = r + gamma min(Q1', Q2')(s', pi'(s') + eps)."""
     observations, actions, rewards, next_observations, terminated = batch
     next_q1, next_q2 = target_critic(next_observations, target_actor(next_observations, eps))
-    y = rewards + (1 - terminated) * gamma * torch.minimum(next_q1, next_q2)
+    next_values = torch.minimum(next_q1, next_q2)
+    y = (rewards + (1 - terminated) * gamma * next_values).detach()
     q1, q2 = critic(observations, actions)
     qf1_loss, qf2_loss = (q1 - y).square().mean(), (q2 - y).square().mean()
     loss = qf1_loss + qf2_loss
@@ -202,12 +202,13 @@ def critic_loss(critic, target_critic, target_actor, batch, eps, gamma):
 def actor_loss(actor, critic, observations):
     """The mean of -Q1(s, pi(s))."""
     q1, _ = critic(observations, actor(observations))
-    return -q1.mean(), {"actor_loss": -q1.mean()}
+    loss = -q1.mean()
+    return loss, {"actor_loss": loss}
 
 
-@torch.no_grad()  # updater() takes the gradients; nothing else needs any
+@torch.no_grad()  # only the functions that updater() returns compute gradients
 def learn(args, env, test_env, stop):
-    """Train one agent; return False if stop(), asked whenever an episode ends, ended it early."""
+    """Train in the noisy `env` and test in `test_env`; return False if stop() ended it early."""
     if not noisy.is_bounded(env.action_space):
         fail(f"TD3 needs bounded actions; some actions of {args.env_id} are unbounded")
     device = torch.device("cuda" if args.cuda else "cpu")
@@ -233,13 +234,14 @@ def learn(args, env, test_env, stop):
     online_parameters = [*actor.parameters(), *critic.parameters()]
     target_parameters = [*target_actor.parameters(), *target_critic.parameters()]
 
-    # RESUME: all that training changes belongs in `state`. What is missing there starts afresh when
-    # the run is resumed, and nothing says so (tools/check_script.py finds out).
+    # RESUME: all that training changes belongs in `state`. What is missing there starts anew when a
+    # run is resumed, without a warning: tools/check_script.py finds it. Random numbers are drawn on
+    # the CPU, because the generator of a GPU is not saved.
     state = {"actor": actor, "critic": critic, "buffer": buffer}
     state |= {"target_actor": target_actor, "target_critic": target_critic}
     state |= {"q_optimizer": q_optimizer, "actor_optimizer": actor_optimizer}
     start = run.resume(state | {"env": noisy.EnvState(env, rng)})
-    if start > 0:
+    if start > 0:  # the checkpoint was written between two episodes
         noisy.set_progress(env, start / args.total_timesteps)
         observation, _ = env.reset()
 
@@ -254,37 +256,39 @@ def learn(args, env, test_env, stop):
         # STEP
         next_observation, reward, terminated, truncated, info = env.step(action)
 
-        # STORE: terminated alone ends the values, a time limit does not
+        # STORE: only `terminated` ends the values; after a time limit they go on
         buffer.add(observation, action, reward, next_observation, terminated, truncated)
         observation = next_observation
 
-        done = global_step == args.total_timesteps
+        is_last = global_step == args.total_timesteps
         if global_step > args.learning_starts:
             # LEARN: critic
             batch = [tensor.to(device) for tensor in buffer.sample(args.batch_size, rng)]
-            eps = args.policy_noise * torch.randn(batch[1].shape).to(device)
+            observations, actions = batch[:2]
+            eps = args.policy_noise * torch.randn(actions.shape).to(device)
             eps = eps.clamp(-args.noise_clip, args.noise_clip)
             curves = update_critic(target_critic, target_actor, batch, eps, args.gamma)
 
             if global_step % args.policy_frequency == 0:
                 # LEARN: actor
-                curves |= update_actor(critic, batch[0])
+                curves |= update_actor(critic, observations)
 
                 # LEARN: targets
+                # target += tau * (online - target)
                 torch._foreach_lerp_(target_parameters, online_parameters, args.tau)
 
-            if done or global_step % 100 == 0:
+            if is_last or global_step % 100 == 0:
                 run.log(global_step, losses=curves, noise=noisy.noise_statistics(env))
 
         # TEST
-        if done or (args.eval_frequency > 0 and global_step % args.eval_frequency == 0):
+        if is_last or (args.eval_frequency > 0 and global_step % args.eval_frequency == 0):
             results = noisy.play(test_env, actor.policy, args.eval_episodes, TEST_SEED)
             run.log_test(global_step, results, {"actor": actor.state_dict()})
 
         # NEXT EPISODE
         if terminated or truncated:
             run.log_episode(global_step, info)
-            if done:
+            if is_last:
                 break
             stopping = stop()
             if stopping or global_step - run.saved_step >= args.checkpoint_frequency:
@@ -299,11 +303,11 @@ def learn(args, env, test_env, stop):
 
 
 def load_policy(run_dir, env=None):
-    """Return the policy of a run's last test; `env` is for runs of 0.3, which tell no spaces."""
+    """Return the policy of a run's last test; version 0.3 saved no spaces, so it needs `env`."""
     config = json.loads(Path(run_dir, "config.json").read_text())
     actor = Actor(env or noisy.Spaces(config))
     saved = torch.load(Path(run_dir, "policy.pt"), "cpu", weights_only=True)
-    actor.load_state_dict(saved.get("actor", saved))  # in 0.3 it was all there is
+    actor.load_state_dict(saved.get("actor", saved))  # version 0.3 saved the actor alone
     return actor.policy
 
 
@@ -311,7 +315,7 @@ def load_policy(run_dir, env=None):
 
 
 class Learned(nn.Module):
-    """A loss and the network that it learns, whose parameters torch.func exchanges."""
+    """loss(network, ...) as a module: functional_call needs one to differentiate."""
 
     def __init__(self, loss, network):
         super().__init__()
@@ -326,7 +330,8 @@ def updater(loss, network, optimizer, args):
     """Return update(*inputs) -> curves: one step of the optimizer on loss(network, *inputs).
 
     Numbers among the inputs may change from one update to the next. The optimizer may be any whose
-    step() needs no closure. Taking the gradient in the compiled graph is faster than backward().
+    step() needs no closure. Loss and gradient in one compiled graph take about 40 % less processor
+    time than a compiled loss and backward().
     """
     learned, device = Learned(loss, network), next(network.parameters()).device
     parameters = {name: p for name, p in learned.named_parameters() if p.requires_grad}
@@ -335,14 +340,15 @@ def updater(loss, network, optimizer, args):
     bf16 = torch.autocast(device.type, torch.bfloat16, enabled=args.matmul_precision == "bf16")
 
     def update(*inputs):
-        # a compiled graph would keep a number, and be compiled again for every other one
-        inputs = [torch.tensor(float(x)) if type(x) in NUMBERS else x for x in inputs]
+        # a compiled graph takes a Python number as a constant, and is compiled again for another
+        numbers = (int, float, np.float64)
+        inputs = [torch.tensor(float(x)) if type(x) in numbers else x for x in inputs]
         with bf16:
             gradient, (_, curves) = gradient_of(parameters, tuple(inputs))
         for name, parameter in parameters.items():
-            # contiguous: the fused Adam of PyTorch 2.13 misreads any other strides, in silence
+            # the fused Adam of PyTorch 2.13 silently misreads gradients that are not contiguous
             parameter.grad = gradient[name].contiguous()
-        # Adam's momentum of dead units ends at 1e-45, and Intel's processors are slow with that
+        # Adam's momentum of dead units decays to 1e-45, and Intel's processors are slow with that
         torch.set_flush_denormal(True)
         optimizer.step()
         torch.set_flush_denormal(False)
@@ -351,7 +357,8 @@ def updater(loss, network, optimizer, args):
     return update
 
 
-# THE RUN: its environments, its folder, signals; word for word the same in the three scripts
+# THE RUN: environments, folder, signals. The three scripts have the same text, and you can change
+# one of them alone.
 
 
 def fail(message, code=2):
@@ -370,7 +377,7 @@ def fail_on(errors, message, code=2):
 
 
 def say(text):
-    """Print a line; training goes on if its reader has left, as in `... | head`."""
+    """Print a line; training goes on if nobody reads it any more, as in `... | head`."""
     try:
         print(text, flush=True)
     except OSError:
@@ -413,13 +420,13 @@ def train(args, stop=lambda: 0):
     has_bf16 = any(processor.get(name) for name in ("avx512_bf16", "amx_bf16", "bf16", "sve_bf16"))
     if precision == "bf16" and not (has_bf16 or args.cuda):
         fail("--matmul-precision bf16: this processor has no bfloat16, so it would be slower")
-    # "medium" is bfloat16 where there is AMX, and TF32 on a GPU
-    if precision == "bf16" or processor.get("amx_tile") or args.cuda:
+    # "medium" rounds to bfloat16 with AMX or on ARM, and to TF32 on a GPU
+    if precision == "bf16" or processor.get("amx_tile") or processor.get("bf16") or args.cuda:
         precision = "highest"
     torch.set_float32_matmul_precision(precision)
     with fail_on((gym.error.Error, noisy.SpaceError), f"--env-id {args.env_id}"):
         env, test_env = noisy.make_environments(make_env, asdict(args), TEST_SEED)
-    with env, test_env:  # which closes them
+    with env, test_env:  # they are closed at the end
         return learn(args, env, test_env, stop)
 
 
@@ -446,12 +453,12 @@ class Run:
         self.config["matmul_precision"] = torch.get_float32_matmul_precision()
         self.is_finished = (self.folder / "result.json").exists()
         if self.is_finished:
-            self._delete("checkpoint.pt")  # of a process that was killed before it could
+            self._delete("checkpoint.pt")  # left by a process that was killed before it did so
         config = self.folder / "config.json"
         if config.exists():
             with fail_on(ValueError, str(self.folder)):
                 self.config = noisy.resumed_run(json.loads(config.read_text()), self.config)
-        if "," in self.config["script_sha256"]:
+        if "," in self.config["script_sha256"]:  # resumed_run() has appended another one
             say("the script has changed since the run began; if it matters, use --exp-name")
         noises = " + ".join(map("{} at {}".format, args.noise, args.noise_rate)) or "no noise"
         begun = f"{self.config['algorithm']} on {args.env_id}, {noises}, seed {args.seed}"
@@ -478,7 +485,7 @@ class Run:
             say(f"resumed at step {step}")
         else:
             self._delete("events.out.tfevents.*")
-            for name, part in state.items():  # now, and not when it is needed
+            for name, part in state.items():  # fail now, and not when the run is resumed
                 with fail_on(Exception, f"the state of {name!r} cannot be saved and read back"):
                     file = io.BytesIO()
                     torch.save(part.state_dict(), file)
@@ -509,7 +516,7 @@ class Run:
 
     def save(self, step):
         """Write a checkpoint: all that resuming needs, between two episodes."""
-        self.writer.flush()  # to be no older than the checkpoint
+        self.writer.flush()  # so that the curves reach as far as the checkpoint
         checkpoint = {
             "step": step,
             "state": {name: part.state_dict() for name, part in self.state.items()},
@@ -529,7 +536,7 @@ class Run:
         if "losses" in groups and self.learning_since:
             first_step, since = self.learning_since
             tags["charts/SPS"] = (step - first_step) / (now - since)
-        elif "losses" in groups:  # the first ones: the time until now went into compiling
+        elif "losses" in groups:  # the first ones: compiling does not count
             self.learning_since = step, now
         if not all(map(math.isfinite, tags.values())):
             reason = f"step {step}: training diverged, some values are not finite: {tags}"
@@ -551,14 +558,14 @@ class Run:
             self.printed = now
 
     def log_episode(self, step, info):
-        """Log a training episode as the info of its last step tells it."""
+        """Log a training episode by the info of its last step; its return is without noise."""
         charts = {"episodic_return": info["episode"]["r"], "episodic_length": info["episode"]["l"]}
         self.log(step, charts=charts | noisy.success_rate([noisy.outcome(info)]))
 
     def log_test(self, step, results, policy, due=None):
         """Log the (N, 3) returns, lengths and outcomes of a test, and save the policy.
 
-        eval.csv has the step at which the test fell `due`, if that was an earlier one.
+        `due` is the step for eval.csv if it is not `step`: PPO tests after whole rollouts.
         """
         due = due or step
         for episode, (episodic_return, length, outcome) in enumerate(results.tolist()):
@@ -573,14 +580,14 @@ class Run:
         success = noisy.success_rate(results[:, 2])
         self.result = {"final_return_mean": mean, "final_return_std": std}
         self.result |= {f"final_{name}": rate for name, rate in success.items()}
-        self.last_test, self.printed = f"eval_return={mean:.2f} ", -math.inf
+        self.last_test, self.printed = f"eval_return={mean:.2f} ", -math.inf  # print a line now
         self.bar.set_description_str(self.last_test)
         test = {"episodic_return_mean": mean, "episodic_return_std": std}
         self.log(step, eval=test | {"episodic_length_mean": length} | success)
 
     def finish(self, step):
-        """Write, last of all, result.json; the checkpoint has served."""
-        _, _, session_end = hparams({}, {})  # HPARAMS: its status is success
+        """Write result.json, last of all, and delete the checkpoint."""
+        _, _, session_end = hparams({}, {})  # HPARAMS shows the run as successful
         self.writer.file_writer.add_summary(session_end)
         self.writer.close()
         self.bar.close()
@@ -622,11 +629,11 @@ class Run:
 
 
 def read_state(file):
-    """Read a checkpoint, which may hold NumPy's arrays and numbers, but no code."""
+    """Read a checkpoint that may hold arrays and numbers of NumPy, but never code."""
     numpy, types = np._core.multiarray, {type(np.dtype(code)) for code in np.typecodes["All"]}
     types |= {np.ndarray, np.dtype, numpy._reconstruct, numpy.scalar, bytes}
     with torch.serialization.safe_globals(list(types)):
-        return torch.load(file, "cpu", weights_only=True)  # from a GPU, too
+        return torch.load(file, "cpu", weights_only=True)  # also what was saved on a GPU
 
 
 def stop_at_signals():
@@ -635,25 +642,25 @@ def stop_at_signals():
 
     def remember(number, frame):
         received.append(number)
-        is_forked = os.getpid() != script  # by the environment; the first Ctrl-C is for the script
+        is_worker = os.getpid() != script  # of the environment: it needs them after a first Ctrl-C
         is_second_ctrl_c = number == signal.SIGINT and len(received) > 1
-        if is_second_ctrl_c or (is_forked and number != signal.SIGINT):
+        if is_second_ctrl_c or (is_worker and number != signal.SIGINT):
             os._exit(128 + number)
-        if not is_forked:
+        if not is_worker:
             with contextlib.suppress(OSError):  # print() is not safe in here
                 os.write(1, b"stopping after this episode; Ctrl-C again: without a checkpoint\n")
 
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        if signal.getsignal(number) != signal.SIG_IGN:  # as nohup has it
+        if signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP
             signal.signal(number, remember)
     return lambda: received[0] if received else 0
 
 
 if __name__ == "__main__":
-    import tyro  # only here: whoever plays a policy does not need it
+    import tyro  # here, because load_policy() does not need it
 
     stop = stop_at_signals()
-    sys.path.append(os.getcwd())  # for what the module of --env-id module:Name-v0 imports
+    sys.path.append(os.getcwd())  # so that the module of --env-id module:Name-v0 can import
     noises = "\n  ".join(["Noises:", *noisy.signatures()])
     args = tyro.cli(Args, description=f"{__doc__}\n{noises}")
     with fail_on((noisy.NotFiniteError, noisy.SpaceError), "training stopped", code=1):

@@ -5,6 +5,7 @@
     python tools/bench.py --against-checkout ../before --clock cpu
     python tools/bench.py --against-cleanrl ../cleanrl --cleanrl-python ../cleanrl/.venv/bin/python
     python tools/bench.py --against-sbx ../sbx/bin/python
+    python tools/bench.py --algos sac td3 --against-rltools ../rltools/bin/python
 
 Every program is a process with one thread on one core (the last; `taskset` chooses another). It has
 its defaults, but SAC and TD3 learn from step 1,000 on, and none tests its policy or saves. Whenever
@@ -18,7 +19,8 @@ With --clock cpu only time on the core counts, which depends less on other proce
 the ratios of neighbouring blocks; "from" and "to" are the 95 % interval of this median, from six
 pairs on. CleanRL's pinned Gymnasium has -v4 environments
 (Humanoid-v4: 376 observations, -v5: 348). SBX gets the sizes of our networks, batches and updates;
-it logs nothing, and in PPO it normalizes neither observations nor rewards.
+it logs nothing, and in PPO it normalizes neither observations nor rewards. RLtools, SAC and TD3 in
+C++, gets these sizes when it is compiled, and uses MKL if mkl and mkl-include are installed.
 --jobs N compares N runs side by side, on a core each, with one alone.
 """
 
@@ -116,6 +118,28 @@ def child_sbx(algo, env_id):
     model.learn(TOTAL_TIMESTEPS, callback)
 
 
+def child_rltools(algo, env_id):
+    """Run RLtools, compiled for our sizes; its learning rates and the like are its defaults."""
+    import gymnasium
+    import rltools
+
+    def make_env():
+        env = gymnasium.wrappers.RescaleAction(gymnasium.make(env_id), -1, 1)
+        env.reset(seed=1)
+        return env
+
+    marks, step, sizes = Marks(), 0, {"HIDDEN_DIM": 256, "BATCH_SIZE": 256}
+    options = {f"{part}_{name}": n for part in ("ACTOR", "CRITIC") for name, n in sizes.items()}
+    options |= {"N_WARMUP_STEPS": LEARNING_STARTS, "REPLAY_BUFFER_CAP": 10**6}
+    make_module = {"sac": rltools.SAC, "td3": rltools.TD3}[algo]
+    module = make_module(make_env, enable_evaluation=False, STEP_LIMIT=TOTAL_TIMESTEPS, **options)
+    state = module.State(1)
+    while not state.step():
+        step += 1
+        if step % 100 == 0 and step > LEARNING_STARTS:
+            marks.mark(step)
+
+
 def start_child(core, folder, child, *arguments):
     """Prepare this process before it imports any library, and become a child in a folder."""
     os.chdir(folder)
@@ -128,7 +152,7 @@ def start_child(core, folder, child, *arguments):
     CHILDREN[child](*arguments)
 
 
-CHILDREN = {"_script": child_script, "_sbx": child_sbx}
+CHILDREN = {"_script": child_script, "_sbx": child_sbx, "_rltools": child_rltools}
 
 
 # MEASURING
@@ -223,6 +247,8 @@ def ours_and_others(algo, env_id, options):
         yield Program("CleanRL", core, "_script", *arguments, "--no-cuda", python=python)
     if options.against_sbx:
         yield Program("SBX", core, "_sbx", algo, env_id, python=options.against_sbx)
+    if options.against_rltools and algo != "ppo":
+        yield Program("RLtools", core, "_rltools", algo, env_id, python=options.against_rltools)
 
 
 def compare(algo, env_id, options):
@@ -279,6 +305,7 @@ def parse(argv):
     add("--against-cleanrl", type=Path, metavar="PATH", help="a checkout of CleanRL")
     add("--cleanrl-python", metavar="PYTHON", help="with CleanRL's requirements")
     add("--against-sbx", metavar="PYTHON", help="with sbx-rl")
+    add("--against-rltools", metavar="PYTHON", help="with rltools, mkl and mkl-include; SAC, TD3")
     add("--against-checkout", type=Path, metavar="PATH", help="another version of this project")
     add("--jobs", type=int, metavar="N", help="compare N runs side by side with one")
     end = argv.index("--") if "--" in argv else len(argv)
@@ -291,7 +318,8 @@ def parse(argv):
             parser.error(f"--{name} must be at least {low}, not {value}")
     if options.jobs and options.jobs > (cores := len(options.cores)):
         parser.error(f"--jobs {options.jobs} needs as many cores, and there are {cores}")
-    others = (options.against_cleanrl, options.against_sbx, options.against_checkout)
+    peers = ("cleanrl", "sbx", "rltools", "checkout")
+    others = [getattr(options, f"against_{peer}") for peer in peers]
     if options.jobs and any(others):
         parser.error("--jobs compares runs of this version only: leave out --against-...")
     if bool(options.against_cleanrl) != bool(options.cleanrl_python):
@@ -301,7 +329,8 @@ def parse(argv):
         folder = getattr(options, f"against_{name}")
         if folder and not (folder / file).is_file():
             parser.error(f"--against-{name}: there is no {folder / file}")
-    for program in filter(None, (options.cleanrl_python, options.against_sbx)):
+    pythons = (options.cleanrl_python, options.against_sbx, options.against_rltools)
+    for program in filter(None, pythons):
         if not shutil.which(program):
             parser.error(f"{program} is not a program")
     return options
