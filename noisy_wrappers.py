@@ -30,19 +30,17 @@ RandomObservationBias (own)         o + e with the same e ~ N(0, scale^2) for an
 RandomObservationDelay (own)        the observations of an episode are low to high steps old
 ==================================  ================================================================
 
-A rate that changes during training is written "start:end": ``"1.0:0.0"`` goes linearly from 1 to 0.
-Call :func:`set_progress` to say how much of the training is done; the next ``reset()`` sets the
-rate. On a perturbed step ``info["noise"]`` is the tuple of the names of the wrappers that acted,
-innermost first; on other steps the key is absent.
+A rate that changes during training is written "start:end": ``"1.0:0.0"`` goes linearly from 1 to 0;
+:func:`set_progress` says how much of the training is done. On a perturbed step ``info["noise"]`` is
+the tuple of the names of the wrappers that acted, innermost first; on other steps it is absent.
 
 Randomness. A wrapper owns two generators, made at ``reset(seed=seed)`` by
 ``np.random.SeedSequence([seed, zlib.crc32(class_name.encode()), position]).spawn(2)``, in which
 ``position`` is the number of noise wrappers inside this one. The first, the gate, draws one uniform
 number per opportunity, whatever the rate, so under one seed a higher rate perturbs the same steps
 and more; the second, ``noise``, draws the noise, for episodes that are not chosen, too. ``reset()``
-without a seed continues both streams; a wrapper that was never seeded takes its seed from the
-operating system. The environment's own generator is never touched, so initial states are the same
-with and without noise.
+without a seed continues both streams. The environment's own generator is never touched, so initial
+states are the same with and without noise.
 
 ``relative=True`` counts additive noise in standard deviations of each number of the observations,
 or of the rewards, over all that a wrapper has received; the first 99 stay clean. For actions it
@@ -55,11 +53,9 @@ import copy
 import functools
 import hashlib
 import importlib
-import importlib.machinery
 import importlib.metadata
 import inspect
 import json
-import keyword
 import math
 import numbers
 import operator
@@ -85,40 +81,30 @@ from numpy.typing import NDArray
 
 __version__ = "0.4.0"
 
+# In the order of the table above; what the scripts and tools use besides is not listed.
 __all__ = [
-    "NoiseWrapper",
-    "ObservationNoise",
-    "RewardNoise",
     "RandomNormalNoisyObservation",
     "RandomUniformNoisyObservation",
     "RandomUniformScaleObservation",
     "RandomMixupObservation",
     "RandomDropoutObservation",
-    "RandomObservationBias",
-    "RandomObservationDelay",
     "RandomNormalNoisyReward",
     "RandomUniformNoisyReward",
     "RandomUniformScaleReward",
+    "RandomEarlyTermination",
     "RandomNormalNoisyAction",
     "RandomActionDelay",
-    "RandomEarlyTermination",
     "RandomDynamics",
-    "WRAPPERS",
-    "signatures",
+    "RandomObservationBias",
+    "RandomObservationDelay",
+    "NoiseWrapper",
+    "ObservationNoise",
+    "RewardNoise",
     "parse_noise",
     "make_noisy",
-    "Configuration",
-    "BASELINE",
     "set_progress",
     "noise_wrappers",
     "noise_statistics",
-    "make_flat",
-    "FiniteNumbers",
-    "NotFiniteError",
-    "SpaceError",
-    "EnvState",
-    "kept_generators",
-    "run_name",
 ]
 
 Env = gym.Env[Any, Any]
@@ -139,9 +125,7 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     A wrapper calls :meth:`acts` at every opportunity, to decide whether the noise acts now, and
     :meth:`mark` where it has changed something. It draws from ``self.noise``, and passes its own
-    arguments on to ``super().__init__``, which records them. docs/wrappers.md has an example. To
-    check arguments before there is an environment, the constructor is also called with one that has
-    nothing but spaces; a ValueError is what it has to say about bad ones.
+    arguments on to ``super().__init__``, which records them. docs/wrappers.md has an example.
 
     Attributes:
         schedule: the rates at the beginning and at the end of training, both in [0, 1].
@@ -157,7 +141,7 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if _layers(env, gym.wrappers.Autoreset):
             raise ValueError("noise must see every reset: apply gymnasium.wrappers.Autoreset last")
         self.schedule = _schedule(noise_rate)
-        self._training_progress = 0.0
+        self._progress = 0.0  # the fraction of training done
         self._noise_rate = self.schedule[0]
         RecordConstructorArgs.__init__(self, noise_rate=_as_written(self.schedule), **parameters)
         self.parameters = parameters
@@ -183,21 +167,12 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.schedule = (rate, rate)
         self._noise_rate = rate
 
-    # A vector environment reaches the attributes of the outermost noise wrapper only, perhaps in
-    # another process: so the next two speak for the wrappers inside as well.
-
-    @property
-    def training_progress(self) -> float:
-        """The fraction of training done; assigning it assigns that of the wrappers inside, too."""
-        return self._training_progress
-
-    @training_progress.setter
-    def training_progress(self, fraction: float) -> None:
-        for layer in _layers(self, NoiseWrapper):
-            layer._training_progress = fraction
+    def set_progress(self, fraction: float) -> None:
+        """Call :func:`set_progress` with this environment, as a vector environment can do."""
+        set_progress(self, fraction)
 
     def noise_statistics(self) -> dict[str, float]:
-        """Return :func:`noise_statistics` of this wrapper and of those inside."""
+        """Return :func:`noise_statistics` of this environment."""
         return noise_statistics(self)
 
     @property
@@ -212,7 +187,7 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def _begin(self, seed: int | None) -> None:
         """Begin an episode, before the environment does; a wrapper may decide here what to do."""
-        self._noise_rate = float(np.interp(self._training_progress, (0.0, 1.0), self.schedule))
+        self._noise_rate = float(np.interp(self._progress, (0.0, 1.0), self.schedule))
         if seed is not None:
             np_random(seed)  # raises Gymnasium's error if it is no seed
             self._seed(seed)
@@ -317,18 +292,18 @@ class ObservationNoise(NoiseWrapper):
         self.keys = _keys(keys)
         super().__init__(env, noise_rate, **parameters, keys=self.keys)
         self._boxes = {} if isinstance(env, _ProbeEnv) else self._find_boxes(env)
-        self._shape: tuple[int, ...] = (sum(math.prod(b.shape) for b in self._boxes.values()),)
-        if () in self._boxes:
-            self._shape = self._boxes[()].shape  # of what is perturbed
+        self._places: dict[EntryPath, Any] = {}  # of the boxes in the vector: slice, shape, dtype
+        size = 0
+        for path, box in self._boxes.items():
+            place = slice(size, size + math.prod(box.shape))
+            self._places[path] = place, box.shape, box.dtype
+            size = place.stop
+        # of what is perturbed
+        self._shape = self._boxes[()].shape if () in self._boxes else (size,)
 
     def _find_boxes(self, env: Env) -> dict[EntryPath, gym.spaces.Box]:
         """Return the entries to perturb: {path in the observation: their space}."""
-        name, space = type(self).__name__, env.observation_space
-        if any(_has_categories(f.env) for f in _layers(env, gym.wrappers.FlattenObservation)):
-            raise ValueError(
-                f"{name} cannot perturb categories, and these observations were flattened with "
-                "some in them: apply it before gymnasium.wrappers.FlattenObservation"
-            )
+        space = env.observation_space
         entries = dict(_entries(space))
         if self.keys is not None:
             known = [*dict.fromkeys(path[0] for path in entries if path)]
@@ -336,14 +311,13 @@ class ObservationNoise(NoiseWrapper):
                 raise ValueError(f"keys={self.keys!r}: these observations have the keys {known}")
             entries = {path: part for path, part in entries.items() if path[0] in self.keys}
         boxes = {path: part for path, part in entries.items() if _is_box(part, "fiu")}
-        if boxes:
-            return boxes
-        if _has_categories(env):
+        if not boxes:
+            name = type(self).__name__
             raise ValueError(
-                f"{name} cannot perturb categories (Discrete, MultiDiscrete, MultiBinary), and "
-                "finds nothing else here: use reward noise, action noise or early termination"
+                f"{name} cannot perturb categories, it needs observations of floats or integers, "
+                f"got {space}: use reward noise, action noise or early termination"
             )
-        raise ValueError(f"{name} needs observations of floats or integers, got {space}")
+        return boxes
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment and perturb the first observation with probability p."""
@@ -373,19 +347,20 @@ class ObservationNoise(NoiseWrapper):
         if numbers.shape != given.shape:
             wanted = f"an array of shape {given.shape}, not {numbers.shape}"
             raise ValueError(f"{type(self).__name__}._perturb must return {wanted}")
-        parts: dict[EntryPath, Array] = {}
-        start, changed = 0, False
-        for path, box in self._boxes.items():
-            part, clean = numbers, given
-            if path:  # a part of the vector
-                end = start + math.prod(box.shape)
-                part = numbers[start:end].reshape(box.shape)
-                clean = given[start:end].reshape(box.shape)
-                start = end
-            parts[path] = _cast(part, box.dtype)
-            # an environment may return another dtype than that of its space: that is no noise
-            changed = changed or _differ(parts[path], _cast(clean, box.dtype))
-        return _replaced(observation, parts), self.mark(info) if changed else info
+        parts, clean = self._parts(numbers), self._parts(given)
+        for path, part in parts.items():
+            if np.count_nonzero(part != clean[path]):
+                return _replaced(observation, parts), self.mark(info)
+        return _replaced(observation, parts), info
+
+    def _parts(self, numbers: Array) -> dict[EntryPath, Array]:
+        """Return the entries that consist of these numbers, in the dtype of their space."""
+        if () in self._boxes:
+            return {(): _cast(numbers, self._boxes[()].dtype)}
+        return {
+            path: _cast(numbers[place].reshape(shape), dtype)
+            for path, (place, shape, dtype) in self._places.items()
+        }
 
     def _perturb(self, observation: Array) -> Array:
         """Return the numbers of an observation with noise, a new array.
@@ -404,7 +379,7 @@ class ObservationNoise(NoiseWrapper):
         numbers.flags.writeable = False
         return numbers
 
-    def _check_scales(self, scale: Scale, given: Any) -> None:
+    def _check_scale(self, scale: Scale, given: Any) -> None:
         """Raise ValueError unless a tuple of scales, ``given`` by the user, fits."""
         if isinstance(scale, tuple) and self._boxes and self._shape != (len(scale),):
             raise ValueError(
@@ -453,7 +428,7 @@ class RandomNormalNoisyObservation(ObservationNoise):
         parameters = {"scale": self.scale, "loc": self.loc, "relative": relative}
         super().__init__(env, noise_rate, **parameters, keys=keys)
         self._spread = _Spread() if _flag("relative", relative) else None
-        self._check_scales(self.scale, scale)
+        self._check_scale(self.scale, scale)
         self._widen(lambda bound: (-np.inf, np.inf))
 
     def _perturb(self, observation: Array) -> Array:
@@ -615,7 +590,7 @@ class RandomObservationBias(ObservationNoise):
         self.scale = _scale_or_scales(scale)
         super().__init__(env, noise_rate, scale=self.scale, relative=relative, keys=keys)
         self._spread = _Spread() if _flag("relative", relative) else None
-        self._check_scales(self.scale, scale)
+        self._check_scale(self.scale, scale)
         self._widen(lambda bound: (-np.inf, np.inf))
         self._bias: Array | None = None  # of the episode, if it is chosen
 
@@ -657,7 +632,7 @@ class RandomObservationDelay(ObservationNoise):
         super()._begin(seed)
         delay = int(self.noise.integers(self.low, self.high, endpoint=True))
         self._delay = delay if self.acts() else 0
-        self._received = deque(maxlen=min(self._delay + 1, sys.maxsize))
+        self._received = deque(maxlen=self._delay + 1)
 
     def _observe(self, observation: Any, info: Info) -> tuple[Any, Info]:
         if not self._delay:
@@ -688,7 +663,7 @@ class RewardNoise(NoiseWrapper):
         if self.acts():
             given: Any = _number_in(reward)
             reward = self._perturb(given)
-            if reward != given and not math.isnan(given):
+            if reward != given:
                 info = self.mark(info)
         return observation, reward, terminated, truncated, info
 
@@ -835,7 +810,7 @@ class RandomActionDelay(NoiseWrapper):
         super()._begin(seed)
         delay = int(self.noise.integers(self.low, self.high, endpoint=True))
         self._delay = delay if self.acts() else 0
-        self._actions = deque(maxlen=min(self._delay + 1, sys.maxsize))
+        self._actions = deque(maxlen=self._delay + 1)
 
     def step(self, action: Any) -> Step:
         """Step the environment with the action of some steps ago."""
@@ -857,7 +832,6 @@ class RandomEarlyTermination(NoiseWrapper):
     k-th step ends there: ``terminated`` is set, or ``truncated`` if ``truncate=True``. ``high`` is
     ``low`` by default. ``each_step=True``, without low and high, is the paper's alternative: every
     step ends the episode with probability p. ``times_applied`` counts the episodes that it ended.
-    An environment that records its episodes would miss them, so it is refused.
 
     >>> env = RandomEarlyTermination(gym.make("CartPole-v1"), 1.0, 2)
     >>> _ = env.reset(seed=0)
@@ -877,11 +851,10 @@ class RandomEarlyTermination(NoiseWrapper):
         each_step: bool = False,
         truncate: bool = False,
     ):
-        of_recorders = ("return_queue", "get_episode_rewards")  # Gymnasium's, Stable-Baselines3's
-        if any(env.has_wrapper_attr(name) for name in of_recorders):
+        if any(env.has_wrapper_attr(name) for name in ("return_queue", "get_episode_rewards")):
             raise ValueError(
-                "this environment records its episodes, as RecordEpisodeStatistics and Monitor do, "
-                "and the record would miss those that RandomEarlyTermination ends: apply that first"
+                "RandomEarlyTermination needs to be inside of what records episodes "
+                "(RecordEpisodeStatistics, Monitor): the record would miss those that it ends"
             )
         self.each_step, self.truncate = _flag("each_step", each_step), _flag("truncate", truncate)
         if not each_step:
@@ -896,11 +869,9 @@ class RandomEarlyTermination(NoiseWrapper):
         self._last_step: int | None = None
         timers = _layers(env, gym.wrappers.TimeLimit)
         limit = min((timer._max_episode_steps for timer in timers), default=math.inf)
-        if low is not None and low >= limit:  # no episode lasts long enough to be ended
-            only = low == limit and not truncate
-            effect = "only turns truncated into terminated there" if only else "never acts"
-            most = f"episodes have at most {limit} steps"
-            warnings.warn(f"RandomEarlyTermination({low}) {effect}: {most}", stacklevel=2)
+        if low is not None and low > limit:
+            never = f"never acts: episodes have at most {limit} steps"
+            warnings.warn(f"RandomEarlyTermination({low}) {never}", stacklevel=2)
 
     def _begin(self, seed: int | None) -> None:
         super()._begin(seed)
@@ -930,19 +901,16 @@ class RandomDynamics(NoiseWrapper):
     At ``reset()`` the episode is chosen with probability p. In a chosen one, each row of the named
     ``fields`` of the simulator's model (that of a body, a joint, an actuator) is its own value
     times e ~ U(low, high), ``noise.uniform(low, high, number of rows)`` for each field in turn.
-    Fields have MuJoCo's own names, as ``dof_damping``; docs/wrappers.md says what they mean.
-    ``body_mass`` takes ``body_inertia`` along, and ``actuator_gainprm`` the bias of servos
-    (``actuator_biasprm``), which keep their target. Friction has one factor for all geoms
-    (``geom_friction``, ``pair_friction``): MuJoCo takes the larger one of two, so a contact has its
-    nominal friction times that factor.
+    docs/wrappers.md says what the fields mean, and where a model is found. ``body_mass`` takes
+    ``body_inertia`` along, and ``actuator_gainprm`` the bias of servos (``actuator_biasprm``),
+    which keep their target. Friction has one factor for all geoms.
 
     What MuJoCo derives from these values is derived anew. All is undone at the next ``reset()``:
     other episodes are those of the bare environment, which may randomize other fields itself; one
     that sets these is a SpaceError. ``info["dynamics"]`` of a chosen episode's reset has the
     factors, {field: array}. Several of these wrappers may scale different fields of one
-    environment. The model is found in environments of Gymnasium, Gymnasium-Robotics, MyoSuite 3 and
-    dm_control (with shimmy). ``times_applied`` counts episodes. Peng et al., "Sim-to-Real Transfer
-    with Dynamics Randomization", 2018.
+    environment. ``times_applied`` counts episodes. Peng et al., "Sim-to-Real Transfer with Dynamics
+    Randomization", 2018.
 
     >>> env = RandomDynamics(gym.make("InvertedPendulum-v5"), 1.0, 0.5, 1.5)
     >>> env.reset(seed=0)[1]["dynamics"]["body_mass"].round(2)  # of the world, the cart, the pole
@@ -966,10 +934,9 @@ class RandomDynamics(NoiseWrapper):
         self._factors: dict[str, Array] = {}  # of the episode; none if it is not chosen
         self._outer: list[RandomDynamics] = []  # wrappers whose reset() waits for this one's
         for inner in _layers(env, RandomDynamics):
-            for field in self.fields:
-                if _with_those_along([field]) & _with_those_along(inner.fields):
-                    problem = "another RandomDynamics of this environment scales"
-                    raise ValueError(f"fields: {problem} {field}, too")
+            if common := _with_those_along(self.fields) & _with_those_along(inner.fields):
+                problem = "another RandomDynamics of this environment scales"
+                raise ValueError(f"fields={self.fields}: {problem} {', '.join(common)}, too")
         if not isinstance(env, _ProbeEnv):
             self._restore()  # what another wrapper has left of this environment
             _check_fields(self._model(), self.fields)
@@ -1025,139 +992,100 @@ class RandomDynamics(NoiseWrapper):
         self._restore()
         model = self._model()
         self._scale(model, wrappers)  # before the environment's own reset, which needs it
-        named = [field for wrapper in wrappers for field in wrapper.fields]
-        before = {field: _values(model, field) for field in _with_those_along(named)}
+        named = _with_those_along(field for wrapper in wrappers for field in wrapper.fields)
+        before = {field: _values(model, field) for field in named}
         observation, info = self.env.reset(seed=seed, options=options)
         now = self._model()
-        if now is model:
-            set_by_reset = {f for f in before if (_values(model, f) != before[f]).any()}
-            for field in named:
-                if field in set_by_reset:  # no factor would be left
-                    reason = f"this environment's reset() sets {field} itself: name other fields"
-                    raise SpaceError(f"fields: {reason}")
-        if now is not model or set_by_reset:  # another model, or the inertia of a mass
+        if now is not model:  # the environment has built another one
             self._restore()
             for wrapper in wrappers:
                 if any(len(f) != len(_values(now, name)) for name, f in wrapper._factors.items()):
                     wrapper._factors = wrapper._draw(now)
             self._scale(now, wrappers)
+        elif changed := [f for f in before if (_values(model, f) != before[f]).any()]:
+            reason = f"this environment's reset() sets {changed[0]} itself: name other fields"
+            raise SpaceError(f"fields: {reason}")  # no factor would be left
         return observation, info
 
     def _scale(self, model: Any, wrappers: "list[RandomDynamics]") -> None:
         factors = {name: f for wrapper in wrappers for name, f in wrapper._factors.items()}
         if not factors:
             return
-        base = self.unwrapped  # which has it, because another wrapper of it may have to undo it
-        if getattr(base, "_scaled_model", None) is None or base._scaled_model.model is not model:
-            base._scaled_model = _ScaledModel(model)
-        base._scaled_model.scale(factors)
+        base = self.unwrapped  # knows what is scaled, because another wrapper may have to undo it
+        known, data, _ = getattr(base, "_scaled_model", (None, None, {}))
+        if known is not model:
+            data = sys.modules["mujoco"].MjData(model)  # to compute with: that takes longer to make
+        base._scaled_model = model, data, _scale_model(model, data, factors)
 
     def _restore(self) -> None:
-        if scaled := getattr(self.unwrapped, "_scaled_model", None):
-            scaled.undo()
+        """Undo what was written; what the environment has written since then stays."""
+        model, _, written = getattr(self.unwrapped, "_scaled_model", (None, None, {}))
+        for name, (before, new) in written.items():
+            values = _values(model, name)
+            _set_values(model, name, np.where(values == new, before, values))
+        written.clear()
 
 
-# Fields of MuJoCo's model that are usually randomized.
-_USUAL_FIELDS = (
+_FIELDS = (
     "body_mass",
     "body_inertia",
     "geom_friction",
+    "pair_friction",
     "jnt_stiffness",
-    "dof_armature",
     "dof_damping",
     "dof_frictionloss",
+    "dof_armature",
+    "tendon_stiffness",
+    "tendon_damping",
+    "tendon_frictionloss",
     "actuator_gainprm",
     "actuator_forcerange",
     "actuator_gear",
 )
 _FRICTIONS = ("geom_friction", "pair_friction")
 _SCALED_ALONG = {"body_mass": "body_inertia", "actuator_gainprm": "actuator_biasprm"}
-# Which of an actuator's ten parameters are its strength, by its type: of the gain a fixed one, an
-# affine one, a muscle; of the bias none, an affine one (of a servo), a muscle.
-_PARAMETER = np.arange(10)
-_STRENGTH_IN_GAIN = {0: _PARAMETER < 3, 1: _PARAMETER < 3, 2: np.isin(_PARAMETER, (2, 3))}
-_STRENGTH_IN_BIAS = {0: _PARAMETER < 0, 1: np.isin(_PARAMETER, (1, 2)), 2: _STRENGTH_IN_GAIN[2]}
-# What mj_setConst computes from others (engine_setconst.c), in the model and in model.stat.
+# What mj_setConst derives from them, in the model and in its stat; older versions lack some.
 _DERIVED_FIELDS = (
     "body_subtreemass",
     "body_invweight0",
     "dof_invweight0",
     "dof_M0",
-    "dof_length",
     "actuator_acc0",
     "actuator_length0",
     "tendon_invweight0",
-    "tendon_length0",
-    "tendon_lengthspring",
-    "eq_data",
-    "cam_pos0",
-    "cam_poscom0",
-    "cam_mat0",
-    "light_pos0",
-    "light_poscom0",
-    "light_dir0",
-    "flexedge_length0",
     "flexedge_invweight0",
-    "flex_vertmetric",
-    "flex_vert0",
+    "cam_poscom0",
+    "light_poscom0",
 )
-_DERIVED_STATISTICS = ("meaninertia", "meanmass")  # others are of the picture
+_DERIVED_STATISTICS = ("meaninertia", "meanmass")
+# Which of an actuator's ten parameters are its strength, by its type: of the gain a fixed one, an
+# affine one, a muscle; of the bias none, an affine one (of a servo), a muscle.
+_PARAMETER = np.arange(10)
+_STRENGTH_IN_GAIN = {0: _PARAMETER < 3, 1: _PARAMETER < 3, 2: np.isin(_PARAMETER, (2, 3))}
+_STRENGTH_IN_BIAS = {0: _PARAMETER < 0, 1: np.isin(_PARAMETER, (1, 2)), 2: _STRENGTH_IN_GAIN[2]}
 
 
-class _ScaledModel:
-    """A MuJoCo model whose fields are scaled for an episode, and what undoes that.
+def _scale_model(
+    model: Any, data: Any, factors: dict[str, Array]
+) -> dict[str, tuple[Array, Array]]:
+    """Multiply the rows of a model's fields by their factors, {field: factors}.
 
-    What MuJoCo derives from the fields is derived in a copy, because mj_setConst also writes what
-    does not depend on them, and the environment may have set that itself. Where the copy shows that
-    a value depends on the factors, it is taken over.
+    Return {name: (values before, values written)} of all that was changed. ``data`` is an MjData of
+    the model to compute with.
     """
-
-    def __init__(self, model: Any):
-        import mujoco
-
-        self.model = model
-        self.data = mujoco.MjData(model)  # to compute with; that of the environment is left alone
-        self.scaled: dict[str, tuple[Array, Array]] = {}  # {field: (before, as written)}
-        self.derived: dict[str, tuple[Array, Array]] = {}
-
-    def scale(self, factors: dict[str, Array]) -> None:
-        """Multiply the rows of the fields by their factors, {field: factors}."""
-        trial = copy.copy(self.model)
-        nominal = self._derive(trial)
-        for name, of_elements in _factors_of_elements(self.model, factors).items():
-            before = _values(self.model, name)
-            self.scaled[name] = (before, before * of_elements)
-            for model in (self.model, trial):
-                _set_values(model, name, before * of_elements)
-        for name, value in self._derive(trial).items():
-            depends = value != nominal[name]
-            if np.any(depends):
-                before = _values(self.model, name)
-                self.derived[name] = (before, np.where(depends, value, before))
-                _set_values(self.model, name, self.derived[name][1])
-
-    def undo(self) -> None:
-        """Restore what was written here; what the environment has written since then stays."""
-        now = {name: _values(self.model, name) for name in self.derived}
-        derived_anew = any(np.any(now[name] != new) for name, (_, new) in self.derived.items())
-        scaled = self._derive(copy.copy(self.model)) if derived_anew else {}
-        for name, (before, new) in {**self.scaled, **self.derived}.items():
-            values = _values(self.model, name)
-            _set_values(self.model, name, np.where(values == new, before, values))
-        if derived_anew:  # by the environment's own mj_setConst, while the fields were scaled
-            nominal = self._derive(copy.copy(self.model))
-            for name, values in now.items():
-                kept = _values(self.model, name)
-                _set_values(self.model, name, np.where(values == scaled[name], nominal[name], kept))
-        self.scaled, self.derived = {}, {}
-
-    def _derive(self, trial: Any) -> dict[str, Array]:
-        """Return what MuJoCo derives from the values of a copy of the model, which it changes."""
-        import mujoco
-
-        mujoco.mj_setConst(trial, self.data)
-        names = [name for name in _DERIVED_FIELDS if hasattr(trial, name)]
-        return {name: _values(trial, name) for name in (*names, *_DERIVED_STATISTICS)}
+    written = {}
+    trial = copy.copy(model)  # mj_setConst also writes what the environment may have set itself
+    for name, of_elements in _factors_of_elements(model, factors).items():
+        before = _values(model, name)
+        written[name] = before, before * of_elements
+        _set_values(trial, name, before * of_elements)
+    sys.modules["mujoco"].mj_setConst(trial, data)
+    for name in (*_DERIVED_FIELDS, *_DERIVED_STATISTICS):
+        if name in _DERIVED_STATISTICS or hasattr(model, name):
+            written[name] = _values(model, name), _values(trial, name)
+    for name, (_, new) in written.items():
+        _set_values(model, name, new)
+    return written
 
 
 def _values(model: Any, name: str) -> Array:
@@ -1173,7 +1101,8 @@ def _set_values(model: Any, name: str, values: Array) -> None:
 
 
 def _with_those_along(fields: Iterable[str]) -> set[str]:
-    return {*fields, *(_SCALED_ALONG[field] for field in fields if field in _SCALED_ALONG)}
+    found = set(fields)
+    return found | {along for field, along in _SCALED_ALONG.items() if field in found}
 
 
 def _factors_of_elements(model: Any, factors: dict[str, Array]) -> dict[str, Array]:
@@ -1208,23 +1137,9 @@ def _check_fields(model: Any, fields: tuple[str, ...]) -> None:
 # -------------------------------------------------------------------- noises in words, and combined
 
 
-_IN_ORDER = (
-    RandomNormalNoisyObservation,
-    RandomUniformNoisyObservation,
-    RandomUniformScaleObservation,
-    RandomMixupObservation,
-    RandomDropoutObservation,
-    RandomNormalNoisyReward,
-    RandomUniformNoisyReward,
-    RandomUniformScaleReward,
-    RandomEarlyTermination,
-    RandomNormalNoisyAction,
-    RandomActionDelay,
-    RandomDynamics,
-    RandomObservationBias,
-    RandomObservationDelay,
-)
-WRAPPERS: dict[str, type[NoiseWrapper]] = {wrapper.__name__: wrapper for wrapper in _IN_ORDER}
+WRAPPERS: dict[str, type[NoiseWrapper]] = {
+    name: globals()[name] for name in __all__ if name.startswith("Random")
+}
 
 
 def signatures() -> list[str]:
@@ -1279,8 +1194,9 @@ def _read_noise(text: str) -> Noise:
     wrapper = _import_wrapper(module, name, text) if module else WRAPPERS.get(name)
     if wrapper is None:
         raise _bad_noise(text, "unknown name")
+    signature = inspect.signature(wrapper)
     try:
-        inspect.signature(wrapper).bind(None, 1.0, *args, **kwargs)
+        given = signature.bind(None, 1.0, *args, **kwargs).arguments
     except TypeError as error:
         raise _bad_noise(text, str(error)) from None
     try:
@@ -1288,23 +1204,22 @@ def _read_noise(text: str) -> Noise:
     except ValueError as error:
         raise _bad_noise(text, str(error)) from None
     parameters = _parameters(wrapper)
-    for p in parameters:
-        if p.name not in recorded:
-            call = f"super().__init__(env, noise_rate, {p.name}={p.name})"
-            raise _bad_noise(text, f"its constructor must pass {p.name} on: {call}")
+    values = {p.name: {**given, **recorded}.get(p.name, p.default) for p in parameters}
     positional = [p for p in parameters if p.kind is not p.KEYWORD_ONLY]
-    while positional and recorded[positional[-1].name] == positional[-1].default:
+    while positional and values[positional[-1].name] == positional[-1].default:
         positional.pop()  # but not a default before another value, which would take its place
-    keywords = [p for p in parameters if p.kind is p.KEYWORD_ONLY and recorded[p.name] != p.default]
-    written = [repr(recorded[p.name]) for p in positional]
-    written += [f"{p.name}={recorded[p.name]!r}" for p in keywords]
+    keywords = [p for p in parameters if p.kind is p.KEYWORD_ONLY and values[p.name] != p.default]
+    written = [repr(values[p.name]) for p in positional]
+    written += [f"{p.name}={values[p.name]!r}" for p in keywords]
     owner = "" if wrapper is WRAPPERS.get(name) else f"{module}:"
     noise = Noise(wrapper, f"{owner}{wrapper.__name__}({', '.join(written)})")
-    with contextlib.suppress(TypeError, ValueError):
-        if noise(_ProbeEnv(), 1.0).parameters == recorded:  # what is written makes the same again
-            return noise
-    wanted = "name its arguments (no *args or **kwargs) and pass them on as they came"
-    raise _bad_noise(text, f"its constructor must {wanted}; {noise} would be another noise")
+    if owner:
+        with contextlib.suppress(TypeError, ValueError):
+            if noise(_ProbeEnv(), 1.0).parameters == recorded:
+                return noise
+        wanted = "name its arguments (no *args or **kwargs) and pass them on as they came"
+        raise _bad_noise(text, f"its constructor must {wanted}; {noise} would be another noise")
+    return noise
 
 
 def _read_call(text: str) -> tuple[str, str, list[Any], dict[str, Any]]:
@@ -1328,10 +1243,8 @@ def _import_wrapper(module: str, name: str, text: str) -> type[NoiseWrapper]:
     """Return a wrapper of the user's own."""
     _import_module(module, f"bad noise {text!r}")
     wrapper = getattr(sys.modules[module], name, None)
-    if not isinstance(wrapper, type):
-        raise _bad_noise(text, f"{module} has no class {name}")
-    if not issubclass(wrapper, NoiseWrapper):
-        raise _bad_noise(text, f"{name} must be a subclass of noisy_wrappers.NoiseWrapper")
+    if not (isinstance(wrapper, type) and issubclass(wrapper, NoiseWrapper)):
+        raise _bad_noise(text, f"{module} has no subclass {name} of noisy_wrappers.NoiseWrapper")
     kind, kinds = getattr(wrapper, "kind", None), ("observation", "reward", "action", "dynamics")
     if kind not in kinds:
         raise _bad_noise(text, f"{name}.kind must be one of {', '.join(kinds)}, not {kind!r}")
@@ -1351,8 +1264,8 @@ def _bad_noise(text: str, reason: str) -> ValueError:
 class Configuration:
     """The noises of a run or of a test, each with its rate; without any it is the baseline.
 
-    It is made once, of what a user writes or config.json holds (:meth:`read`) or of two cells of a
-    csv file (:meth:`parse`); no other code takes such text apart. Equal configurations are equal
+    It is made of what a user writes or config.json holds (:meth:`read`) or of two cells of a csv
+    file (:meth:`parse`); no other code takes such text apart. Equal configurations are equal
     objects. They are ordered by noise, then by rate, the baseline first.
 
     >>> str(Configuration.read(["RandomEarlyTermination(50, 50)"], ["1:0"]))
@@ -1366,11 +1279,10 @@ class Configuration:
     def read(cls, noises: Sequence[str], rates: Sequence[Rate], *, stored: bool = False) -> Self:
         """Check noises and rates and make them canonical; ValueError says what is wrong.
 
-        One rate serves all noises; it is a number in [0, 1], or "start:end" of two such numbers,
-        which is a number if they are equal. Noises of rate 0 are dropped (they are the baseline).
-        Dynamics and action noise come first, where :func:`make_noisy` applies them. ``stored`` are
-        those of a config.json. They are canonical; one of the user's own is taken as it stands,
-        because its module need not be where its runs are analysed.
+        One rate serves all noises. Noises of rate 0 are dropped (they are the baseline). Dynamics
+        and action noise come first, where :func:`make_noisy` applies them. ``stored`` are those of
+        a config.json: one of the user's own is taken as it stands, because its module need not be
+        where its runs are analysed.
         """
         noises = _listed("noises", noises, '["RandomNormalNoisyReward(0.1)"]')
         rates = _listed("rates", rates, "[0.5]")
@@ -1404,8 +1316,7 @@ class Configuration:
     def for_tests(self) -> Self:
         """Return it, or raise ValueError if no policy can be tested under it.
 
-        Noise that is relative to observations or rewards would depend on the policy and on earlier
-        tests, and a rate that changes needs a training.
+        A running scale would depend on the policy, and a rate that changes needs a training.
         """
         for noise, rate in zip(*self.texts, strict=True):
             if isinstance(rate, str):
@@ -1425,8 +1336,7 @@ class Configuration:
     @property
     def columns(self) -> tuple[str, str]:
         """The cells of robustness.csv and choice.csv: "A(1.0) + B()", "0.05 + 1.0:0.0"."""
-        noises, rates = self.texts
-        return " + ".join(noises), " + ".join(map(str, rates or [0.0]))
+        return self.noise, " + ".join(map(str, self.texts[1] or [0.0]))
 
     @property
     def noise(self) -> str:
@@ -1436,26 +1346,17 @@ class Configuration:
     @property
     def noise_rate(self) -> str:
         """The rates as tables and the paper have them: "0.05"; the baseline's is "0.00"."""
-        written = []
-        for start, end in self.rates or [(0.0, 0.0)]:
-            text = f"{start:.2f}" if round(start, 2) == start else str(start)
-            if end != start:
-                text += " to " + (f"{end:.2f}" if round(end, 2) == end else str(end))
-            written.append(text)
-        return " + ".join(written)
+
+        def text(rate: float) -> str:
+            return f"{rate:.2f}" if round(rate, 2) == rate else str(rate)
+
+        ends = self.rates or [(0.0, 0.0)]
+        return " + ".join(text(a) if a == b else f"{text(a)} to {text(b)}" for a, b in ends)
 
     @property
     def wrappers(self) -> list[str]:
         """The names of the wrappers, in order, as they are written: perhaps with a module."""
         return [noise.partition("(")[0] for noise in self.noises]
-
-    @property
-    def kinds(self) -> set[str]:
-        """What the noises perturb: "observation", "reward", "action", "dynamics", or "own".
-
-        The last is a noise that is not ours: its module need not be there where runs are analysed.
-        """
-        return {WRAPPERS[name].kind if name in WRAPPERS else "own" for name in self.wrappers}
 
     @property
     def slug(self) -> str:
@@ -1469,7 +1370,7 @@ class Configuration:
     def wrap(self, env: Env, *, record_statistics: bool = True) -> Env:
         """Stack the noises on an environment, as :func:`make_noisy` says."""
         if not isinstance(env, gym.Env):
-            raise TypeError(f"make_noisy takes a single gymnasium.Env, not a {type(env).__name__}")
+            raise TypeError(f"needs a single gymnasium.Env, not a {type(env).__name__}")
         if isinstance(env, gym.wrappers.FlattenObservation) and not isinstance(
             env.env.observation_space, gym.spaces.Box
         ):
@@ -1480,8 +1381,8 @@ class Configuration:
             if noise.wrapper.kind in ("dynamics", "action"):
                 env = noise(env, rate)
         inside = next(layer for layer in _layers(env) if not isinstance(layer, NoiseWrapper))
-        if record_statistics and not isinstance(inside, RecordEpisodeStatistics):
-            env = RecordEpisodeStatistics(env)
+        if record_statistics and not isinstance(inside, gym.wrappers.RecordEpisodeStatistics):
+            env = gym.wrappers.RecordEpisodeStatistics(env)
         for noise, rate in pairs:
             if noise.wrapper.kind in ("observation", "reward"):
                 env = noise(env, rate)
@@ -1531,10 +1432,10 @@ def make_noisy(
     Dynamics noise is innermost (:class:`RandomDynamics`, then early termination), then action noise
     (:class:`RandomActionDelay` first), then Gymnasium's ``RecordEpisodeStatistics``, then the other
     noises in the order given: ``info["episode"]`` has the return before reward noise.
-    ``record_statistics=False`` leaves the record out: one that is there already, such as
-    Stable-Baselines3's Monitor, stays. Where dictionaries or tuples are flattened by the outermost
-    wrapper, all goes inside that one. ValueError is as of :meth:`Configuration.read`, or a space
-    that a noise cannot work on; TypeError not a single environment (a vector, for example).
+    ``record_statistics=False`` leaves the record out, as where Stable-Baselines3's Monitor keeps
+    one. Where dictionaries or tuples are flattened by the outermost wrapper, all goes inside that
+    one. ValueError is a bad noise or rate, or a space that a noise cannot work on; TypeError not a
+    single environment.
 
     >>> make_noisy(gym.make("CartPole-v1").unwrapped, ["RandomNormalNoisyReward(1)"], [0.1])
     <RandomNormalNoisyReward<RecordEpisodeStatistics<CartPoleEnv<CartPole-v1>>>>
@@ -1542,30 +1443,14 @@ def make_noisy(
     return Configuration.read(noises, rates).wrap(env, record_statistics=record_statistics)
 
 
-class RecordEpisodeStatistics(gym.wrappers.RecordEpisodeStatistics[Any, Any]):
-    """Gymnasium's wrapper, whose record takes the place of one that the environment keeps."""
-
-    def __init__(self, env: Env, **recorded: Any):
-        super().__init__(env, **recorded)
-        self._stats_key = "episode of noisy_wrappers"  # Gymnasium's asserts that its key is free
-
-    def step(self, action: Any) -> Step:
-        """Step the environment; the info of an episode's last step has "episode"."""
-        observation, reward, terminated, truncated, info = super().step(action)
-        if terminated or truncated:
-            record = info.pop(self._stats_key)  # the environment may return the same dict again
-            info = {**info, "episode": record}
-        return observation, reward, terminated, truncated, info
-
-
 # ---------------------------------------------------------------------------------- during training
 
 
-def set_progress(env: Any, fraction: float) -> None:
+def set_progress(env: Env, fraction: float) -> None:
     """Set the fraction of training done, for rates that change; call it before each ``reset()``.
 
-    Rates change when the next episode begins, never within one. ``env`` is an environment, a vector
-    environment of Gymnasium, or a VecEnv of Stable-Baselines3, also with processes of its own.
+    Rates change when the next episode begins, never within one. A vector of environments is told
+    by its ``call("set_progress", fraction)``.
 
     >>> env = RandomNormalNoisyReward(gym.make("CartPole-v1"), "1.0:0.0", 0.1)
     >>> set_progress(env, 0.25)
@@ -1574,11 +1459,8 @@ def set_progress(env: Any, fraction: float) -> None:
     0.75
     """
     progress = _number("fraction", fraction, low=0, high=1)
-    if isinstance(env, gym.Env):
-        for layer in _layers(env, NoiseWrapper):
-            layer._training_progress = progress
-    else:
-        _call_each(env, "set_wrapper_attr", "training_progress", progress, force=False)
+    for wrapper in noise_wrappers(env).values():
+        wrapper._progress = progress
 
 
 def noise_wrappers(env: Env) -> dict[str, NoiseWrapper]:
@@ -1587,7 +1469,7 @@ def noise_wrappers(env: Env) -> dict[str, NoiseWrapper]:
     The second of a class is "ClassName_2", and so on. Not a single environment is a TypeError.
     """
     if not isinstance(env, gym.Env):
-        raise TypeError(f"noise_wrappers takes a gymnasium.Env, not a {type(env).__name__}")
+        raise TypeError(f"needs a single gymnasium.Env, not a {type(env).__name__}")
     found: dict[str, NoiseWrapper] = {}
     for layer in reversed(_layers(env, NoiseWrapper)):
         name = type(layer).__name__
@@ -1596,42 +1478,22 @@ def noise_wrappers(env: Env) -> dict[str, NoiseWrapper]:
     return found
 
 
-def noise_statistics(env: Any) -> dict[str, float]:
+def noise_statistics(env: Env) -> dict[str, float]:
     """Return the rate and the realised rate of an environment's noise wrappers, for a log.
 
-    Where noises are combined, the wrapper's name stands in front. Of a vector of environments, as
-    :func:`set_progress` takes one, these are the means; ValueError if their noises differ.
+    Where noises are combined, the wrapper's name stands in front.
 
     >>> env = make_noisy(gym.make("CartPole-v1"), ["RandomNormalNoisyReward(1)"], [1.0])
     >>> _ = env.reset(), env.step(0)
     >>> noise_statistics(env)
     {'rate': 1.0, 'applied_fraction': 1.0}
     """
-    if isinstance(env, gym.Env):
-        statistics, wrappers = {}, noise_wrappers(env)
-        for name, wrapper in wrappers.items():
-            prefix = f"{name}/" if len(wrappers) > 1 else ""
-            statistics[f"{prefix}rate"] = wrapper.noise_rate
-            statistics[f"{prefix}applied_fraction"] = wrapper.applied_fraction
-        return statistics
-    noisy = _call_each(env, "has_wrapper_attr", "noise_statistics")
-    if not any(noisy):
-        return {}
-    each = _call_each(env, "noise_statistics") if all(noisy) else []
-    if len({tuple(statistics) for statistics in each}) != 1:
-        raise ValueError("these environments have different noises, so there are no means")
-    return {name: float(np.mean([one[name] for one in each])) for name in each[0]}
-
-
-def _call_each(env: Any, method: str, *args: Any, **kwargs: Any) -> Sequence[Any]:
-    """Call a method of each environment of a vector, in the process in which it runs."""
-    if isinstance(env, gym.vector.VectorEnv):
-        env = env.unwrapped
-        # One that is not made of single environments, such as CartPole's own, holds no noise.
-        return env.call(method, *args, **kwargs) if hasattr(env, "call") else ()
-    if hasattr(env, "env_method"):  # of Stable-Baselines3
-        return env.env_method(method, *args, **kwargs)
-    raise TypeError(f"needs an environment or a vector of environments, not {type(env).__name__}")
+    statistics, wrappers = {}, noise_wrappers(env)
+    for name, wrapper in wrappers.items():
+        prefix = f"{name}/" if len(wrappers) > 1 else ""
+        statistics[f"{prefix}rate"] = wrapper.noise_rate
+        statistics[f"{prefix}applied_fraction"] = wrapper.applied_fraction
+    return statistics
 
 
 # ---------------------------------------------------------- an environment, made ready for networks
@@ -1651,18 +1513,10 @@ class SpaceError(ValueError):
 class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Stops at NaN and infinity, and makes what an environment returns what the API asks for.
 
-    A learner that receives NaN does not recover, and may never show it: NotFiniteError says whether
-    the action was already NaN, as after a divergence. Rewards become floats and the two ends bools;
-    they may be arrays of one element. Observations are copied, because an environment may write the
-    next one into the same array, and actions, because it may write into those, and infos. An
-    observation that has not the shape of its space raises SpaceError. The spaces are looked up
-    once: an environment may make new ones, with new generators, at every access.
-
-    >>> env = FiniteNumbers(gym.make("Pendulum-v1", disable_env_checker=True))
-    >>> _ = env.reset(seed=0)
-    >>> env.step(np.array([np.nan]))
-    Traceback (most recent call last):
-    noisy_wrappers.NotFiniteError: step 1 of an episode: the environment was given the action [nan]
+    NotFiniteError says whether the action was already NaN, as after a divergence; SpaceError that
+    an observation has not the shape of its space. Rewards become floats and the two ends bools.
+    Observations, actions and infos are copied, because an environment may write into them. The
+    spaces are looked up once: an environment may make new ones at every access.
     """
 
     def __init__(self, env: Env):
@@ -1690,14 +1544,8 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if not math.isfinite(number):
             self._blame("returned the reward", reward, action)
         observation, info = self._checked(observation, action), dict(info or {})
+        info.pop("episode", None)  # where an environment records itself, ours would be refused
         return observation, number, bool(terminated), bool(truncated), info
-
-    def close(self) -> None:
-        """Close the environment; warn if that fails, because what was trained in it is valid."""
-        try:
-            self.env.close()
-        except (Exception, SystemExit) as error:
-            gym.logger.warn(f"closing the environment failed: {error!r}")
 
     def _checked(self, observation: Any, action: Any = None) -> Any:
         """Return a copy of an observation."""
@@ -1731,15 +1579,8 @@ def make_flat(env: Env, step_limit: int | None = None) -> Env:
     :class:`FiniteNumbers` makes rewards floats and stops at NaN and infinity; dictionaries, tuples,
     arrays and categories are then flattened. An environment whose spec has no time limit is cut
     after ``step_limit`` steps, if that is given. Apply noise to the result: it goes in between, so
-    it knows the parts. SpaceError if there are no vectors (then the environment has been closed),
-    TypeError if it is no gymnasium.Env.
-
-    >>> make_flat(gym.make("Pendulum-v1").unwrapped)
-    <FiniteNumbers<PendulumEnv<Pendulum-v1>>>
+    it knows the parts. SpaceError if there are no vectors; then the environment has been closed.
     """
-    if not isinstance(env, gym.Env):
-        kind = type(env)
-        raise TypeError(f"needs a gymnasium.Env, not a {kind.__module__}.{kind.__qualname__}")
     name = env.spec.id if env.spec else str(env)
     if step_limit and env.spec and env.spec.max_episode_steps is None:
         env = gym.wrappers.TimeLimit(env, step_limit)
@@ -1794,12 +1635,7 @@ def make_environments(
 
 
 def is_bounded(space: gym.Space[Any]) -> bool:
-    """Return whether all bounds of a Box are finite; the largest float32 stands for infinity.
-
-    >>> largest = np.finfo(np.float32).max
-    >>> is_bounded(gym.spaces.Box(-1, 1, (2,))), is_bounded(gym.spaces.Box(-largest, 1, (2,)))
-    (True, False)
-    """
+    """Return whether all bounds of a Box are finite; the largest float32 stands for infinity."""
     if not isinstance(space, gym.spaces.Box):
         return False
     bounds = np.abs(np.concatenate([space.low, space.high], axis=None, dtype=np.float64))
@@ -1807,11 +1643,7 @@ def is_bounded(space: gym.Space[Any]) -> bool:
 
 
 def into_space(action: Array, space: gym.spaces.Box) -> Array:
-    """Return an action in its space's dtype and, to the last bit, within its bounds.
-
-    >>> into_space(np.float64([0.1, 2]), gym.spaces.Box(-1, 1, (2,)))
-    array([0.1, 1. ], dtype=float32)
-    """
+    """Return an action in its space's dtype and, to the last bit, within its bounds."""
     # in this order, because the cast may round a bound up
     return action.astype(space.dtype).clip(space.low, space.high)
 
@@ -1821,9 +1653,6 @@ def outcome(info: Mapping[str, Any]) -> float:
 
     ``is_success`` and ``success`` are the names that Gymnasium-Robotics, Meta-World and
     Stable-Baselines3 use; NaN where the environment says nothing.
-
-    >>> outcome({"is_success": np.float32(1)}), outcome({"success": False}), outcome({})
-    (1.0, 0.0, nan)
     """
     for name in ("is_success", "success"):
         value = np.asarray(info.get(name))  # PyTorch's tensors have a size() of their own
@@ -1833,11 +1662,7 @@ def outcome(info: Mapping[str, Any]) -> float:
 
 
 def success_rate(outcomes: Iterable[float]) -> dict[str, float]:
-    """Return the rate of success by its name; nothing if no :func:`outcome` is known.
-
-    >>> success_rate([1.0, 0.0, math.nan, 0.0]), success_rate([math.nan])
-    ({'success_rate': 0.25}, {})
-    """
+    """Return the rate of success by its name; nothing if no :func:`outcome` is known."""
     values = np.asarray(list(outcomes))
     return {} if np.isnan(values).all() else {"success_rate": float((values > 0).mean())}
 
@@ -1847,9 +1672,6 @@ def canonical_env_id(env_id: str) -> str:
 
     "module:Env-v0" imports the module, which registers the environment, and stays "module:Env-v0".
     ValueError if there is no such environment or module; what a module raises passes through.
-
-    >>> canonical_env_id("Hopper")
-    'Hopper-v5'
     """
     module, colon, name = env_id.rpartition(":")
     if module:
@@ -1868,14 +1690,11 @@ def parse_env_kwargs(texts: Sequence[str]) -> dict[str, Any]:
     """Read arguments of an environment, "name:value", as a script's ``--env-kwargs`` has them.
 
     A value is a literal of Python, or else text. ValueError if that is no name, or given twice.
-
-    >>> parse_env_kwargs(["mass:2.0", "reward_type:dense", "sizes:(1, 2)", "file:a:b"])
-    {'mass': 2.0, 'reward_type': 'dense', 'sizes': (1, 2), 'file': 'a:b'}
     """
     found: dict[str, Any] = {}
     for text in _listed("env_kwargs", texts, '["mass:2.0"]'):
         name, colon, value = str(text).partition(":")
-        if not colon or not name.isidentifier() or keyword.iskeyword(name):
+        if not colon or not name.isidentifier():
             raise ValueError(f"env_kwargs: {text!r} is not name:value, such as mass:2.0")
         if name in found:
             raise ValueError(f"env_kwargs: {name} is given twice")
@@ -1900,19 +1719,10 @@ def _import_module(module: str, problem: str) -> None:
     """
     path, searched = sys.path[:], module_path()
     sys.path[:] = searched
-    top = module.partition(".")[0]
     try:
-        if not all(map(str.isidentifier, module.split("."))):
-            raise ValueError(f"{problem}: {module!r} is not a module name")
-        loaded, found = sys.modules.get(top), importlib.machinery.PathFinder.find_spec(top)
-        if loaded and found and found.origin != getattr(loaded, "__file__", found.origin):
-            other = f"a module {top!r} is loaded already, from {loaded.__file__}"
-            raise ValueError(f"{problem}: {other}; rename yours")
         with kept_generators():
             seed_globals(0)  # what the module draws is the same in every run and in all tests
             importlib.import_module(module)
-    except SystemExit as error:
-        raise ValueError(f"{problem}: {module} called sys.exit({error.code!r})") from error
     except ModuleNotFoundError as error:
         if not f"{module}.".startswith(f"{error.name}."):
             raise  # it exists, and imports another one that does not
@@ -1982,16 +1792,16 @@ def seed_globals(seed: int) -> None:
 def kept_generators(env: Env | None = None) -> Iterator[None]:
     """Restore after some lines the global generators, and those that EnvState finds in ``env``."""
     generators: list[Any] = [random, np.random]
-    if torch := sys.modules.get("torch"):
-        generators.append(torch.default_generator)
     if env is not None:
         generators += _generators(env).values()
     streams = [_stream(generator) for generator in generators]
-    try:
-        yield
-    finally:
-        for generator, stream in zip(generators, streams, strict=True):
-            _set_stream(generator, stream)
+    torch = sys.modules.get("torch")
+    with torch.random.fork_rng(devices=[]) if torch else contextlib.nullcontext():
+        try:
+            yield
+        finally:
+            for generator, stream in zip(generators, streams, strict=True):
+                _set_stream(generator, stream)
 
 
 def play(
@@ -2021,9 +1831,6 @@ def _generators(env: Env) -> dict[str, Any]:
 
     They are named by their places, such as "0._np_random". Nothing else is looked into.
     """
-    kinds: tuple[Any, ...] = (np.random.Generator, np.random.RandomState, random.Random)
-    if torch := sys.modules.get("torch"):
-        kinds += (torch.Generator,)
     holders: dict[str, Any] = {}
     for i, layer in enumerate(_layers(env)):
         holders[str(i)] = layer
@@ -2031,6 +1838,7 @@ def _generators(env: Env) -> dict[str, Any]:
         for name, value in {**spaces, **vars(layer)}.items():
             if issubclass(type(value), gym.Space):
                 holders |= _parts_of_space(f"{i}.{name}", value)
+    kinds = (np.random.Generator, np.random.RandomState, random.Random)
     found = {}
     for place, holder in holders.items():
         for name, value in vars(holder).items():
@@ -2052,31 +1860,26 @@ def _parts_of_space(place: str, space: gym.Space[Any]) -> dict[str, gym.Space[An
 
 def _stream(generator: Any) -> Any:
     """Return the state of a generator, or of random or np.random, in Python's own types."""
-    if isinstance(generator, np.random.Generator):
-        stream = {"state": generator.bit_generator.state}
-        if isinstance(seeds := generator.bit_generator.seed_seq, np.random.SeedSequence):
-            stream["seeds"] = seeds.state  # with the number of children that were spawned
-        return _without_arrays(stream)
-    if generator is np.random or isinstance(generator, np.random.RandomState):  # dm_control's
-        return _without_arrays(generator.get_state(legacy=False))
     if generator is random or isinstance(generator, random.Random):
         return generator.getstate()
-    return generator.get_state().tolist()  # PyTorch's
+    if generator is np.random or isinstance(generator, np.random.RandomState):  # dm_control's
+        return _without_arrays(generator.get_state(legacy=False))
+    stream = {"state": generator.bit_generator.state}
+    if isinstance(seeds := generator.bit_generator.seed_seq, np.random.SeedSequence):
+        stream["seeds"] = seeds.state  # with the number of children that were spawned
+    return _without_arrays(stream)
 
 
 def _set_stream(generator: Any, stream: Any) -> None:
-    if isinstance(generator, np.random.Generator):
+    if generator is random or isinstance(generator, random.Random):
+        version, words, normal = stream
+        generator.setstate((version, tuple(words), normal))
+    elif generator is np.random or isinstance(generator, np.random.RandomState):
+        generator.set_state(stream)
+    else:
         generator.bit_generator.state = stream["state"]
         if "seeds" in stream:  # in place, because whoever spawns may hold it, too
             generator.bit_generator.seed_seq.__init__(**stream["seeds"])
-    elif generator is np.random or isinstance(generator, np.random.RandomState):
-        generator.set_state(stream)
-    elif generator is random or isinstance(generator, random.Random):
-        version, words, normal = stream
-        generator.setstate((version, tuple(words), normal))
-    else:
-        torch = sys.modules["torch"]
-        generator.set_state(torch.tensor(stream, dtype=torch.uint8))
 
 
 # ------------------------------------------------------------- a run's identity: name and arguments
@@ -2169,11 +1972,6 @@ def different_arguments(
     Both are contents of a config.json, with "args", and with "defaults" since version 0.4. Values
     are compared as JSON, so a tuple equals its list. An argument that one of them lacks, because
     the script has it since then, had the default that the other one names.
-
-    >>> old = {"args": {"seed": 1}}
-    >>> new = {"args": {"seed": 1, "width": 64}, "defaults": {"seed": 1, "width": 32}}
-    >>> different_arguments(old, new)
-    {'width': (32, 64)}
     """
     names = [*config["args"], *(name for name in other["args"] if name not in config["args"])]
     differing = {}
@@ -2198,47 +1996,39 @@ def release(config: Mapping[str, Any]) -> str:
 
 
 def as_json(value: Any) -> Any:
-    """Return a value as JSON has it: a tuple is a list, a path its text.
-
-    >>> as_json({"noise": ("A()",), "runs_dir": Path("runs")})
-    {'noise': ['A()'], 'runs_dir': 'runs'}
-    """
+    """Return a value as JSON has it: a tuple is a list, a path its text."""
     return json.loads(json.dumps(value, default=str))
 
 
-_COUNTS = {
-    *("total_timesteps", "max_episode_steps", "checkpoint_frequency", "eval_episodes"),
-    *("torch_threads", "buffer_size", "batch_size", "policy_frequency"),
-    *("target_network_frequency", "num_steps", "num_minibatches", "update_epochs"),
-}
-_NOT_NEGATIVE = {
-    *("seed", "eval_frequency", "learning_starts", "policy_lr", "q_lr", "learning_rate", "alpha"),
-    *("exploration_noise", "policy_noise", "noise_clip", "clip_coef", "ent_coef", "vf_coef"),
-    *("max_grad_norm", "target_kl"),
-}
-_FRACTIONS = {"gamma", "gae_lambda", "tau"}
+# Arguments of the scripts that are at least 0, at least 1, or fractions.
+_NOT_NEGATIVE = ("seed", "eval_frequency", "learning_starts")
+_COUNTS = (
+    "total_timesteps",
+    "max_episode_steps",
+    "checkpoint_frequency",
+    "eval_episodes",
+    "torch_threads",
+    "buffer_size",
+    "batch_size",
+    "policy_frequency",
+    "target_network_frequency",
+    "num_steps",
+    "num_minibatches",
+    "update_epochs",
+)
+_FRACTIONS = ("gamma", "gae_lambda", "tau")
 
 
-def check_numbers(args: Mapping[str, Any]) -> None:
-    """Check the numbers among a script's arguments, {name: value}, of those that it knows.
-
-    >>> check_numbers({"gamma": 1.1})
-    Traceback (most recent call last):
-    ValueError: --gamma must be at most 1, not 1.1
-
-    Raises:
-        ValueError: one is out of its range, or NaN.
-    """
+def _check_numbers(args: Mapping[str, Any]) -> None:
+    """Raise ValueError if one of these arguments of a script is out of its range, or NaN."""
     for name, value in args.items():
-        if not isinstance(value, int | float):
+        if name not in _NOT_NEGATIVE + _COUNTS + _FRACTIONS or value is None:
             continue
-        option = f"--{name.replace('_', '-')}"
         low = 1 if name in _COUNTS else 0
-        high = 1 if name in _FRACTIONS else 2**63 - 1
-        if name not in _COUNTS | _NOT_NEGATIVE | _FRACTIONS or low <= value <= high:
-            continue
-        wanted = f"at most {high}" if value > high else f"at least {low}"
-        raise ValueError(f"{option} must be {wanted}, not {value}")
+        high = 1 if name in _FRACTIONS else math.inf
+        if not low <= value <= high:
+            wanted = f"at most {high}" if value > high else f"at least {low}"
+            raise ValueError(f"--{name.replace('_', '-')} must be {wanted}, not {value}")
 
 
 def canonical_arguments(args: Mapping[str, Any]) -> dict[str, Any]:
@@ -2248,10 +2038,10 @@ def canonical_arguments(args: Mapping[str, Any]) -> dict[str, Any]:
     module of "module:Env-v0" is imported.
 
     Raises:
-        ValueError: a number out of its range (:func:`check_numbers`), a bad ``exp_name``, noise or
-            rate, or an environment that does not exist.
+        ValueError: a number out of its range, a bad ``exp_name``, noise or rate, or an environment
+            that does not exist.
     """
-    check_numbers(args)
+    _check_numbers(args)
     if args["exp_name"] in ("", ".", ".."):
         raise ValueError(f"--exp-name must be a name, not {args['exp_name']!r}")
     parse_env_kwargs(args["env_kwargs"])
@@ -2360,10 +2150,6 @@ def _describe_keys(env: Env) -> list[list[Any]]:
 class Spaces:
     """The spaces that a run's config.json tells of, in place of its environment.
 
-    >>> box = {"shape": [2], "low": "-inf", "high": [1.0, 2.0], "dtype": "float32"}
-    >>> Spaces({"observation_space": box, "action_space": box}).action_space
-    Box(-inf, [1. 2.], (2,), float32)
-
     Attributes:
         observation_space: a Box of one dimension.
         action_space: a Box of one dimension.
@@ -2438,23 +2224,6 @@ def _is_box(space: gym.Space[Any], kinds: str) -> bool:
     return isinstance(space, gym.spaces.Box) and space.dtype.kind in kinds
 
 
-def _has_categories(env: Env) -> bool:
-    """Return whether observations contain categories, which flattening makes numbers of."""
-    kinds = gym.spaces.Discrete | gym.spaces.MultiDiscrete | gym.spaces.MultiBinary
-    return any(isinstance(part, kinds) for _, part in _entries(env.observation_space))
-
-
-def _differ(one: Array, other: Array) -> bool:
-    """Return whether two arrays differ; NaN in both is no difference."""
-    unequal = one != other
-    if not np.count_nonzero(unequal):
-        return False
-    first = unequal.argmax()  # usually there is no NaN, so one look is enough
-    if one.item(first) == one.item(first):
-        return True
-    return bool(np.any(unequal & ~(np.isnan(one) & np.isnan(other))))
-
-
 def _cast(values: Array, dtype: np.dtype[Any]) -> Array:
     """Cast float64 values; to an integer dtype they are rounded and clipped to its range."""
     if dtype.kind in "iu":
@@ -2473,8 +2242,6 @@ def _number_in(reward: Any) -> Any:
 
 def _as_float(reward: Any) -> float:
     """Return a reward as a float, or NaN if it is not one number."""
-    if isinstance(reward, str):
-        return math.nan
     try:
         return float(_number_in(reward))
     except (TypeError, ValueError):  # None, or several numbers
@@ -2522,8 +2289,8 @@ def _whole_interval(low: int | None, high: int | None, least: int) -> tuple[int,
     for name, value in (("low", low), ("high", low if high is None else high)):
         end = _without_arrays(value)
         is_whole = isinstance(end, numbers.Integral) and not isinstance(end, bool)
-        if not (is_whole and least <= end < 2**63):  # NumPy draws 64-bit integers
-            raise ValueError(f"{name} must be an integer in [{least}, 2**63), got {value!r}")
+        if not (is_whole and least <= end < 2**31):
+            raise ValueError(f"{name} must be an integer in [{least}, 2**31), got {value!r}")
         ends.append(int(end))
     if ends[0] > ends[1]:
         raise ValueError(f"low must not exceed high, got low={ends[0]}, high={ends[1]}")
@@ -2563,31 +2330,11 @@ def _fields(fields: Any) -> tuple[str, ...]:
     if not isinstance(found, tuple | list) or not found:
         raise ValueError(f"fields must be a tuple of names, got {fields!r}")
     for field in found:
-        if field not in _USUAL_FIELDS and not _is_field(field):
-            usual = ", ".join(_USUAL_FIELDS)
-            raise ValueError(
-                f"fields: {field!r} cannot be scaled for each body, geom, contact pair, joint, "
-                f"degree of freedom, actuator or tendon of MuJoCo's model; usual are {usual}"
-            )
-    for field, along in _SCALED_ALONG.items():
-        if along in found and (field in found or along == "actuator_biasprm"):
-            raise ValueError(f"fields: {field} takes {along} along, so name {field} alone")
+        if field not in _FIELDS:
+            raise ValueError(f"fields: {field!r} is none of {', '.join(_FIELDS)}")
+    if {"body_mass", "body_inertia"} <= set(found):
+        raise ValueError("fields: body_mass takes body_inertia along, so name body_mass alone")
     return tuple(dict.fromkeys(found))
-
-
-def _is_field(name: Any) -> bool:
-    try:
-        import mujoco
-    except ImportError:  # then there is no environment to apply it to, either
-        return False
-    rows = ("body_", "geom_", "pair_", "jnt_", "dof_", "actuator_", "tendon_")
-    shapes = ("pos", "quat", "size", "axis", "aabb", "rbound")  # others depend on these
-    if not isinstance(name, str) or not name.startswith(rows) or name.endswith(shapes):
-        return False
-    if name in _DERIVED_FIELDS:
-        return False
-    array = getattr(mujoco.MjModel.from_xml_string("<mujoco/>"), name, None)
-    return isinstance(array, np.ndarray) and array.dtype == np.float64
 
 
 def _schedule(noise_rate: Rate) -> tuple[float, float]:

@@ -134,7 +134,8 @@ def read_episodes(path, metric=RETURN):
 def is_unseen(condition, config):
     """Tell whether a test condition counts in the score of a training configuration."""
     ends = "RandomEarlyTermination" in condition.wrappers
-    changes_behaviour = "reward" not in condition.kinds and not ends
+    rewards = [n for n in condition.wrappers if n in WRAPPERS and WRAPPERS[n].kind == "reward"]
+    changes_behaviour = not rewards and not ends
     new = set(condition.wrappers).isdisjoint(config.wrappers)
     return condition != CLEAN and changes_behaviour and new
 

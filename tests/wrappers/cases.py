@@ -88,9 +88,9 @@ BASES = [
     "RandomEarlyTermination(3, 9)",
     *NOISES[-5:],
 ]
-# Those that are decided when an episode begins, and the others.
+STEP_BASES = [text for text in BASES if "Normal" in text or "Mixup" in text]
+# Those that are decided when an episode begins.
 EPISODE_NOISES = [text for text in NOISES if "Termination(3" in text or text in NOISES[-4:]]
-STEP_NOISES = [text for text in NOISES if text not in EPISODE_NOISES]
 
 BOX = gym.spaces.Box(-10.0, 10.0, (3,), np.float64)
 WIDE = gym.spaces.Box(-10.0, 10.0, (30,), np.float64)  # dropout never keeps all of it

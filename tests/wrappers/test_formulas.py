@@ -6,8 +6,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from cases import (
+    BASES,
     EPISODE_NOISES,
-    NOISES,
     OBSERVATION_CASES,
     REWARD_CASES,
     GenericEnv,
@@ -101,17 +101,15 @@ def test_each_step_golden(truncate):
 
 
 def test_termination_at_the_time_limit_is_a_termination():
-    with pytest.warns(UserWarning, match="only turns truncated into terminated"):
-        env = RandomEarlyTermination(gym.wrappers.TimeLimit(constant_env(), 5), 1.0, 5)
+    env = RandomEarlyTermination(gym.wrappers.TimeLimit(constant_env(), 5), 1.0, 5)
     env.reset(seed=0)
     assert [env.step(0)[2:4] for _ in range(5)][-1] == (True, True)
     assert env.times_applied == 1
 
 
-@pytest.mark.parametrize(("low", "kwargs"), [(6, {}), (5, {"truncate": True})])
-def test_a_termination_beyond_the_time_limit_never_acts(low, kwargs):
+def test_a_termination_beyond_the_time_limit_never_acts():
     with pytest.warns(UserWarning, match="never acts: episodes have at most 5 steps"):
-        env = RandomEarlyTermination(gym.wrappers.TimeLimit(constant_env(), 5), 1.0, low, **kwargs)
+        env = RandomEarlyTermination(gym.wrappers.TimeLimit(constant_env(), 5), 1.0, 6)
     steps = rollout(env, seed=0, steps=20)
     assert not any("noise" in step[4] for step in steps)
     assert (env.times_applied, env.opportunities) == (0, 5)
@@ -121,9 +119,6 @@ def test_a_termination_beyond_the_time_limit_never_acts(low, kwargs):
     "text",
     [
         "RandomDropoutObservation(1)",
-        "RandomNormalNoisyObservation(0)",
-        "RandomUniformScaleObservation(1, 1)",
-        "RandomUniformScaleReward(1, 1)",
         "RandomNormalNoisyReward(0)",
         "RandomNormalNoisyAction(0)",
         "RandomActionDelay(0)",
@@ -145,20 +140,6 @@ def test_the_dtype_of_the_space_alone_is_no_noise():
     kept = [bool(np.all(observation)) for observation, *_ in steps]
     assert 0 < sum(kept) < len(kept)
     assert ["noise" not in info for *_, info in steps] == kept
-
-
-@pytest.mark.parametrize("text", ["RandomDropoutObservation(1)", "RandomNormalNoisyReward(1)"])
-def test_nan_that_stays_nan_is_not_changed(text):
-    env = build(text, constant_env(np.nan), 1.0)
-    env.reset(seed=0)
-    assert "noise" not in env.step(0)[-1]
-
-
-@pytest.mark.parametrize("factor", [0.0, 0.5, 1.0])
-def test_mixup_of_infinite_observations_is_infinite(factor):
-    env = RandomMixupObservation(constant_env(np.inf), 1.0, factor)
-    env.reset()
-    assert env.step(0)[0].tolist() == [np.inf] * 3
 
 
 @pytest.mark.parametrize("reuse", [False, True])
@@ -192,19 +173,13 @@ def test_mixup_remembers_unperturbed_steps_too():
     assert env.step(0)[0][0] == 3.5
 
 
-def test_mixup_survives_a_caller_that_writes_into_observations():
-    env = RandomMixupObservation(numbered_env(), 1.0, 0.0)
-    env.reset()[0][:] = 99
-    assert env.step(0)[0][0] == 1
-
-
-@pytest.mark.parametrize("text", NOISES)
+@pytest.mark.parametrize("text", BASES)
 @pytest.mark.parametrize("rate", [0.2, 0.6])
 def test_applied_fraction_is_the_rate(text, rate):
     """Up to four standard deviations."""
     env = build(text, episodes_env([10]), rate)
     assert env.applied_fraction == 0
-    steps = rollout(env, seed=3, steps=4000)
+    steps = rollout(env, seed=3, steps=2000)
     seen = sum("noise" in info for *_, info in steps)
     resets = sum(reward is None for _, reward, *_ in steps)
     if text in EPISODE_NOISES:

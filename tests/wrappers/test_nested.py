@@ -1,6 +1,5 @@
 """Observations of several parts: dictionaries and tuples."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from cases import OBSERVATION_CASES, GenericEnv, build, rollout, streams
@@ -55,19 +54,19 @@ def make_goals():
     return sampled(GOALS)[0]
 
 
-@pytest.mark.parametrize("rate", [0.3, 1.0])
 @pytest.mark.parametrize(("wrapper", "args", "kwargs", "formula"), OBSERVATION_CASES)
-def test_numbers_are_perturbed_as_one_vector(wrapper, args, kwargs, formula, rate):
+def test_numbers_are_perturbed_as_one_vector(wrapper, args, kwargs, formula):
     space = Dict({"b": Box(-5, 5, (1,), np.float64), "a": Tuple((Discrete(2), Box(-5, 5, (1, 2))))})
     env, samples = sampled(space)
-    env = wrapper(env, rate, *args, **kwargs)
+    kept = [flatten(space, sample) for sample in samples]
+    env = wrapper(env, 0.3, *args, **kwargs)
     gate, noise = streams(wrapper, seed=7)
     previous = None
     for t, (got, *_, info) in enumerate(rollout(env, seed=7, steps=49)):
         clean = samples[t]
         vector = np.concatenate([clean["a"][1].ravel(), clean["b"]]).astype(np.float64)
         expected = vector
-        if (wrapper is not RandomMixupObservation or t > 0) and gate.random() < rate:
+        if (wrapper is not RandomMixupObservation or t > 0) and gate.random() < 0.3:
             expected = formula(noise, vector, previous)
         assert list(got) == ["a", "b"] and got["a"][0] == clean["a"][0]
         assert (got["a"][1].shape, got["a"][1].dtype) == ((1, 2), np.float32)
@@ -75,6 +74,7 @@ def test_numbers_are_perturbed_as_one_vector(wrapper, args, kwargs, formula, rat
         np.testing.assert_allclose(together, expected, rtol=1e-6)
         assert ("noise" in info) == bool((expected != vector).any())
         previous = vector
+    np.testing.assert_array_equal([flatten(space, sample) for sample in samples], kept)
 
 
 @pytest.mark.parametrize(
@@ -97,14 +97,6 @@ def test_keys_restrict_the_noise():
     np.testing.assert_array_equal(got["desired_goal"], samples[0]["desired_goal"] + eps[:3])
     np.testing.assert_array_equal(got["observation"], samples[0]["observation"] + eps[3:])
     assert got["achieved_goal"] is samples[0]["achieved_goal"]
-
-
-def test_an_environment_may_return_other_sequences():
-    space = Dict(a=Box(-1, 1, (2,)), b=Box(-1, 1, (1,)))
-    observation = {"a": np.array([0.25, 0.5], object), "b": [1]}
-    env = GenericEnv(space, reset=lambda env: (observation, {}))
-    got, info = RandomDropoutObservation(env, 1.0, 1.0).reset()
-    assert info == {} and got["a"].tolist() == [0.25, 0.5] and got["b"].dtype == np.float32
 
 
 def test_keys_of_a_tuple_are_indices():
@@ -140,25 +132,14 @@ def test_the_space_is_widened_in_its_entries():
     assert space["inner"][0] == Discrete(3)
 
 
-def test_the_environments_observation_is_not_written_to():
-    env, samples = sampled(MIXED)
-    kept = [flatten(MIXED, sample) for sample in samples]
-    names = [list(sample) for sample in samples]
-    env = RandomDropoutObservation(RandomNormalNoisyObservation(env, 1.0, 9.0), 1.0, 0.5)
-    rollout(env, seed=0, steps=49)
-    assert [list(sample) for sample in samples] == names
-    np.testing.assert_array_equal([flatten(MIXED, sample) for sample in samples], kept)
-
-
 @pytest.mark.filterwarnings("ignore:.*WARN")
-@pytest.mark.parametrize("space", [GOALS, MIXED, Tuple((MIXED, Box(-1, 1, (2,))))])
-def test_check_env(space):
+def test_check_env():
     class Sampled(GenericEnv):
         def draw(self):
             self.observation_space.seed(int(self.np_random.integers(2**31)))
             return self.observation_space.sample()
 
-    env = Sampled(space)
+    env = Sampled(Tuple((MIXED, Box(-1, 1, (2,)))))
     check_env(RandomMixupObservation(RandomNormalNoisyObservation(env, 0.5, 1), 0.5, 0.5))
 
 
@@ -167,7 +148,6 @@ def test_check_env(space):
     [
         (make_goals, ("goal",), "the keys .'achieved_goal', 'desired"),
         (make_goals, (0,), "have the keys"),
-        (GenericEnv, ("observation",), r"have the keys \[\]"),
         (
             lambda: sampled(Dict(x=Box(-1, 1), y=Discrete(2)))[0],
             ("y",),
@@ -176,9 +156,8 @@ def test_check_env(space):
     ],
 )
 def test_keys_that_name_no_numbers(env, keys, reason):
-    with pytest.raises(ValueError, match=reason) as error:
+    with pytest.raises(ValueError, match=reason):
         RandomDropoutObservation(env(), 0.1, 0.5, keys=keys)
-    assert "\n" not in str(error.value)
 
 
 def test_a_scale_for_each_dimension_of_the_vector():
@@ -192,11 +171,10 @@ def test_a_scale_for_each_dimension_of_the_vector():
         RandomNormalNoisyObservation(sampled(GOALS)[0], 1.0, scale)
 
 
-@pytest.mark.parametrize("surplus", [-1, 1])
-def test_a_noise_must_return_as_many_numbers_as_it_gets(surplus):
+def test_a_noise_must_return_as_many_numbers_as_it_gets():
     class Other(ObservationNoise):
         def _perturb(self, observation):
-            return np.ones(len(observation) + surplus)
+            return np.ones(len(observation) + 1)
 
     with pytest.raises(ValueError, match="must return an array of shape"):
         Other(make_goals(), 1.0).reset(seed=0)
@@ -206,8 +184,6 @@ def test_keys_in_the_notation_and_in_the_folders_name():
     text = "RandomDropoutObservation(0.5, keys=('b', 'a', 'b'))"
     name = "p0.5_s1_DropoutObservation_0.5_keys=a-b__E__x"
     assert run_name("E", "x", [text], [0.5], 1) == name
-    one = "RandomDropoutObservation(0.5, keys='a')"
-    assert run_name("E", "x", [one], [0.5], 1) == name.replace("a-b", "a")
     strange = {
         run_name("E", "x", [f"RandomDropoutObservation(0.5, keys={keys!r})"], [0.5], 1)
         for keys in [("a", "b"), ("a-b",), ("a/b",), ("a b",), ("0",), (0,), ("a', 'b",), ("(a",)]
@@ -216,11 +192,3 @@ def test_keys_in_the_notation_and_in_the_folders_name():
     env = make_noisy(sampled(GOALS)[0], ["RandomDropoutObservation(0, keys='observation')"], [1.0])
     assert not env.reset(seed=0)[0]["observation"].any()
     assert env.reset()[0]["desired_goal"].all()
-
-
-def test_specs_keep_the_keys():
-    gym.register("Goals-v0", "test_nested:make_goals")
-    env = gym.make("Goals-v0", disable_env_checker=True)
-    env = RandomDropoutObservation(env, 0.5, 0.5, keys=("observation",))
-    for spec in (env.spec, gym.envs.registration.EnvSpec.from_json(env.spec.to_json())):
-        assert spec.make().keys == ("observation",)

@@ -3,15 +3,13 @@
 import copy
 import json
 import random
-import sys
-import time
 import weakref
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from cases import BOX, A, B, layers, numbered_env
+from cases import BOX, A, B, layers
 from gymnasium.wrappers import FlattenObservation
 
 from noisy_wrappers import (
@@ -90,41 +88,19 @@ def test_finite_numbers_look_into_dictionaries():
         env.step(None)
 
 
-@pytest.mark.parametrize(
-    ("observations", "actions", "word"),
-    [
-        (gym.spaces.Sequence(BOX), BOX, "Box observations of numbers"),
-        (gym.spaces.Box(0, 1, (1,), np.bool_), BOX, "Box observations of numbers"),
-        (BOX, gym.spaces.Discrete(3), "Box actions of floats"),
-        (BOX, gym.spaces.Box(-1, 1, (1,), np.int32), "Box actions of floats"),
-        (BOX, gym.spaces.Box(-1, 1, (2, 2)), "in one dimension"),
-    ],
-)
-def test_make_flat_refuses_what_networks_cannot_take(observations, actions, word):
-    with pytest.raises(ValueError, match=word) as error:
-        make_flat(Given(observations, actions))
-    assert str(actions if "actions" in word or "dim" in word else observations) in str(error.value)
-
-
-def test_an_environment_that_is_none_of_gymnasiums():
-    for env in ([], lambda: None, type("Env", (), {"__module__": "gym.core"})()):
-        with pytest.raises(TypeError, match="needs a gymnasium.Env, not a ") as error:
-            make_flat(env)
-        assert "\n" not in str(error.value)
-
-
-class OneOfJax:
-    """An array of one element, which float() does not take, as JAX's."""
-
-    shape = (1,)
-
-    def item(self):
-        return 2.0
+def test_make_flat_refuses_what_networks_cannot_take():
+    for observations in (gym.spaces.Sequence(BOX), gym.spaces.Box(0, 1, (1,), np.bool_)):
+        with pytest.raises(SpaceError, match="needs Box observations of numbers; .* has "):
+            make_flat(Given(observations))
+    ints = gym.spaces.Box(-1, 1, (1,), np.int32)
+    for actions in (gym.spaces.Discrete(3), ints, gym.spaces.Box(-1, 1, (2, 2))):
+        with pytest.raises(SpaceError, match="needs Box actions of floats in one dimension"):
+            make_flat(Given(BOX, actions))
 
 
 @pytest.mark.parametrize(
     "reward",
-    [2, np.float32(2), np.array([2.0], np.float32), np.array(2), torch.tensor([2]), OneOfJax()],
+    [2, np.float32(2), np.array([2.0], np.float32), np.array(2), torch.tensor([2])],
 )
 def test_rewards_are_floats(reward):
     env = FiniteNumbers(Given(BOX))
@@ -160,19 +136,6 @@ def test_finite_numbers_tell_a_divergence_from_a_broken_environment():
         env.step(np.array([0, np.nan]))
     with pytest.raises(NotFiniteError, match="returned the reward nan"):
         env.step(np.zeros(2))
-
-
-def test_observations_are_arrays_of_their_own():
-    """Some environments write every observation into the same array."""
-    env = FiniteNumbers(numbered_env(reuse=True))
-    seen = [env.reset()[0], *(env.step(0)[0] for _ in range(3))]
-    assert [observation.flat[0] for observation in seen] == [1, 2, 3, 4]
-
-
-def test_finite_numbers_are_part_of_the_spec():
-    env = gym.make(make_flat(gym.make("Pendulum-v1")).spec)
-    assert isinstance(env, FiniteNumbers)
-    assert env.spec.max_episode_steps == 200
 
 
 def pendulum():
@@ -232,14 +195,13 @@ def test_an_env_state_has_only_pythons_own_types(make_generator):
 class Drawing(gym.Env):
     """Draws from all kinds of generators that are its attributes, and spawns at every reset."""
 
-    observation_space = gym.spaces.Box(-9, 9, (7,), np.float64)
+    observation_space = gym.spaces.Box(-9, 9, (6,), np.float64)
     action_space = gym.spaces.Dict(a=gym.spaces.Box(-1, 1, (1,)))
 
     def __init__(self):
-        self.goals, self.torch = gym.spaces.Box(-1, 1, (1,)), torch.Generator()
+        self.goals = gym.spaces.Box(-1, 1, (1,))
         self.dice = random.SystemRandom()  # nothing can restore it, and nothing fails
         self.gone = weakref.proxy(Drawing.reset.__get__(self))  # of what has been deleted
-        self.tables = [{str(i): [i] for i in range(10_000)}] * 100
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -247,11 +209,9 @@ class Drawing(gym.Env):
             self.rng, self.old = np.random.default_rng(seed), np.random.RandomState(seed)
             self.python = random.Random(seed)
             self.goals.seed(seed)
-            self.torch.manual_seed(seed)
         drawn = [self.rng.normal(), self.old.normal(), self.python.random()]
         drawn += [self.np_random.spawn(1)[0].normal(), self.rng.spawn(2)[1].normal()]
-        drawn += [self.goals.sample()[0], torch.rand((), generator=self.torch).item()]
-        return np.array(drawn), {}
+        return np.array([*drawn, self.goals.sample()[0]]), {}
 
 
 def test_an_env_state_has_the_generators_among_the_attributes():
@@ -275,23 +235,11 @@ def test_an_env_state_has_the_generators_among_the_attributes():
     assert play(other) == third
 
 
-def test_what_an_environment_holds_is_not_searched():
-    """A million numbers, as of tables of data, cost nothing."""
-    env = Drawing()
-    env.reset(seed=1)
-    before = time.process_time()
-    for _ in range(20):
-        with kept_generators(env):
-            pass
-    assert time.process_time() - before < 1
-    assert len(json.dumps(EnvState(env).state_dict()["attributes"])) < 60_000
-
-
-def test_success_may_be_a_tensor():
-    for value in (True, [True], 1.0):
-        assert outcome({"success": torch.tensor(value)}) == 1.0
+def test_outcomes():
+    for value in (1, [True], np.float32(1), torch.tensor(True)):
+        assert outcome({"success": value}) == 1.0
     assert outcome({"is_success": torch.tensor(False)}) == 0.0
-    assert np.isnan(outcome({"success": torch.tensor([True, False])}))
+    assert np.isnan(outcome({"success": [True, False]})) and np.isnan(outcome({}))
 
 
 class Heedless(gym.Env):
@@ -313,44 +261,22 @@ def test_an_environment_that_ignores_its_seed_is_seeded_all_the_same():
         np.testing.assert_array_equal(pendulum.reset(seed=seed)[0], bare.reset(seed=seed)[0])
 
 
-class Mission(gym.spaces.Space):
-    """A space that does not say whether it can be flattened, as MiniGrid's."""
-
-
-def test_a_space_of_another_kind_is_refused():
-    env = gym.wrappers.TransformObservation(
-        gym.make("Pendulum-v1"), lambda o: {"o": o}, gym.spaces.Dict({"o": Mission()})
-    )
-    with pytest.raises(SpaceError, match="needs Box observations of numbers"):
-        make_flat(env)
-
-
-def test_an_environment_that_exits_when_it_is_closed(monkeypatch):
-    env = make_flat(gym.make("Pendulum-v1"))
-    monkeypatch.setattr(env.unwrapped, "close", sys.exit)
-    with pytest.warns(UserWarning, match="closing the environment failed: SystemExit"):
-        env.close()
-
-
-def test_an_environment_may_return_the_same_info_again(monkeypatch):
-    env = make_noisy(gym.make("Pendulum-v1", max_episode_steps=3), [], [])
-    inner, info = env.env, {"mine": 1}
-    step = inner.step
-    monkeypatch.setattr(inner, "step", lambda action: (*step(action)[:4], info))
+def test_an_environments_own_record_gives_way():
+    """Ours has the true return of what is trained in, also where an environment records itself."""
+    inner = gym.wrappers.RecordEpisodeStatistics(gym.make("Pendulum-v1", max_episode_steps=3))
+    env = make_noisy(make_flat(gym.wrappers.TransformReward(inner, lambda r: 1.0)), [A], [1.0])
     for _ in range(2):
         env.reset()
         infos = [env.step(np.zeros(1, np.float32))[4] for _ in range(3)]
-        assert infos[:2] == [{"mine": 1}] * 2 and infos[2]["episode"]["l"] == 3
-    assert info == {"mine": 1}
+        assert infos[2]["episode"]["l"] == infos[2]["episode"]["r"] == 3
 
 
 def test_an_env_state_of_another_stack_is_refused():
     env, rng = pendulum()
     saved = EnvState(env, rng).state_dict()
-    with pytest.raises(ValueError):
-        EnvState(env).load_state_dict(saved)
     bare = gym.make("Pendulum-v1")
     bare.reset(seed=1)
     assert EnvState(bare).state_dict()["returns"] == []
-    with pytest.raises(ValueError):
-        EnvState(bare, rng).load_state_dict(saved)
+    for other in (EnvState(env), EnvState(bare, rng)):
+        with pytest.raises(ValueError):
+            other.load_state_dict(saved)

@@ -1,26 +1,26 @@
-"""The notation of the command line, and stacks of noises."""
+"""The notation of the command line, stacks of noises, and configurations."""
 
 import math
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from cases import NOISES, A, B, C, GenericEnv, build, constant_env, layers, rollout, streams
-from gymnasium.wrappers import RecordEpisodeStatistics
+from cases import NOISES, A, B, C, GenericEnv, build, constant_env, layers, rollout
 
 from noisy_wrappers import (
+    BASELINE,
     Configuration,
     RandomEarlyTermination,
     RandomNormalNoisyObservation,
     RandomNormalNoisyReward,
-    RandomUniformScaleReward,
     make_noisy,
     noise_statistics,
     noise_wrappers,
     parse_noise,
+    rate_order,
     run_name,
-    set_progress,
     signatures,
+    split_noises,
 )
 
 
@@ -89,25 +89,17 @@ def canonical(noises, rates):
 
 def test_canonical_notation():
     assert canonical([], []) == ([], [])
-    assert canonical([A], [0.5]) == (["RandomNormalNoisyReward(1.0)"], [0.5])
     names = ["RandomEarlyTermination(9)", "RandomNormalNoisyReward(1.0)"]
     assert canonical([A, C], [0.5]) == (names, [0.5, 0.5])  # dynamics noise comes first
     assert canonical([A, B, C], [0.5, 0, 1]) == (names, [1.0, 0.5])
-    assert canonical([A, B], [0]) == ([], [])
     assert canonical([A, B], ["0:0", 0.0]) == ([], [])
     assert canonical([A, C], ["1:0", "0:.5"]) == (names, ["0.0:0.5", "1.0:0.0"])
     assert canonical([A], ["-0.0:0"]) == ([], [])
     assert canonical([A], ["0.50:.5"]) == (names[1:], [0.5])
     assert canonical([A, A], ["1:0"])[1] == ["1.0:0.0", "1.0:0.0"]
-    action = "RandomNormalNoisyAction(1.0)"
-    assert canonical([A, action, C], [0.1, 0.2, 0.3]) == (
-        ["RandomEarlyTermination(9)", action, "RandomNormalNoisyReward(1.0)"],
-        [0.3, 0.2, 0.1],
-    )
     again = canonical([B, A, C], [0.1, 0.2, 0.3])
     assert canonical(*again) == again
-    for rate in again[1]:
-        assert type(rate) is float
+    assert {type(rate) for rate in again[1]} == {float}
 
 
 @pytest.mark.parametrize(
@@ -116,46 +108,31 @@ def test_canonical_notation():
     + [([A], [rate]) for rate in (1.1, math.nan, "0.5:", "1:2", "a:b", "0.5", "1:0.5:0", "nan:0")],
 )
 def test_bad_noises_and_rates(noises, rates):
-    for function in (
-        lambda: canonical(noises, rates),
-        lambda: make_noisy(constant_env(), noises, rates),
-        lambda: run_name("E", "x", noises, rates, 1),
-    ):
-        with pytest.raises(ValueError) as error:
-            function()
-        lines = str(error.value).split("\n  ")
-        assert "\n" not in lines[0]
-        assert lines[1:] == (signatures() if "Nothing" in str(noises) else [])
+    with pytest.raises(ValueError) as error:
+        canonical(noises, rates)
+    lines = str(error.value).split("\n  ")
+    assert "\n" not in lines[0]
+    assert lines[1:] == (signatures() if "Nothing" in str(noises) else [])
 
 
-@pytest.mark.parametrize("function", [canonical, make_noisy])
-def test_noises_and_rates_are_lists(function):
-    first = [constant_env()] if function is make_noisy else []
+def test_noises_and_rates_are_lists():
     for noises, rates, name in [(A, [0.5], "noises"), ([A], 0.5, "rates"), ([A], "1:0", "rates")]:
-        with pytest.raises(ValueError, match=rf"^{name} must be a list, for example \[.*\], got "):
-            function(*first, noises, rates)
+        with pytest.raises(ValueError, match=f"^{name} must be a list, for example"):
+            canonical(noises, rates)
     with pytest.raises(ValueError, match="bad noise <class"):
-        function(*first, [RandomNormalNoisyReward], [0.5])
+        canonical([RandomNormalNoisyReward], [0.5])
 
 
 def test_numbers_and_arrays_of_numpy():
-    rates = np.array([0.5, 0.0])
-    assert canonical(np.array([A, B]), rates) == canonical([A, B], [0.5, 0.0])
-    assert canonical(np.array([A]), np.array([0.0])) == ([], [])
-    for half in (np.float64(0.5), np.float32(0.5), np.array(0.5)):
+    assert canonical(np.array([A, B]), np.array([0.5, 0.0])) == canonical([A, B], [0.5, 0.0])
+    for half in (np.float32(0.5), np.array(0.5)):
         env = RandomNormalNoisyReward(constant_env(), half, half, loc=half)
         assert (env.noise_rate, env.scale, env.loc) == (0.5, 0.5, 0.5)
         assert {type(env.noise_rate), type(env.scale), type(env.loc)} == {float}
-        set_progress(env, half)
-    for nine in (np.int64(9), np.uint8(9), np.array(9)):
-        assert type(RandomEarlyTermination(constant_env(), 0.5, nine).low) is int
+    assert type(RandomEarlyTermination(constant_env(), 0.5, np.int64(9)).low) is int
     env = GenericEnv(gym.spaces.Box(-1, 1, (3,)))
     scales = RandomNormalNoisyObservation(env, 0.5, np.array([1, 2, 3])).scale
-    assert scales == (1.0, 2.0, 3.0)
-    assert {type(scale) for scale in scales} == {float}
-    for bad in (np.array([[1.0, 2.0]]), np.array([0.1, np.nan]), np.array([0.1])):
-        with pytest.raises(ValueError, match="scale"):
-            RandomNormalNoisyObservation(env, 0.5, bad)
+    assert scales == (1.0, 2.0, 3.0) and {type(scale) for scale in scales} == {float}
     for bad in (np.array([0.5, 0.5]), np.array(True), np.array(2.0)):
         with pytest.raises(ValueError, match="noise_rate"):
             RandomNormalNoisyReward(constant_env(), bad, 0.1)
@@ -165,28 +142,16 @@ def test_make_noisy_order():
     statistics = "RecordEpisodeStatistics"
     reward, dropout, end = (text.split("(")[0] for text in (A, B, C))
     assert layers(make_noisy(constant_env(), [], [])) == [statistics]
-    assert layers(make_noisy(constant_env(), [A], [0])) == [statistics]
     assert layers(make_noisy(constant_env(), [A, B], [0.5])) == [statistics, reward, dropout]
-    for noises in ([A, B, C], [A, C, B], [C, A, B]):
-        env = make_noisy(constant_env(), noises, [0.5])
-        assert layers(env) == [end, statistics, reward, dropout]
     env = make_noisy(constant_env(), [A, "RandomNormalNoisyAction(1)", B, C], ["0:1"])
     assert layers(env) == [end, "RandomNormalNoisyAction", statistics, reward, dropout]
     assert {wrapper.schedule for wrapper in noise_wrappers(env).values()} == {(0.0, 1.0)}
     env = make_noisy(constant_env(), [B, A, C], [0.1, 0.2, 0.3])
     assert layers(env) == [end, statistics, dropout, reward]
     rates = {name: wrapper.noise_rate for name, wrapper in noise_wrappers(env).items()}
-    assert rates == {end: 0.3, dropout: 0.1, reward: 0.2}
-    assert list(rates) == [end, dropout, reward]
-
-
-def test_noise_wrappers_numbers_repeats():
-    env = make_noisy(constant_env(), [A, B, A, A], [0.1, 0.2, 0.3, 0.4])
-    found = noise_wrappers(RecordEpisodeStatistics(env))
-    name = "RandomNormalNoisyReward"
-    assert list(found) == [name, "RandomDropoutObservation", f"{name}_2", f"{name}_3"]
-    assert [wrapper.noise_rate for wrapper in found.values()] == [0.1, 0.2, 0.3, 0.4]
-    assert noise_wrappers(constant_env()) == {}
+    assert list(rates.items()) == [(end, 0.3), (dropout, 0.1), (reward, 0.2)]
+    layers_alone = layers(make_noisy(constant_env(), [A, C], [0.5], record_statistics=False))
+    assert layers_alone == [end, reward]
 
 
 def test_noise_statistics():
@@ -194,40 +159,84 @@ def test_noise_statistics():
     env.reset(seed=1)
     for _ in range(9):
         env.step(0)
-    name, statistics = "RandomNormalNoisyReward", noise_statistics(env)
-    assert list(statistics) == [
-        f"{wrapper}/{number}"
-        for wrapper in (name, "RandomDropoutObservation", f"{name}_2")
-        for number in ("rate", "applied_fraction")
-    ]
-    wrappers = noise_wrappers(env)
-    for wrapper in wrappers:
-        assert statistics[f"{wrapper}/rate"] == wrappers[wrapper].noise_rate
-        assert statistics[f"{wrapper}/applied_fraction"] == wrappers[wrapper].applied_fraction
-    assert statistics[f"{name}/rate"] == statistics[f"{name}/applied_fraction"] == 1
+    statistics, wrappers = noise_statistics(env), noise_wrappers(env)
+    name = "RandomNormalNoisyReward"  # the second of a class has a number
+    assert list(wrappers) == [name, "RandomDropoutObservation", f"{name}_2"]
+    assert len(statistics) == 6
+    for name, wrapper in wrappers.items():
+        assert statistics[f"{name}/rate"] == wrapper.noise_rate
+        assert statistics[f"{name}/applied_fraction"] == wrapper.applied_fraction
     alone = make_noisy(constant_env(), [A], [0.25])
-    assert list(noise_statistics(alone)) == ["rate", "applied_fraction"]
-    assert noise_statistics(alone)["rate"] == 0.25
+    assert noise_statistics(alone) == {"rate": 0.25, "applied_fraction": 0}
     assert noise_statistics(constant_env()) == {}
 
 
-def test_statistics_see_the_true_return_and_length():
-    noises = ["RandomUniformScaleReward(0, 0)", "RandomNormalNoisyReward(5)", C]
-    env = make_noisy(GenericEnv(), noises, [1.0])
-    rewards = [step[1] for step in rollout(GenericEnv(), seed=8, steps=9)[1:]]
-    env.reset(seed=8)
-    steps = [env.step(0) for _ in range(9)]
-    assert [step[2] for step in steps] == [False] * 8 + [True]
-    assert steps[-1][4]["episode"]["r"] == pytest.approx(sum(rewards))
-    assert steps[-1][4]["episode"]["l"] == 9
-    assert sum(step[1] for step in steps) != pytest.approx(sum(rewards))
+# ------------------------------------------- a configuration: how it is read, written, ordered
+
+SCALE = "RandomUniformScaleReward(0.5, 1.5)"
+SHIFT = "RandomNormalNoisyReward(0.3)"
+ENDING = "RandomEarlyTermination(50)"
 
 
-def test_combined_noise_is_the_composition_of_the_formulas():
-    noises = ["RandomUniformScaleReward(0.5, 1.5)", "RandomNormalNoisyReward(2)"]
-    env = make_noisy(GenericEnv(), noises, [1.0])
-    clean = [step[1] for step in rollout(GenericEnv(), seed=3)[1:]]
-    noisy = [step[1] for step in rollout(env, seed=3)[1:]]
-    _, scale = streams(RandomUniformScaleReward, 3, 0)
-    _, shift = streams(RandomNormalNoisyReward, 3, 1)
-    assert noisy == [r * scale.uniform(0.5, 1.5) + shift.normal(0, 2) for r in clean]
+@pytest.mark.parametrize(
+    ("noises", "rates", "noise", "noise_rate"),
+    [
+        ([], [], "", "0.00"),
+        ([SCALE], [0.5], SCALE, "0.50"),
+        ([SCALE], [0.125], SCALE, "0.125"),
+        ([SCALE], ["1.0:0.0"], SCALE, "1.00 to 0.00"),
+        ([SCALE, SHIFT], [0.05, "0.5:1.0"], f"{SCALE} + {SHIFT}", "0.05 + 0.50 to 1.00"),
+    ],
+)
+def test_it_is_read_and_written(noises, rates, noise, noise_rate):
+    config = Configuration.read(noises, rates)
+    assert (config.noise, config.noise_rate) == (noise, noise_rate)
+    assert (
+        Configuration.parse(*config.columns)
+        == config
+        == Configuration.read(*config.texts, stored=True)
+    )
+    assert Configuration.parse(noise, noise_rate) == config
+    assert config.texts == (noises, rates)
+    assert (config == BASELINE) == (not noises)
+    assert Configuration.parse("", "0.00") == BASELINE == Configuration()
+
+
+def test_it_is_ordered_by_noise_and_by_its_rates_as_numbers():
+    rates = [0.05, "0.1:0.0", 0.1, 0.1234, 1.0]
+    ordered = [BASELINE, *(Configuration.read([SCALE], [rate]) for rate in rates)]
+    ordered.append(Configuration.read([SCALE, SHIFT], [0.01, 0.01]))
+    assert sorted(ordered[::-1]) == ordered
+    texts = [config.noise_rate for config in ordered[1:6]]
+    assert sorted(texts[::-1], key=rate_order) == texts
+
+
+def test_its_wrappers():
+    config = Configuration.read([ENDING, SCALE], [1.0, 0.5])
+    assert config.wrappers == ["RandomEarlyTermination", "RandomUniformScaleReward"]
+
+
+def test_spellings_of_one_configuration_are_one():
+    config = Configuration.read(["RandomUniformScaleReward(.50, high=1.5)", ENDING], ["1:0", 0.05])
+    assert config == Configuration.read([ENDING, SCALE], [0.05, "1.0:0.0"])
+    assert str(config) == f"{ENDING} + {SCALE} at 0.05 + 1.0 to 0.0"
+    assert config.columns == (f"{ENDING} + {SCALE}", "0.05 + 1.0:0.0")
+    assert config.slug == "p0.05+1.0to0.0_EarlyTermination_50+UniformScaleReward_0.5_1.5"
+    assert (str(BASELINE), BASELINE.slug, BASELINE.columns) == ("no noise", "", ("", "0.0"))
+    assert Configuration.read([SCALE, ENDING], [0.0, "0:0"]) == BASELINE
+
+
+def test_what_a_program_has_stored():
+    assert Configuration.parse("Gone(1)", 0.5).columns == ("Gone(1)", "0.5")
+    own = "no_such_module:Sticky(3)"  # whose module need not be here
+    config = Configuration.read([own, SCALE], ["1.0:0.0", 0.5], stored=True)
+    assert config.texts == ([own, SCALE], ["1.0:0.0", 0.5])
+    for bad in ("Gone(1)", "no_such_module:Sticky(", 3):
+        with pytest.raises(ValueError, match="bad noise"):
+            Configuration.read([bad], [0.5], stored=True)
+
+
+@pytest.mark.parametrize("text", [f"{SCALE}+{SHIFT}", f" {SCALE} + {SHIFT} "])
+def test_an_entry_is_split_into_its_noises(text):
+    assert split_noises(text) == [SCALE, SHIFT]
+    assert split_noises("A(1e+5)@1:0+B()@.5") == ["A(1e+5)@1:0", "B()@.5"]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from cases import GenericEnv, streams
 from gymnasium.utils.env_checker import check_env
-from test_action_noise import actions_env
+from test_actions import actions_env
 
 from noisy_wrappers import (
     Configuration,
@@ -64,7 +64,6 @@ def test_it_is_a_wrapper_like_the_others(folder):
     assert str(parse_noise("my_noises:StickyAction(longest=3)")) == TEXT
     config = Configuration.read([TEXT, "RandomEarlyTermination(9)"], ["1:0"])
     assert config.texts[0] == ["RandomEarlyTermination(9)", TEXT]  # an action noise
-    assert config.kinds == {"dynamics", "own"}
     assert Configuration.parse(*config.columns) == config
     assert run_name("E", "x", [TEXT], [0.5], 1) == "p0.5_s1_my_noises--StickyAction_3__E__x"
     env = config.wrap(gym.make("Pendulum-v1"))
@@ -82,10 +81,6 @@ class Strict(NoiseWrapper):
 
 class Vague(NoiseWrapper): pass
 
-class Forgetful(StickyAction):
-    def __init__(self, env, noise_rate, x):
-        super().__init__(env, noise_rate, longest=x)
-
 class Child(StickyAction):
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
@@ -100,14 +95,11 @@ class Degrees(StickyAction):
     ("text", "message"),
     [
         ("no_such:A(1)", "No module named 'no_such'"),
-        ("my-noises:StickyAction(1)", "'my-noises' is not a module name"),
-        ("my_noises:Nothing(1)", "my_noises has no class Nothing"),
-        ("my_noises:Other(1)", "must be a subclass of noisy_wrappers"),
+        ("my_noises:Other(1)", "my_noises has no subclass Other of noisy_wrappers.NoiseWrapper"),
         ("my_noises:StickyAction()", "missing a required argument: 'longest'"),
         ("my_noises:StickyAction(longest)", "expected Name(number, ..., keyword=value)"),
         ("my_noises:Strict(1)", "x is bad"),
         ("my_noises:Vague(1)", "Vague.kind must be one of"),
-        ("my_noises:Forgetful(1)", "must pass x on: super().__init__(env, noise_rate, x=x)"),
         ("my_noises:Child(2)", "must name its arguments"),
         ("my_noises:Degrees(90)", "my_noises:Degrees(45.0) would be another noise"),
     ],
@@ -155,55 +147,26 @@ def test_a_sweep_and_a_test_from_the_folder_of_the_noise(folder):
     assert np.isfinite([float(row["episodic_return"]) for row in rows]).all()
 
 
-def test_a_noise_without_arguments_needs_no_constructor(folder):
-    (folder / "my_noises.py").write_text(
-        "from noisy_wrappers import *\n\n\n"
-        "class Doubled(ObservationNoise):\n"
-        "    def _perturb(self, observation):\n"
-        "        return 2 * observation\n"
-    )
-    assert str(parse_noise("my_noises:Doubled()")) == "my_noises:Doubled()"
-    # one of this project's has one name, wherever it comes from
-    assert str(parse_noise("my_noises:RandomActionDelay(1)")) == "RandomActionDelay(1)"
-
-
 def test_a_default_before_another_argument_stays(folder):
     (folder / "my_noises.py").write_text(
-        "from noisy_wrappers import RewardNoise\n\n\n"
+        "from noisy_wrappers import *\n\n\n"
         "class Between(RewardNoise):\n"
         "    def __init__(self, env, noise_rate, high=3, low=1, text=''):\n"
-        "        super().__init__(env, noise_rate, high=high, low=low, text=text)\n\n"
-        "    def _perturb(self, reward):\n"
-        "        return reward + self.noise.uniform(self.parameters['low'], 3)\n"
+        "        super().__init__(env, noise_rate, high=high, low=low, text=text)\n"
     )
     for written, canonical in {
-        "Between(3, 2)": "Between(3, 2)",
-        "Between(low=2)": "Between(3, 2)",
-        "Between(2, 1)": "Between(2)",
-        "Between(3)": "Between()",
-        "Between(text='a + b')": "Between(3, 1, 'a + b')",
+        "Between(3, 2)": "my_noises:Between(3, 2)",
+        "Between(low=2)": "my_noises:Between(3, 2)",
+        "Between(2, 1)": "my_noises:Between(2)",
+        "Between(3)": "my_noises:Between()",
+        "Between(text='a + b')": "my_noises:Between(3, 1, 'a + b')",
+        "RandomActionDelay(1)": "RandomActionDelay(1)",  # ours has one name, wherever it is from
     }.items():
-        noise = parse_noise(f"my_noises:{written}")
-        assert str(noise) == f"my_noises:{canonical}"
-        assert (
-            noise(GenericEnv(), 1.0).parameters
-            == parse_noise(str(noise))(GenericEnv(), 1.0).parameters
-        )
-    config = Configuration.read([str(noise)], [0.5])
+        assert str(parse_noise(f"my_noises:{written}")) == canonical
+    noise = "my_noises:Between(3, 1, 'a + b')"
+    config = Configuration.read([noise], [0.5])
     assert Configuration.parse(*config.columns) == config
-    assert split_noises(f"{noise}+RandomActionDelay(1)") == [str(noise), "RandomActionDelay(1)"]
-
-
-def test_different_arguments_are_different_folders(folder):
-    calls = ["A(1, 2)", "A((1, 2))", "A(1, (2,))", "A(1)", "A((1,))", "A(None)", "A('None')"]
-    calls += ["A(True)", "A('True')", "A('x', 1)", "A('x_1')", "A('a', 'b')", "A(('a', 'b'))"]
-    (folder / "my_noises.py").write_text(
-        "from noisy_wrappers import RewardNoise\n\n\nclass A(RewardNoise):\n"
-        "    def __init__(self, env, noise_rate, a, b=None):\n"
-        "        super().__init__(env, noise_rate, a=a, b=b)\n"
-    )
-    names = {run_name("Hopper-v5", "ppo", [f"my_noises:{call}"], [0.5], 1) for call in calls}
-    assert len(names) == len(calls)
+    assert split_noises(f"{noise}+RandomActionDelay(1)") == [noise, "RandomActionDelay(1)"]
 
 
 def test_a_noise_with_a_state_of_its_own_resumes(folder):

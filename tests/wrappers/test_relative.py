@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from cases import BOX, GenericEnv, build, rollout, streams
-from test_action_noise import actions_env
+from test_actions import actions_env
 from test_nested import GOALS, sampled
 
 from noisy_wrappers import (
@@ -16,7 +16,6 @@ from noisy_wrappers import (
     RandomObservationBias,
     RandomUniformNoisyObservation,
     RandomUniformNoisyReward,
-    make_noisy,
     parse_noise,
     run_name,
 )
@@ -68,18 +67,6 @@ def test_relative_golden(wrapper, args, draw, rate):
         noisy += changed
         assert ("noise" in got[4]) == changed
     assert env.times_applied == noisy > 0 and env.opportunities == len(received)
-
-
-def test_a_dimension_that_never_changes_and_samples_that_are_not_finite():
-    observation = np.array([0.1, 2.0, 3.0])
-    env = GenericEnv(SPACE, step=lambda env, a: (observation.copy(), 1.0, False, False, {}))
-    env = RandomNormalNoisyObservation(env, 1.0, 1.0, relative=True)
-    env.reset(seed=0)
-    for i in range(200):
-        observation[1] = np.nan if i == 50 else i
-        seen = env.step(0)[0]
-    assert np.isfinite(seen).all() and seen[1] != 199
-    assert seen[0] == pytest.approx(0.1, abs=0.5)  # the reset's was another
 
 
 def test_what_it_has_estimated_is_resumed(tmp_path):
@@ -139,22 +126,17 @@ def test_it_is_written_and_named():
     assert run_name("E", "x", [text], [0.5], 1) == name
     assert "relative" not in run_name("E", "x", [text.replace("True", "False")], [0.5], 1)
     for name in ("NormalNoisyObservation(1", "UniformNoisyReward(0, 1", "NormalNoisyAction(1"):
-        for bad in (1, None, "yes"):
-            with pytest.raises(ValueError, match="relative must be True or False"):
-                parse_noise(f"Random{name}, relative={bad!r})")
-    assert np.isinf(
-        make_noisy(
-            GenericEnv(BOX), ["RandomUniformNoisyObservation(0, 1, relative=True)"], [0.1]
-        ).observation_space.high
-    ).all()
+        with pytest.raises(ValueError, match="relative must be True or False"):
+            parse_noise(f"Random{name}, relative=1)")
+    env = RandomUniformNoisyObservation(GenericEnv(BOX), 0.1, 0, 1, relative=True)
+    assert np.isinf(env.observation_space.high).all()
 
 
 @pytest.mark.parametrize(
     ("noises", "rates", "problem"),
     [
-        (["RandomNormalNoisyObservation(0.1, relative=True)"], [1.0], "relative=True"),
-        (["RandomUniformNoisyReward(0, 1, relative=True)"], [1.0], "relative=True"),
         (["RandomObservationBias(1.0, relative=True)"], [0.5], "relative=True"),
+        (["RandomUniformNoisyReward(0, 1, relative=True)"], [1.0], "relative=True"),
         (["RandomDropoutObservation(0.5)", "RandomObservationDelay(2)"], ["1:0", 1], "1.0:0.0"),
         (["RandomNormalNoisyAction(0.1, relative=True)", "RandomObservationBias(1)"], [1], None),
         ([], [], None),
@@ -166,9 +148,8 @@ def test_what_a_test_may_have(noises, rates, problem):
     if problem is None:
         assert configuration.for_tests() is configuration
         return
-    with pytest.raises(ValueError, match=problem) as error:
+    with pytest.raises(ValueError, match=problem):
         configuration.for_tests()
-    assert "\n" not in str(error.value)
 
 
 def test_a_relative_bias_is_constant_within_an_episode():

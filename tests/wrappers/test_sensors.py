@@ -28,7 +28,7 @@ def test_bias_golden(rate, scale):
 
 @pytest.mark.parametrize("reuse", [False, True])
 def test_a_delay_by_hand(reuse):
-    for delay, seen in [(0, [1, 2, 3, 4, 5]), (2, [1, 1, 1, 2, 3]), (2**63 - 1, [1] * 5)]:
+    for delay, seen in [(0, [1, 2, 3, 4, 5]), (2, [1, 1, 1, 2, 3]), (10**6, [1] * 5)]:
         env = RandomObservationDelay(numbered_env(reuse and delay > 0), 1.0, delay)
         steps = rollout(env, seed=0, steps=4)
         assert [step[0][0] for step in steps] == seen
