@@ -2001,7 +2001,19 @@ def as_json(value: Any) -> Any:
 
 
 # Arguments of the scripts that are at least 0, at least 1, or fractions.
-_NOT_NEGATIVE = ("seed", "eval_frequency", "learning_starts")
+_NOT_NEGATIVE = (
+    "seed",
+    "eval_frequency",
+    "learning_starts",
+    "learning_rate",
+    "policy_lr",
+    "q_lr",
+    "exploration_noise",
+    "policy_noise",
+    "noise_clip",
+    "clip_coef",
+    "max_grad_norm",
+)
 _COUNTS = (
     "total_timesteps",
     "max_episode_steps",
@@ -2020,9 +2032,13 @@ _FRACTIONS = ("gamma", "gae_lambda", "tau")
 
 
 def _check_numbers(args: Mapping[str, Any]) -> None:
-    """Raise ValueError if one of these arguments of a script is out of its range, or NaN."""
-    for name, value in args.items():
-        if name not in _NOT_NEGATIVE + _COUNTS + _FRACTIONS or value is None:
+    """Raise ValueError if one of these arguments of a script is out of its range, or NaN.
+
+    A researcher's script may give an option another type, such as a schedule as text.
+    """
+    for name in _NOT_NEGATIVE + _COUNTS + _FRACTIONS:
+        value = args.get(name)
+        if not isinstance(value, int | float):
             continue
         low = 1 if name in _COUNTS else 0
         high = 1 if name in _FRACTIONS else math.inf

@@ -379,7 +379,7 @@ BAD = [  # arguments, what the line names
 BAD_OF_OTHERS = [
     ({"env_id": "toy_envs:Unbounded-v0"}, "SAC needs bounded actions", "SAC"),
     ({"env_id": "toy_envs:Unbounded-v0"}, "TD3 needs bounded actions", "TD3"),
-    ({"learning_starts": -1}, "--learning-starts must be at least 0", "SAC"),
+    ({"q_lr": -1e-3}, "--q-lr must be at least 0, not -0.001", "SAC"),
 ]
 
 
