@@ -245,7 +245,6 @@ def learn(args, env, test_env, stop):
     agent = Agent(env).to(device)
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     update = updater(ppo_loss, agent, optimizer, args)
-    check_acting(agent, env, device)
 
     # RESUME: all that training changes belongs in `state`. What is missing there starts anew when a
     # run is resumed, without a warning: tools/check_script.py finds it. Random numbers are drawn on
@@ -257,7 +256,7 @@ def learn(args, env, test_env, stop):
         noisy.set_progress(env, start / total_steps)
         observation, _ = env.reset()
 
-    act, std = agent.acting()
+    act, std = checked_acting(agent, env, device)
     observation_stats.update(observation)
     # one loop over steps and not two, over rollouts and steps: a run may resume within a rollout
     for global_step in range(start + 1, total_steps + 1):
@@ -308,7 +307,7 @@ def learn(args, env, test_env, stop):
                     clipfracs.append(curves["clipfrac"])
                 if args.target_kl is not None and curves["approx_kl"] > args.target_kl:
                     break
-            act, std = agent.acting()
+            act, std = checked_acting(agent, env, device)
 
             curves["clipfrac"] = torch.stack(clipfracs).mean()
             curves["explained_variance"] = 1 - (returns - values).var() / returns.var().clamp(1e-8)
@@ -343,8 +342,8 @@ def learn(args, env, test_env, stop):
     return True
 
 
-def check_acting(agent, env, device):
-    """Exit unless acting(), in NumPy, and forward(), in PyTorch, are the same policy."""
+def checked_acting(agent, env, device):
+    """Return agent.acting(), in NumPy; exit if that is not the policy of forward(), in PyTorch."""
     act, std = agent.acting()
     generator = torch.Generator().manual_seed(0)
     eps = torch.randn(8, *env.action_space.shape, generator=generator)
@@ -352,8 +351,10 @@ def check_acting(agent, env, device):
     actions = np.stack([act(x) for x in inputs.numpy()]) + std * eps.numpy()
     log_probs, _, _ = agent(inputs.to(device), torch.from_numpy(actions).to(device))
     expected = (-0.5 * eps.square() - 0.5 * math.log(2 * math.pi)).sum(1) - np.log(std).sum()
-    if (log_probs.cpu() - expected).abs().max() > 1e-3:
+    rounding = 1e-3 * (1 + np.abs(actions / std).sum(1))
+    if ((log_probs.cpu() - expected).abs().numpy() > rounding).any():
         fail("the agent acts with one policy and learns another: see acting() and forward()", 1)
+    return act, std
 
 
 def make_policy(agent, observation_stats, env):

@@ -211,6 +211,9 @@ def learn(args, env, test_env, stop):
     """Train in the noisy `env` and test in `test_env`; return False if stop() ended it early."""
     if not noisy.is_bounded(env.action_space):
         fail(f"TD3 needs bounded actions; some actions of {args.env_id} are unbounded")
+    if args.learning_starts >= args.total_timesteps:
+        limit = f"below --total-timesteps ({args.total_timesteps})"
+        fail(f"--learning-starts must be {limit}, not {args.learning_starts}: nothing is learned")
     device = torch.device("cuda" if args.cuda else "cpu")
     run = Run(args, env)
     if run.is_finished:

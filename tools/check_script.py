@@ -12,11 +12,9 @@ import sys
 import tempfile
 import textwrap
 import traceback
-from dataclasses import asdict
 from pathlib import Path
 from unittest import mock
 
-import numpy as np
 import torch
 import watched_run
 from watched_run import ROOT, BrokenError, Trial, check, noisy
@@ -34,17 +32,15 @@ def acts(trial):
     """The policy that acts is the one that learns."""
     with mock.patch.multiple(torch, randn=watched_run.zeros, randn_like=torch.zeros_like):
         run = trial.train("mean_actions")  # in training, too
-    check(run.gaps, "it was not tested before its end: see TEST in learn()")
+    check(run.gaps, "no action follows a test within an episode: see TEST in learn()")
     gap, policy = max(run.gaps), run.script.load_policy(run.folder)
-    advice = "act alike in both, and draw noise by torch.randn"
+    advice = "act alike in both, and draw noise by torch.randn (other noise cannot be checked)"
     check(gap < 1e-4, f"actions in training are {gap:.2g} from those of load_policy(): {advice}")
-    actors = [update for update in run.updates if watched_run.is_saved(update.network, run)]
-    check(actors, "policy.pt has no network that an update learns: give log_test() that one")
-    for update in actors:
-        if found := watched_run.actions_in_loss(update, run):
-            gap = np.abs(np.stack([policy(row) for row in found[0]]) - found[1]).max()
-            text = f"{update.name}() learns actions {gap:.2g} from those of the policy"
-            check(gap < 1e-4, f"{text}: let both call the same method of the network")
+    gaps = watched_run.gaps_in_losses(run, policy)
+    check(gaps, "policy.pt has no network that an update learns: give log_test() that one")
+    for name, gap in gaps.items():
+        text = f"{name}() learns actions {gap:.2g} from those of the policy"
+        check(gap < 1e-4, f"{text}: let both call the same method of the network")
 
 
 def learns(trial):
@@ -55,6 +51,12 @@ def learns(trial):
             check(gradient is not None and gradient.any(), f"no gradient of {where}: use it there")
             changes = not parameter.equal(update.before[name])
             check(changes, f"{where} never changes: give the optimizer this network's parameters")
+
+
+def follows(trial):
+    """Targets follow the networks that learn."""
+    stays = ", ".join(watched_run.left_behind(trial.run))
+    check(not stays, f"{stays} never changes (parameters() has no buffers)")
 
 
 def resumes(trial):
@@ -89,15 +91,9 @@ def options(trial):
     configs = [json.loads(trial.read(run, "config.json")) for run in (trial.run, trial.resumed)]
     differing = noisy.different_arguments(*configs)
     check(not differing, f"a resume changes {differing}: leave args as they are")
-    for name, value in asdict(trial.run.args).items():
-        if name in {"seed", *noisy.MAY_DIFFER_IN_A_RUN} or not isinstance(value, int | float):
-            continue
-        other = not value if isinstance(value, bool) else value + 1
-        try:
-            trial.train("whole", **{name: other})
-        except BrokenError:
-            continue  # refused
-        check(False, f"{name} {other} is taken for {value}: leave resumed_run() in Run as it is")
+    for name, other in watched_run.other_values(trial.run.args).items():
+        refused = trial.refuses(**{name: other})
+        check(refused, f"{name} {other} is no other run: leave resumed_run() in Run as it is")
 
 
 def sweeps(trial):
@@ -123,12 +119,15 @@ def analyses(trial):
     check(trial.algorithm.upper() in out, f"analyze.py does not name it:\n{out}")
 
 
-PROMISES = [trains, acts, learns, resumes, tests, compiles, options]
+PROMISES = [trains, acts, learns, follows, resumes, tests, compiles, options]
 PROMISES += [sweeps, evaluates, analyses]
 
 
-def main(path, *options):
+def main(path="", *options):
     """Print a line for each promise; return the exit status."""
+    if not Path(path).is_file():
+        print(f"error: there is no script {path!r}\n\n{__doc__}" if path[:1] != "-" else __doc__)
+        return 2
     kept = True
     with tempfile.TemporaryDirectory() as folder:
         trial = Trial(Path(path).resolve(), options, Path(folder))
@@ -147,4 +146,4 @@ def main(path, *options):
 
 
 if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:]) if sys.argv[1:] else __doc__)
+    sys.exit(main(*sys.argv[1:]))

@@ -1,6 +1,7 @@
 """Short runs of a training script, trained in this process and watched while they learn."""
 
 import contextlib
+import copy
 import functools
 import importlib.util
 import io
@@ -22,7 +23,7 @@ import noisy_wrappers as noisy  # noqa: E402
 
 # A test and the end of a rollout fall within an episode; the buffer is filled twice.
 SMALL = {"env_id": "Pendulum-v1", "total_timesteps": 150, "max_episode_steps": 20}
-SMALL |= {"eval_frequency": 50, "eval_episodes": 2, "compile": False, "buffer_size": 80}
+SMALL |= {"eval_frequency": 47, "eval_episodes": 2, "compile": False, "buffer_size": 80}
 SMALL |= {"matmul_precision": "highest", "learning_starts": 40, "batch_size": 16}
 SMALL |= {"num_steps": 50, "num_minibatches": 2, "update_epochs": 2}
 
@@ -53,6 +54,14 @@ class Trial:
         """Return a short run, watched, in a folder of runs."""
         return train(self.path, self.options, self.folder / name, **kwargs)
 
+    def refuses(self, **changed):
+        """Return whether the finished run is refused with other arguments."""
+        try:
+            self.train("whole", **changed)
+        except BrokenError:
+            return True
+        return False
+
     @functools.cached_property
     def run(self):
         """The run that others are compared with."""
@@ -62,7 +71,7 @@ class Trial:
     def resumed(self):
         """The same run, stopped and resumed."""
         stopped = self.train("resumed", episodes=4)
-        check(not stopped.finished, "it did not stop after four episodes: ask stop() there")
+        check(not stopped.finished, "it did not stop at the end of an episode: ask stop() there")
         return self.train("resumed")
 
     def read(self, run, name):
@@ -78,16 +87,22 @@ class Trial:
 
 
 def train(path, options, runs_dir, episodes=0, **changed):
-    """Train by a script, imported anew as in a new process, and stop after a number of episodes.
+    """Train by a script, imported anew as in a new process.
 
+    It is stopped when it has learned with each of its updates, and after a number of episodes.
     Return what was seen: `updates`, for each loss the network that it learns, its parameters before
-    the first update, the curves and the gradient of the first and the inputs of the last; and
-    `gaps`, how far the first action after each test was from that of load_policy().
+    the first update, the curves and the gradient of the first and the inputs of the last; `gaps`,
+    how far the first action after each test was from that of load_policy(); and `networks`, those
+    of the state that resumes, {name: (network, its state_dict at the start)}.
     """
     spec = importlib.util.spec_from_file_location(path.stem, path)
     sys.modules[path.stem] = script = importlib.util.module_from_spec(spec)
-    seen = SimpleNamespace(script=script, updates=[], gaps=[], observations=set())
+    seen = SimpleNamespace(script=script, updaters=0, updates=[], gaps=[], observations=set())
     said, ended = io.StringIO(), itertools.count(1)
+
+    def stop():
+        return next(ended) >= episodes > 0 and len(seen.updates) == seen.updaters
+
     if str(path.parent) not in sys.path:
         sys.path.append(str(path.parent))  # for what it imports
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
@@ -100,11 +115,20 @@ def train(path, options, runs_dir, episodes=0, **changed):
             seen.folder = noisy.run_folder(asdict(seen.args))
             script.updater = watch_updates(script.updater, seen)
             script.learn = watch_actions(script.learn, seen)
-            seen.finished = script.train(seen.args, lambda: next(ended) == episodes)
+            script.Run.resume = watch_networks(script.Run.resume, seen)
+            seen.finished = script.train(seen.args, stop)
         except SystemExit as error:
             raise BrokenError(said.getvalue().strip().rpartition("\n")[2]) from error
     seen.said = said.getvalue()
     return seen
+
+
+def other_values(args):
+    """Return other values of numbers and flags that make another run."""
+    values = {name: x for name, x in asdict(args).items() if isinstance(x, int | float)}
+    for name in values.keys() & {"seed", *noisy.MAY_DIFFER_IN_A_RUN}:
+        del values[name]
+    return {name: not x if isinstance(x, bool) else x + 1 for name, x in values.items()}
 
 
 def watch_updates(updater, seen):
@@ -115,6 +139,7 @@ def watch_updates(updater, seen):
         parameters = {name: p for name, p in network.named_parameters() if p.requires_grad}
         before = {name: p.detach().clone() for name, p in parameters.items()}
         own = SimpleNamespace(name=name, loss=loss, network=network, parameters=parameters)
+        seen.updaters += 1
 
         def watched(*inputs):
             curves, own.inputs = update(*inputs), inputs
@@ -153,12 +178,52 @@ def watch_actions(learn, seen):
     return watched_learn
 
 
+def watch_networks(resume, seen):
+    """Return a script's Run.resume(), which notes the networks of the state."""
+
+    def watched_resume(run, state):
+        networks = {name: x for name, x in state.items() if isinstance(x, torch.nn.Module)}
+        seen.networks = {name: (x, copy.deepcopy(x.state_dict())) for name, x in networks.items()}
+        return resume(run, state)
+
+    return watched_resume
+
+
+def left_behind(seen):
+    """Yield the tensors of targets that have not moved, as those of the learned networks have.
+
+    A target is a network in the state that no update learns, with the tensors of one that is. What
+    is to stay as it is needs no place in the state.
+    """
+    learned = [update.network for update in seen.updates]
+    for name, (network, begun) in seen.networks.items():
+        for other, (leader, leader_begun) in seen.networks.items():
+            is_target = leader in learned and network not in learned
+            if is_target and network.state_dict().keys() == leader.state_dict().keys():
+                for key, value in network.state_dict().items():
+                    moves = not torch.equal(leader.state_dict()[key], leader_begun[key])
+                    if moves and torch.equal(value, begun[key]):
+                        yield f"{key} of {name!r}, a copy of {other!r}"
+
+
 def is_saved(network, seen):
     """Tell whether policy.pt has a network as it is now."""
     state, saved = network.state_dict(), seen.script.read_state(seen.folder / "policy.pt")
     parts = [part for part in saved.values() if isinstance(part, dict)]
     alike = [part for part in parts if part.keys() == state.keys()]
     return any(all(map(torch.equal, part.values(), state.values())) for part in alike)
+
+
+def gaps_in_losses(seen, policy):
+    """Return {name: how far the actions that it learns are from the policy's} of actors' losses."""
+    gaps = {}
+    for update in seen.updates:
+        if is_saved(update.network, seen):
+            gaps[update.name] = 0.0
+            if found := actions_in_loss(update, seen):
+                gap = np.abs(np.stack([policy(row) for row in found[0]]) - found[1]).max()
+                gaps[update.name] = gap
+    return gaps
 
 
 def actions_in_loss(update, seen):

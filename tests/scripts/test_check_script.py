@@ -44,6 +44,14 @@ def test_a_formula_of_learning_alone(tmp_path):
     assert "acts with one policy and learns another" in reason(check_script.trains, trial)
 
 
+def test_acting_with_a_copy_that_was_right_at_the_start(tmp_path):
+    setup = "        self.actor_logstd = nn.Parameter"
+    copied = (setup, "        self.first = copy.deepcopy(self.actor_mean)\n" + setup)
+    acting = ("in_numpy(self.actor_mean), self", "in_numpy(self.first), self")
+    trial = broken(tmp_path, "ppo", IMPORT, copied, acting)
+    assert "acts with one policy and learns another" in reason(check_script.trains, trial)
+
+
 def test_acting_with_an_old_copy(tmp_path):
     setup = "    online_parameters = [*actor"
     acting = "action = actor.policy(observation, eps)"
@@ -71,6 +79,36 @@ def test_an_optimizer_of_another_network(tmp_path):
     assert "critic_loss() never changes" in reason(check_script.learns, trial)
 
 
+def test_targets_that_never_move(tmp_path):
+    old = "target_parameters = [*target_actor.parameters(), *target_critic.parameters()]"
+    trial = broken(tmp_path, "td3", (old, old.replace("*target_actor.parameters(), ", "")))
+    trial.path.write_text(trial.path.read_text().replace("[*actor.parameters(), *cri", "[*cri"))
+    assert "network.0.weight of 'target_actor'" in reason(check_script.follows, trial)
+
+
+def test_targets_that_never_move_in_their_buffers(tmp_path):
+    networks = "        self.networks = nn."
+    buffer = '        self.register_buffer("scale", torch.ones(1))\n'
+    inputs = "        inputs = torch.cat([observations, actions], 1)"
+    learning = "            curves = update_critic("
+    trial = broken(
+        tmp_path,
+        "sac",
+        (networks, buffer + networks),
+        (inputs, inputs + " / self.scale"),
+        (learning, "            critic.scale += 0.01\n" + learning),
+    )
+    assert "scale of 'target'" in reason(check_script.follows, trial)
+
+
+def test_something_is_missing_in_the_state_where_episodes_are_short(tmp_path):
+    """The run stops when all has been learned once, though four episodes ended long before."""
+    old = '"q_optimizer": q_optimizer, "actor_optimizer": actor_optimizer}'
+    trial = broken(tmp_path, "td3", (old, '"actor_optimizer": actor_optimizer}'))
+    trial.options = ["--max-episode-steps", "5"]
+    assert "put all that training changes into `state`" in reason(check_script.resumes, trial)
+
+
 def test_something_is_missing_in_the_state(tmp_path):
     old = 'state |= {"target_actor": target_actor, "target_critic": target_critic}'
     trial = broken(tmp_path, "td3", (old, 'state |= {"target_critic": target_critic}'))
@@ -89,7 +127,7 @@ def test_tests_that_train(tmp_path):
 
 @pytest.mark.slow
 def test_a_compiled_loss_that_is_another(tmp_path):
-    old = "return -q1.mean(), {"
+    old = "loss = -q1.mean()\n"
     new = "q1 = q1 * (1.001 if torch.compiler.is_compiling() else 1.0)\n    " + old
     trial = broken(tmp_path, "td3", (old, new))
     assert "of actor_loss() by" in reason(check_script.compiles, trial)
@@ -97,7 +135,7 @@ def test_a_compiled_loss_that_is_another(tmp_path):
 
 @pytest.mark.slow
 def test_a_loss_that_cannot_be_compiled(tmp_path):
-    old = "return -q1.mean(), {"
+    old = "loss = -q1.mean()\n"
     trial = broken(tmp_path, "td3", (old, "torch._dynamo.graph_break()\n    " + old))
     assert "not compiled" in reason(check_script.compiles, trial)
 
@@ -166,6 +204,9 @@ def test_a_line_for_each_promise(tmp_path, capsys, monkeypatch):
     assert "ZeroDivisionError" in err
     monkeypatch.setattr(check_script, "PROMISES", [holds])
     assert check_script.main(path) == 0
+    capsys.readouterr()
+    assert check_script.main("no.py") == check_script.main("--help") == check_script.main() == 2
+    assert "error: there is no script 'no.py'\n" in capsys.readouterr().out
 
 
 def test_no_more_than_a_line_where_it_does_not_train(tmp_path, capsys):

@@ -263,7 +263,9 @@ def test_ten_tests_at_least(algorithm, tmp_path):
 @pytest.mark.parametrize("algorithm", ["SAC", "PPO"])
 def test_overwrite_of_nothing_and_a_short_run(algorithm, tmp_path):
     short = {"total_timesteps": 5, "eval_frequency": 3, "eval_episodes": 1}
-    short |= {"num_steps": 5, "num_minibatches": 1} if algorithm == "PPO" else {}
+    short |= {"PPO": {"num_steps": 5, "num_minibatches": 1}, "SAC": {"learning_starts": 4}}[
+        algorithm
+    ]
     run_dir = run(algorithm, tmp_path, env_id="toy_envs:Count-v0", overwrite=True, **short)
     assert [row[0] for row in evaluations(run_dir)] == ([5] if algorithm == "PPO" else [3, 5])
     result = read_json(run_dir / "result.json")
@@ -380,6 +382,8 @@ BAD_OF_OTHERS = [
     ({"env_id": "toy_envs:Unbounded-v0"}, "SAC needs bounded actions", "SAC"),
     ({"env_id": "toy_envs:Unbounded-v0"}, "TD3 needs bounded actions", "TD3"),
     ({"q_lr": -1e-3}, "--q-lr must be at least 0, not -0.001", "SAC"),
+    ({"learning_starts": 60}, "must be below --total-timesteps (60), not 60: nothing", "SAC"),
+    ({"learning_starts": 90}, "must be below --total-timesteps (60), not 90: nothing", "TD3"),
 ]
 
 
