@@ -21,8 +21,8 @@ import numpy as np
 import noisy_wrappers as noisy
 from analysis.errors import fail, with_place
 from analysis.folders import DamageError, read_json
+from analysis.words import counted, duration
 from sweep.scripts import number
-from sweep.words import counted
 
 # Seconds of learning for each step, without the environment's own, and what each number of an
 # observation adds to them: docs/sweeps.md says on which machine
@@ -253,18 +253,12 @@ def mean_seconds(runs):
     return fmean(taken) if taken else None
 
 
-def hours_of(seconds):
-    """Return a time in hours as text: 1,330 or 4.9 or 0.076."""
-    hours = seconds / 3600
-    return f"{hours:,.0f}" if hours >= 100 else f"{hours:.1f}" if hours >= 0.1 else f"{hours:.2g}"
-
-
 def time_left(batches, jobs, elsewhere=False):
     """Say what batches of runs take, one batch after the other.
 
     batches: the seconds of each run, batch by batch. jobs: runs at a time, None if unknown.
     """
-    text = f"about {hours_of(sum(map(sum, batches)))} core-hours are left"
+    text = f"about {duration(sum(map(sum, batches)))} of processor time left"
     if jobs:
         clock = 0
         for batch in batches:
@@ -272,8 +266,7 @@ def time_left(batches, jobs, elsewhere=False):
             for seconds in batch:
                 heapq.heapreplace(ends, ends[0] + seconds)  # where the next place is free
             clock += max(ends, default=0)
-        runs = counted(jobs, "run")
-        text += f", {hours_of(clock)} hours on the clock with {runs} at a time"
+        text += f", {duration(clock)} on the clock with {counted(jobs, 'run')} at a time"
     if elsewhere:
         text += "; timed on this machine, others may be faster or slower"
     return text
