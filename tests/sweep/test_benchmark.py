@@ -949,5 +949,6 @@ def test_a_script_and_modules_in_the_callers_folder(tmp_path):
     python = Path("env/bin", Path(sys.executable).name)
     line = run(*own, "--dry-run", env=ENV | {"PYTHON": str(python)}, **here).out
     assert f" {tmp_path / python} " in line
+    (tmp_path / "types.py").unlink()  # the script's own folder comes first where it is pasted
     pasted = subprocess.run(line, shell=True, cwd=ROOT, capture_output=True, text=True)
     assert (pasted.returncode, pasted.stdout) == (3, "found it\n")
