@@ -61,8 +61,7 @@ def ask(env_id, configurations=(), max_episode_steps=None, env_kwargs=()):
         declared = made.spec.max_episode_steps
         with noisy.make_flat(made, STEP_LIMIT) as env:
             limit = env.spec.max_episode_steps
-            timed = RewardCounter(env)
-            seconds, steps, length = time_steps(timed, limit, deadline, declared is None)
+            seconds, steps, length, rewards = time_steps(env, limit, deadline, declared is None)
             env.reset()  # a failure after this one is the noise's
             tried = {}
             for n in configurations:  # at every rate: it may fail at one of them
@@ -74,28 +73,14 @@ def ask(env_id, configurations=(), max_episode_steps=None, env_kwargs=()):
                 observed=math.prod(env.observation_space.shape),
                 bounded=bool(np.isfinite([env.action_space.low, env.action_space.high]).all()),
                 tried=tried,
-                rewards=len(timed.rewards) if steps >= STEPS else MANY,
+                rewards=rewards if steps >= STEPS else MANY,
             )
 
 
-class RewardCounter(gym.Wrapper):
-    """Collects the different rewards of an environment, until there are many."""
-
-    def __init__(self, env):
-        """Begin with none."""
-        super().__init__(env)
-        self.rewards = set()
-
-    def step(self, action):
-        """Make a step; remember its reward."""
-        result = self.env.step(action)
-        if len(self.rewards) < MANY:
-            self.rewards.add(float(result[1]))
-        return result
-
-
 def time_steps(env, time_limit, deadline, whole=False):
-    """Return an environment's seconds a step, the steps timed, and the length of an episode.
+    """Return an environment's seconds a step, the steps timed, an episode's length, and rewards.
+
+    The last is how many different rewards there were, MANY if as many or more.
 
     Each step bears its share of a reset: an episode is as long as those that ended while it was
     timed, or as the time limit if none did. whole: an episode is played to its end, if that takes
@@ -109,7 +94,7 @@ def time_steps(env, time_limit, deadline, whole=False):
     now = begin
     half = (begin + deadline) / 2
     steps, resets, ends = [], [], []  # the seconds of each, and after which steps episodes ended
-    ended = True
+    rewards, ended = set(), True
     while not steps or (
         now < deadline
         and (len(steps) < STEPS or now < begin + SECONDS or (whole and not ends and now < half))
@@ -120,15 +105,17 @@ def time_steps(env, time_limit, deadline, whole=False):
             resets.append(time.perf_counter() - start)
         action = env.action_space.sample()
         start = time.perf_counter()
-        _, _, terminated, truncated, _ = env.step(action)
+        _, reward, terminated, truncated, _ = env.step(action)
         now = time.perf_counter()
         steps.append(now - start)
+        if len(rewards) < MANY:
+            rewards.add(float(reward))
         if ended := terminated or truncated:
             ends.append(len(steps))
     length = ends[-1] / len(ends) if ends else time_limit
     own_share = 1 - (waited() - waited_before) / (time.perf_counter() - begin)
     seconds = (fmean(steps) + fmean(resets) / length) * own_share
-    return seconds, len(steps), math.ceil(length)
+    return seconds, len(steps), math.ceil(length), len(rewards)
 
 
 def waited():

@@ -197,11 +197,9 @@ def unknown_option(name, known):
         return f"{name} is an option of the scripts: put it at the end, after --"
     if name in EXECUTOR_OPTIONS:  # benchmark.sh reads it, unless it is written with a value
         return f"{name} takes no value"
-    near = difflib.get_close_matches(name, [*known, *EXECUTOR_OPTIONS, *of_scripts], n=1)
-    if not near:
-        return f"unknown option {name}; ./benchmark.sh --help lists them"
-    after = ", an option of the scripts, at the end after --" if near[0] in of_scripts else ""
-    return f"unknown option {name}; did you mean {near[0]}{after}?"
+    near = difflib.get_close_matches(name, [*known, *EXECUTOR_OPTIONS], n=1)
+    hint = f"did you mean {near[0]}?" if near else "./benchmark.sh --help lists them"
+    return f"unknown option {name}; {hint}"
 
 
 def from_project(caller, text):

@@ -522,7 +522,6 @@ def test_baselines_that_pay(noises, more, baselines):
         ("best -- --exp-name mine", "--exp-name: several algorithms would write into the same"),
         ("demo --env-id Hopper-v5", "unknown option --env-id; did you mean --envs?"),
         ("demo --gamma 0.9", "--gamma is an option of the scripts: put it at the end, after --"),
-        ("demo --gama 0.9", "did you mean --gamma, an option of the scripts, at the end after --?"),
         ("demo --runs-dir=-x", "--runs-dir must be a path"),
         ("--algos sac demo", "unknown preset '--algos'"),
         ("demo -- --overwrite", "--overwrite would start interrupted runs afresh"),
