@@ -10,7 +10,7 @@ SHELL := bash
 demo: $(BIN)/.run
 	@echo "Ten runs of PPO, five of them with noise: about two minutes on one core"
 	PYTHON=$(BIN)/python ./benchmark.sh demo
-	@echo "Now analyze.py, once: tables and figures, in about ten seconds"
+	@echo "Now analyze.py, once: tables and figures, in a few seconds"
 	@$(BIN)/python analyze.py --runs-dir runs/demo >runs/demo/logs/analysis.txt
 	@echo
 	@sed '/^$$/q' runs/demo/logs/analysis.txt  # the verdict
