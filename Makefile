@@ -10,7 +10,8 @@ SHELL := bash
 demo: $(BIN)/.run
 	@echo "Ten runs of PPO, five of them with noise: about two minutes on one core"
 	PYTHON=$(BIN)/python ./benchmark.sh demo
-	$(BIN)/python analyze.py --runs-dir runs/demo >runs/demo/logs/analysis.txt
+	@echo "Now analyze.py, once: tables and figures, in a few seconds"
+	@$(BIN)/python analyze.py --runs-dir runs/demo >runs/demo/logs/analysis.txt
 	@echo
 	@sed '/^$$/q' runs/demo/logs/analysis.txt  # the verdict
 	@echo "The picture: runs/demo/results/curves_PPO_RandomNormalNoisyObservation_1.0.svg"

@@ -13,8 +13,8 @@ Presets
   choose     finds a noise that helps: for each algorithm and environment, tries the noises, gives
              the better half of them more seeds in each round, compares the winner with no noise on
              fresh seeds, and prints a verdict; the runs are stored in runs/choose
-  demo       PPO on InvertedPendulum-v5, without and with one noise, 5 seeds, 20,480 steps, not
-             compiled and with a learning rate of 1e-3, into runs/demo
+  demo       PPO on InvertedPendulum-v5, without and with one noise, 5 seeds, 20,480 steps, set to
+             learn fast, into runs/demo
   baseline   no noise: 3 algorithms, 5 environments, the paper's seeds
   best       the paper's best noise for each algorithm and environment
   paper      15 noises at 6 rates, 9,100 runs

@@ -70,11 +70,6 @@ def percent(value, sign="+"):
     return f"{value:{sign},.{0 if abs(value) >= 10 else 1}f} %"
 
 
-def counted(number, word):
-    """Write how many there are: "1 seed", "5 seeds"."""
-    return f"{number:.0f} {word}" + ("" if number == 1 else "s")
-
-
 def seeds_of(n, n_baseline):
     """Write the seeds with and without noise: "5", or "5/10" where they differ."""
     return f"{n:.0f}" if n == n_baseline else f"{n:.0f}/{n_baseline:.0f}"

@@ -8,11 +8,12 @@ import pandas as pd
 from analysis import statistics, verdicts
 from analysis.comparisons import IQM, IQM_CHANGE, PROBABILITY, compare_all, results
 from analysis.folders import SEARCH, SUCCESS
-from analysis.formatting import Table, counted, listed, seeds_of, slug, two_digits
+from analysis.formatting import Table, listed, seeds_of, slug, two_digits
 from analysis.luck import add_luck, luck_of_studies
 from analysis.power import LEVEL
 from analysis.runs import KEYS, STUDY, study_name
 from analysis.verdicts import ALL_EQUAL
+from analysis.words import counted
 from noisy_wrappers import BASELINE
 
 CONSISTENT_PERCENT = 80  # of the environments, as in the paper

@@ -9,7 +9,6 @@ import pandas as pd
 
 from analysis.folders import SUCCESS
 from analysis.formatting import (
-    counted,
     is_zero,
     listed,
     not_zero,
@@ -21,6 +20,7 @@ from analysis.formatting import (
 from analysis.power import LEVEL
 from analysis.runs import STUDY, rows_of, study_name
 from analysis.statistics import SEEDS_FOR_INTERVAL, holm
+from analysis.words import counted
 
 BETTER, WORSE = CLEAR = ["better", "worse"]
 NO_SUCH_GAIN = "no such gain"  # as --smallest-gain asks for

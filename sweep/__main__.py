@@ -18,17 +18,16 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from datetime import timedelta
 from statistics import harmonic_mean
 from typing import NamedTuple
 
 from analysis.errors import take_over_terminal
 from analysis.logs import STOPPED, Log, is_locked, read_log
+from analysis.words import counted, duration
 from sweep.environment import cost
 from sweep.found import look, refuse_others, remarks, runs_in
 from sweep.grid import PlannedRun, command_line, grid
 from sweep.options import from_caller, parse_args
-from sweep.words import counted
 
 PATIENCE = 60  # seconds until another machine's results are seen, or taken for lost
 YOUNG = 120  # seconds: a run writes a line at least every ten, except in a test or in compiling
@@ -59,7 +58,7 @@ def progress_of(run, over):
     is_young = abs(log.age) < YOUNG  # a log that is dated in the future is not
     if is_locked(run.folder):
         is_silent = YOUNG <= log.age < float("inf")
-        reason = f"running, silent for {log.age / 60:.0f} min" if is_silent else ""
+        reason = f"running, silent for {duration(log.age)}" if is_silent else ""
         return Progress(run, log, RUNNING, "still running" if over else reason)
     status = log.exit_status
     if status in STOPPED:
@@ -67,7 +66,8 @@ def progress_of(run, over):
     if status == 0:  # the run was finished, and its folder has been moved or deleted since
         return Progress(run, log._replace(step=0), "to do", "no result.json")
     if status is not None:
-        ended = f"signal {status - 128}" if status > 128 else f"exit {status}"
+        # beyond the last signal it is a program's own, such as the 255 of sys.exit(-1)
+        ended = f"signal {status - 128}" if 128 < status <= 192 else f"exit {status}"
         return Progress(run, log, "failed", ended)
     if is_young and not over:
         return Progress(run, log, PROBABLY)
@@ -79,8 +79,14 @@ def summary(progresses):
     count = Counter(progress.state for progress in progresses)
     states = [state for state in STATES if state != PROBABLY or count[state]]
     text = f"{counted(len(progresses), 'run')}: " + ", ".join(
-        f"{count[state]} {state}" for state in states
+        f"{count[state]:,} {state}" for state in states
     )
+    steps_left = [
+        0 if p.state == "done" else max(0, p.run.total_timesteps - p.log.step) for p in progresses
+    ]
+    steps = sum(p.run.total_timesteps for p in progresses)
+    if any(steps_left):
+        text += f"; {steps - sum(steps_left):,} of {steps:,} steps"
     speeds = {}
     for progress in progresses:
         if progress.log.steps_per_second:
@@ -89,13 +95,12 @@ def summary(progresses):
     speed = {key: harmonic_mean(values) for key, values in speeds.items()}
     on_their_way = [p for p in progresses if p.state in (RUNNING, PROBABLY)]
     if on_their_way and speed:
-        seconds = 0
-        for run, log, state, _ in progresses:
-            steps = 0 if state == "done" else max(0, run.total_timesteps - log.step)
-            seconds += steps / speed.get(run.kind, speed[None])
-        left = timedelta(seconds=round(seconds / len(on_their_way)))
+        seconds = sum(
+            number / speed.get(progress.run.kind, speed[None])
+            for number, progress in zip(steps_left, progresses, strict=True)
+        )
         now = sum(progress.log.steps_per_second for progress in on_their_way)
-        text += f"; about {left} left"
+        text += f"; about {duration(seconds / len(on_their_way))} left"
         text += f", {now:,.0f} steps/s" * bool(now)  # a narrow terminal cuts the end off
     return text
 
@@ -127,7 +132,7 @@ def show_list(args, runs, choices):
     for run in todo:
         folder = f"{run.folder.parent}/{run.folder.name}"  # with a slash, for --runs-dir . too
         print(folder, command_line(run), sep="\t")
-    lines = [f"{counted(len(runs), 'run')}{with_baselines(runs)}, {len(todo)} to do"]
+    lines = [f"{counted(len(runs), 'run')}{with_baselines(runs)}, {len(todo):,} to do"]
     if choices:
         from sweep import telling
 
@@ -151,7 +156,11 @@ def watch(args, runs, choices):
     while os.getppid() == parent:
         if time.monotonic() - shown >= pause:
             shown = time.monotonic()
-            line = summary([progress_of(run, over=False) for run in runs])
+            progresses = [progress_of(run, over=False) for run in runs]
+            # one that has no lock yet is starting: this sweep has begun it
+            line = summary(
+                [p._replace(state=p.state.removeprefix("probably ")) for p in progresses]
+            )
             if terminal:
                 width = shutil.get_terminal_size().columns - 1
                 line = f"\r{line[:width].ljust(width)}"
@@ -182,12 +191,11 @@ def show_stopped(args, runs, choices):
 def show_report(args, runs, choices):
     """Print what came out of a sweep; the exit status is 1 unless all runs are done."""
     progresses = show_progress(args, runs, over=True, everything=True)
-    unfinished = any(p.state != "done" for p in progresses)
-    if unfinished:
-        check_disk(runs[0].folder.parent / "logs")
+    unfinished = [p.log.path for p in progresses if p.state != "done"]
+    check_disk(unfinished)
     refused = {p.run.script.file: p.log.last_line for p in progresses if p.reason == "exit 2"}
     for script, reason in refused.items():
-        print(f"{script} refused its arguments, so no more of its runs were started: {reason}")
+        print(f"{script} refused arguments, so no other seeds of these were started: {reason}")
     if choices:
         from sweep import telling
 
@@ -197,7 +205,7 @@ def show_report(args, runs, choices):
         program = shlex.quote(from_caller(args, "analyze.py"))
         print(f"See the curves with: tensorboard --logdir {place}")
         print(f"Make tables and figures with: python {program} --runs-dir {place}")
-    return int(unfinished)
+    return int(bool(unfinished))
 
 
 def show_progress(args, runs, over, everything=False):
@@ -221,17 +229,23 @@ def with_baselines(runs):
     return f" ({number} of them without noise)" if kinds[True] not in (set(), kinds[False]) else ""
 
 
-def check_disk(folder):
-    """Say so if nothing can be written into a folder: then not even the logs can tell."""
-    try:
-        with tempfile.TemporaryFile(dir=folder) as file:
-            file.write(bytes(100_000))
-            file.flush()
-            os.fsync(file.fileno())
-    except FileNotFoundError:
-        pass  # nothing was started from here
-    except OSError as error:
-        print(f"error: cannot write to {folder}: {error.strerror}", file=sys.stderr)
+def check_disk(logs):
+    """Say so if logs cannot be written: then nothing else tells why their runs were not started."""
+    for folder in dict.fromkeys(log.parent for log in logs):
+        try:
+            with tempfile.TemporaryFile(dir=folder) as file:
+                file.write(bytes(100_000))
+                file.flush()
+                os.fsync(file.fileno())
+        except FileNotFoundError:
+            pass  # nothing was started from here
+        except OSError as error:
+            print(f"error: cannot write to {folder}: {error.strerror}", file=sys.stderr)
+    for log in filter(os.path.lexists, logs):  # it may be somebody else's
+        try:
+            open(log, "ab").close()
+        except OSError as error:
+            print(f"error: cannot write to {log}: {error.strerror}", file=sys.stderr)
 
 
 VIEWS = {
@@ -285,11 +299,11 @@ def are_seen(runs):
 
 
 def is_late(run):
-    """Tell whether a run has just ended well, and its result is not to be seen."""
-    if os.path.exists(run.folder / "result.json"):
-        return False
-    log = read_log(run.folder)
-    return log.exit_status == 0 and abs(log.age) < YOUNG + PATIENCE
+    """Tell whether a run has ended well, and its result is not to be seen.
+
+    When it ended does not matter: the other machine's clock may be wrong.
+    """
+    return not os.path.exists(run.folder / "result.json") and read_log(run.folder).exit_status == 0
 
 
 if __name__ == "__main__":

@@ -21,8 +21,8 @@ import numpy as np
 import noisy_wrappers as noisy
 from analysis.errors import fail, with_place
 from analysis.folders import DamageError, read_json
+from analysis.words import counted, duration
 from sweep.scripts import number
-from sweep.words import counted
 
 # Seconds of learning for each step, without the environment's own, and what each number of an
 # observation adds to them: docs/sweeps.md says on which machine
@@ -61,8 +61,7 @@ def ask(env_id, configurations=(), max_episode_steps=None, env_kwargs=()):
         declared = made.spec.max_episode_steps
         with noisy.make_flat(made, STEP_LIMIT) as env:
             limit = env.spec.max_episode_steps
-            timed = RewardCounter(env)
-            seconds, steps, length = time_steps(timed, limit, deadline, declared is None)
+            seconds, steps, length, rewards = time_steps(env, limit, deadline, declared is None)
             env.reset()  # a failure after this one is the noise's
             tried = {}
             for n in configurations:  # at every rate: it may fail at one of them
@@ -74,28 +73,14 @@ def ask(env_id, configurations=(), max_episode_steps=None, env_kwargs=()):
                 observed=math.prod(env.observation_space.shape),
                 bounded=bool(np.isfinite([env.action_space.low, env.action_space.high]).all()),
                 tried=tried,
-                rewards=len(timed.rewards) if steps >= STEPS else MANY,
+                rewards=rewards if steps >= STEPS else MANY,
             )
 
 
-class RewardCounter(gym.Wrapper):
-    """Collects the different rewards of an environment, until there are many."""
-
-    def __init__(self, env):
-        """Begin with none."""
-        super().__init__(env)
-        self.rewards = set()
-
-    def step(self, action):
-        """Make a step; remember its reward."""
-        result = self.env.step(action)
-        if len(self.rewards) < MANY:
-            self.rewards.add(float(result[1]))
-        return result
-
-
 def time_steps(env, time_limit, deadline, whole=False):
-    """Return an environment's seconds a step, the steps timed, and the length of an episode.
+    """Return an environment's seconds a step, the steps timed, an episode's length, and rewards.
+
+    The last is how many different rewards there were, MANY if as many or more.
 
     Each step bears its share of a reset: an episode is as long as those that ended while it was
     timed, or as the time limit if none did. whole: an episode is played to its end, if that takes
@@ -109,7 +94,7 @@ def time_steps(env, time_limit, deadline, whole=False):
     now = begin
     half = (begin + deadline) / 2
     steps, resets, ends = [], [], []  # the seconds of each, and after which steps episodes ended
-    ended = True
+    rewards, ended = set(), True
     while not steps or (
         now < deadline
         and (len(steps) < STEPS or now < begin + SECONDS or (whole and not ends and now < half))
@@ -120,15 +105,17 @@ def time_steps(env, time_limit, deadline, whole=False):
             resets.append(time.perf_counter() - start)
         action = env.action_space.sample()
         start = time.perf_counter()
-        _, _, terminated, truncated, _ = env.step(action)
+        _, reward, terminated, truncated, _ = env.step(action)
         now = time.perf_counter()
         steps.append(now - start)
+        if len(rewards) < MANY:
+            rewards.add(float(reward))
         if ended := terminated or truncated:
             ends.append(len(steps))
     length = ends[-1] / len(ends) if ends else time_limit
     own_share = 1 - (waited() - waited_before) / (time.perf_counter() - begin)
     seconds = (fmean(steps) + fmean(resets) / length) * own_share
-    return seconds, len(steps), math.ceil(length)
+    return seconds, len(steps), math.ceil(length), len(rewards)
 
 
 def waited():
@@ -253,18 +240,12 @@ def mean_seconds(runs):
     return fmean(taken) if taken else None
 
 
-def hours_of(seconds):
-    """Return a time in hours as text: 1,330 or 4.9 or 0.076."""
-    hours = seconds / 3600
-    return f"{hours:,.0f}" if hours >= 100 else f"{hours:.1f}" if hours >= 0.1 else f"{hours:.2g}"
-
-
 def time_left(batches, jobs, elsewhere=False):
     """Say what batches of runs take, one batch after the other.
 
     batches: the seconds of each run, batch by batch. jobs: runs at a time, None if unknown.
     """
-    text = f"about {hours_of(sum(map(sum, batches)))} core-hours are left"
+    text = f"about {duration(sum(map(sum, batches)))} of processor time left"
     if jobs:
         clock = 0
         for batch in batches:
@@ -272,8 +253,7 @@ def time_left(batches, jobs, elsewhere=False):
             for seconds in batch:
                 heapq.heapreplace(ends, ends[0] + seconds)  # where the next place is free
             clock += max(ends, default=0)
-        runs = counted(jobs, "run")
-        text += f", {hours_of(clock)} hours on the clock with {runs} at a time"
+        text += f", {duration(clock)} on the clock with {counted(jobs, 'run')} at a time"
     if elsewhere:
         text += "; timed on this machine, others may be faster or slower"
     return text

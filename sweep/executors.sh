@@ -23,11 +23,13 @@ no_locks() { # FOLDER
     "choose a --runs-dir on another file system, or have its locks turned on"
 }
 
-# A script that refuses its arguments refuses them in every run: the first one leaves this file, and
-# the sweep starts no other run of that script (on this machine, if machines share no folder).
-refusal_of() { # SWEEP FOLDER COMMAND
-  [[ ! $3 =~ ([A-Za-z0-9_]+)_continuous_noisy\.py ]] ||
-    echo "${2%/*}/logs/.refused-$1-${BASH_REMATCH[1]}"
+# A script that refuses its arguments refuses them with every seed: the first run leaves this file,
+# and the sweep starts no run of another seed (on this machine, if machines share no folder). Other
+# environments and noises are tried: it may be one of these that the script refuses.
+refusal_of() { # SWEEP FOLDER
+  local name=${2##*/} configuration
+  configuration=${name%%__*}
+  echo "${2%/*}/logs/.refused-$1-${configuration%_s*}__${name#*__}"
 }
 is_refused() { [ -e "$(refusal_of "$@")" ]; }
 
@@ -38,7 +40,7 @@ is_refused() { [ -e "$(refusal_of "$@")" ]; }
 # to start the same run waits for it, and goes on with it if it was stopped.
 run_one() {
   local refusal
-  refusal=$(refusal_of "$@")
+  refusal=$(refusal_of "$1" "$2")
   shift
   asked=
   [ ! -e "$refusal" ] || return 2
@@ -59,8 +61,9 @@ run_one() {
   trap '[ -n "$asked" ] || kill -TERM "$child" || true; asked=1' USR1
   while kill -0 "$child" 2>/dev/null; do wait "$child" || true; done # a signal interrupts wait
   wait "$child" || status=$?
-  # analysis/folders.py reads this line
-  echo "# $(date '+%F %T') $HOSTNAME: exit=$status" 2>/dev/null || true
+  # analysis/logs.py reads the last line. What the run printed may have ended within one, as the
+  # bar of a killed program does.
+  printf '\n# %s %s: exit=%s\n' "$(date '+%F %T')" "$HOSTNAME" "$status" 2>/dev/null || true
   [ "$status" -ne 2 ] || touch "$refusal" 2>/dev/null || true
   return "$status"
 }
@@ -73,9 +76,10 @@ slurm_task() {
   sweep=${1##*/lines-} # its id stands in the name of the list
   IFS=$'\t' read -r folder command < <(sed -n "$(($2 + SLURM_ARRAY_TASK_ID + 1))p" "$1")
   sweep=${sweep%.tsv}
-  ! is_refused "$sweep" "$folder" "$command" || exit 2
+  ! is_refused "$sweep" "$folder" || exit 2
   run_one "$sweep" "$folder" "$command" >>"$(log_of "$folder")" || status=$?
-  if [ -n "$asked" ] && [ "$status" -eq 143 ]; then scontrol requeue "$job"; fi
+  # SLURM_CLUSTERS came along from where it was submitted: the task is one of this cluster
+  if [ -n "$asked" ] && [ "$status" -eq 143 ]; then env -u SLURM_CLUSTERS scontrol requeue "$job"; fi
   exit "$status"
 }
 
@@ -86,7 +90,7 @@ run_local() { # nproc obeys OMP_NUM_THREADS, which is about the threads of one p
   cores=$(env -u OMP_NUM_THREADS -u OMP_THREAD_LIMIT nproc)
   while IFS=$'\t' read -r folder command; do
     while [ "$(jobs -pr | wc -l)" -ge "${jobs:-$cores}" ]; do wait -n || true; done
-    ! is_refused "$sweep" "$folder" "$command" || continue
+    ! is_refused "$sweep" "$folder" || continue
     : 2>/dev/null >>"$(log_of "$folder")" || continue # the report says why
     run_one "$sweep" "$folder" "$command" >>"$(log_of "$folder")" &
   done <"$list"
@@ -134,6 +138,7 @@ clusters_of() { # the clusters that sbatch will choose from, "" for this one: as
 
 ask_slurm() { # before anything is written; sets array_size, the least of all clusters
   local clusters
+  unset "${!SQUEUE_@}" "${!SCANCEL_@}" # a user's own, such as SQUEUE_STATES, would hide jobs
   clusters=$(clusters_of)
   array_size=$(scontrol ${clusters:+"--clusters=$clusters"} show config 2>/dev/null |
     awk '$1 == "MaxArraySize" && (!least || $3 < least) {least = $3} END {print least}') || true

@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 from analysis.errors import fail
 from analysis.folders import DamageError, Run, logged, read_run, runs_of
+from analysis.words import counted
 from noisy_wrappers import MAY_DIFFER_IN_A_RUN, __version__, different_arguments, release
 from sweep.grid import PlannedRun
 from sweep.scripts import PROJECT, is_same, read, scripts_in, spelt
-from sweep.words import counted
 
 NOW = release({"versions": {"noisy_wrappers": __version__}})
 NOT_COMPARED = MAY_DIFFER_IN_A_RUN | {"noise", "noise_rate"}  # the name of a folder tells these

@@ -24,6 +24,7 @@ GIVEN_BY_THE_GRID = {  # options of the scripts, and those of the sweep that set
 }
 OF_ANY_CHOICE = {"--algos", "--envs", "--runs-dir"}  # what a status needs to find a choice
 MOST_SEEDS = 100_000  # of one option
+LISTS = ["--algos", "--envs", "--noises", "--noise-rates", "--seeds", "--baseline-seeds"]
 
 
 def parse_args(view, caller, argv):
@@ -61,6 +62,9 @@ def parse_args(view, caller, argv):
     given = {word.partition("=")[0] for word in words if word.startswith("--")}
     for name in sorted(given.difference(known)):
         fail(unknown_option(name, known))
+    for name in LISTS:
+        if sum(word.partition("=")[0] == name for word in words) > 1:
+            fail(f"{name} is there twice: put all its values after one of them")
     parser.set_defaults(**{"pairs": []} | PRESETS.get(preset, {}))
     args = parser.parse_args(words)
     if view == "status" and preset == "choose" and given <= OF_ANY_CHOICE and not extra:
@@ -132,6 +136,9 @@ def check(args, words):
 
 def check_words(args, words):
     """Read the words after the "--"; exit about those that belong to the grid, or to no script."""
+    for word in words:
+        if re.search(r"[\t\n]", word):
+            fail(f"{word!r}: a command is one line, so its words have no tabs and ends of lines")
     for flag in (word.partition("=")[0].replace("_", "-") for word in words):
         if flag in GIVEN_BY_THE_GRID:
             fail(f"{flag} is part of the grid: use {GIVEN_BY_THE_GRID[flag]}, before the --")
@@ -190,11 +197,9 @@ def unknown_option(name, known):
         return f"{name} is an option of the scripts: put it at the end, after --"
     if name in EXECUTOR_OPTIONS:  # benchmark.sh reads it, unless it is written with a value
         return f"{name} takes no value"
-    near = difflib.get_close_matches(name, [*known, *EXECUTOR_OPTIONS, *of_scripts], n=1)
-    if not near:
-        return f"unknown option {name}; ./benchmark.sh --help lists them"
-    after = ", an option of the scripts, at the end after --" if near[0] in of_scripts else ""
-    return f"unknown option {name}; did you mean {near[0]}{after}?"
+    near = difflib.get_close_matches(name, [*known, *EXECUTOR_OPTIONS], n=1)
+    hint = f"did you mean {near[0]}?" if near else "./benchmark.sh --help lists them"
+    return f"unknown option {name}; {hint}"
 
 
 def from_project(caller, text):

@@ -8,10 +8,11 @@ from pathlib import Path
 from analysis.choice import CHOICE_COLUMNS, choice_file
 from analysis.errors import fail, in_words
 from analysis.folders import SUCCESS, rewritten
-from analysis.formatting import counted, p_value, rounded, two_digits
+from analysis.formatting import p_value, rounded, two_digits
 from analysis.power import detectable_shift
 from analysis.statistics import LEVEL
 from analysis.verdicts import POINTS, difference_in_words, excluded, smallest
+from analysis.words import counted
 from noisy_wrappers import BASELINE
 from sweep import halving
 from sweep.environment import time_left
@@ -56,9 +57,9 @@ def total(found, args):
     confirm = sum(2 * choice.plan.looks[-1] for choice in found)
     finished = sum(len(choice.returns) for choice in found)
     most = any(len(choice.plan.looks) > 1 for choice in found)
-    text = f"at most {search + confirm} runs" if most else f"{search + confirm} runs in all"
-    text += f", {search} to search and {'up to ' * most}{confirm} to confirm; "
-    text += f"{finished} {'is' if finished == 1 else 'are'} done"
+    runs = counted(search + confirm, "run")
+    text = f"at most {runs}" if most else f"{runs} in all"
+    text += f", {search:,} to search and {'up to ' * most}{confirm:,} to confirm; {finished:,} done"
     if any(choice.run_seconds is None for choice in found):
         return text
     left = []  # of each choice, the batches that are left: the seconds of their runs

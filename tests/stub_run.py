@@ -5,7 +5,7 @@
 It makes 100,000 steps a second, and a checkpoint after each tenth of them and when SIGTERM or
 SIGINT stops it; started again, it goes on from there. STUB_FAILS is a pattern of folders whose runs
 fail, STUB_LEAVES what a process runs that a run leaves behind, STUB_HIDES the seconds until a
-result is seen. Where the folder of the runs has a file "refuse", SAC refuses its arguments.
+result is seen. A file "refuse" in the folder of the runs has a pattern of runs that are refused.
 """
 
 import argparse
@@ -105,7 +105,8 @@ def train(argv):
     folder.mkdir(parents=True, exist_ok=True)
     lock = open(folder / ".lock", "w")  # noqa: SIM115
     fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # as the scripts do
-    if algorithm == "sac" and Path(args.runs_dir, "refuse").exists():
+    refuse = Path(args.runs_dir, "refuse")
+    if refuse.exists() and fnmatch.fnmatch(folder.name, refuse.read_text()):
         print("error: --gamma must be at most 1, not 2", file=sys.stderr)
         sys.exit(2)
     config = {"algorithm": algorithm.upper(), "versions": {"noisy_wrappers": __version__}}

@@ -25,6 +25,7 @@ from sweep.grid import MOST_BASELINES
 ALGORITHMS = {"sac": 5, "td3": 5, "ppo": 10}  # seeds
 SCALE = "RandomUniformScaleReward(0.5, 1.5)"
 A = "RandomNormalNoisyReward(1)"
+MAKEFILE = ROOT / "Makefile"
 C = "choose --algos ppo --envs Hopper-v5"
 GRID = ["--algos", "sac", "--envs", "Pendulum-v1", "--seeds", "1"]
 
@@ -34,7 +35,7 @@ def dry_run(*args):
     """Return the grid's lines, each with its text and its options."""
     result = view("list", *args)
     assert result.code == 0, result.err
-    lines = [line.split("\t")[1] for line in result.out.splitlines()]
+    lines = [line.split("\t") for line in result.out.splitlines()]
     assert result.err.startswith(f"{len(lines):,} run")
     parser = argparse.ArgumentParser()
     parser.add_argument("python", choices=[sys.executable])
@@ -45,9 +46,10 @@ def dry_run(*args):
         parser.add_argument(option, required=True, type=int)
     parser.add_argument("--noise", nargs="+", default=[])
     parser.add_argument("--noise-rate", nargs="+", default=[])
-    parser.add_argument("--no-compile", action="store_true")  # the demo's
-    parser.add_argument("--learning-rate")
-    return [parser.parse_args(shlex.split(line), argparse.Namespace(text=line)) for line in lines]
+    return [
+        parser.parse_known_args(shlex.split(text), argparse.Namespace(text=text, folder=folder))[0]
+        for folder, text in lines
+    ]
 
 
 # THE RUNS
@@ -56,7 +58,7 @@ def dry_run(*args):
 def test_paper_grid():
     lines = dry_run("paper")
     assert len(lines) == len({line.text for line in lines}) == 9100
-    assert len(set(folders("paper"))) == 9100
+    assert len({line.folder for line in lines}) == 9100
     tables = (ROOT / "results" / "paper").glob("*.csv")
     rows = [row for path in tables for row in csv.DictReader(path.open())]
     noises = {row["noise_as_run"] for row in rows if "noise_as_run" in row}
@@ -84,10 +86,9 @@ def test_paper_grid():
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_scripts_accept_every_line(algorithm):
     script = import_module(f"{algorithm}_continuous_noisy")
-    lines = [x for x in dry_run("paper") if x.seed == 1 and x.script.startswith(algorithm)]
-    some = lines[::4]  # 91 configurations in five environments: each configuration once or twice
-    assert {(*x.noise, *x.noise_rate) for x in some} == {(*x.noise, *x.noise_rate) for x in lines}
-    for line in some:
+    lines = dry_run("paper", "--algos", algorithm, "--seeds", "1")
+    assert len(lines) == 455
+    for line in lines[::13]:  # all noises, all rates, all environments
         args = tyro.cli(script.Args, args=shlex.split(line.text)[2:])
         assert list(args.noise) == line.noise
         assert [args.env_id, args.seed] == [line.env_id, 1]
@@ -110,19 +111,22 @@ def test_other_presets():
             scale = name == "RandomUniformScaleReward"
             assert float(low) == pytest.approx(2 - float(high) if scale else -float(high))
             assert line.noise_rate == (["0.05"] if scale else ["1.0"])
-    assert {(x.script[:3], x.env_id, x.runs_dir) for x in dry_run("demo")} == {
-        ("ppo", "InvertedPendulum-v5", "runs/demo")
-    }
-    chosen = view("dry-run", *C.split())
-    assert all(line.endswith("--runs-dir runs/choose/search") for line in chosen.out.splitlines())
+    demo = {(x.script[:3], x.env_id, x.runs_dir, x.total_timesteps) for x in dry_run("demo")}
+    assert demo == {("ppo", "InvertedPendulum-v5", "runs/demo", 20_480)}
+    [noise] = {x.noise[0] for x in dry_run("demo") if x.noise}
+    slug = "RandomNormalNoisyObservation_1.0"
+    picture = f"runs/demo/results/curves_PPO_{slug}.svg"
+    assert noise == "RandomNormalNoisyObservation(1.0)" and picture in MAKEFILE.read_text()
     assert view("status", *C.split()).out.startswith("runs/choose: ")
-    assert [(x.seed, x.noise, x.total_timesteps) for x in dry_run("demo")] == [
-        (seed, noise, 20_480)
-        for seed in range(1, 6)
-        for noise in ([], ["RandomNormalNoisyObservation(1.0)"])
-    ]
-    picture = "runs/demo/results/curves_PPO_RandomNormalNoisyObservation_1.0.svg"
-    assert picture in (ROOT / "Makefile").read_text()
+
+
+def test_folders_that_need_care(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    home = view("list", "demo", "--runs-dir=~/my runs").out
+    assert f"--runs-dir '{tmp_path}/my runs'" in home
+    assert view("list", "demo", "--runs-dir", ".").out.startswith("./baseline_s1__")
+    inside = view("list", "demo", caller=ROOT / "docs").out
+    assert " --runs-dir docs/runs/demo " in inside
 
 
 def test_a_report_quotes_the_folder(tmp_path):
@@ -130,6 +134,9 @@ def test_a_report_quotes_the_folder(tmp_path):
     [folder] = folders(*grid)
     finish(folder, env_id="Pendulum-v1")
     assert f"analyze.py --runs-dir '{tmp_path}/a b'\n" in view("report", *grid).out
+    (folder / "result.json").write_text("{")  # which is no fault of the disk
+    result = view("report", *grid)
+    assert result.code == 1 and "damaged" in result.out and not result.err
 
 
 def test_a_folder_that_no_file_system_can_hold_ends_in_a_line(tmp_path):
@@ -213,8 +220,8 @@ def test_status_arithmetic(tmp_path):
     assert result.code == 0
     # 800 + 800 + 400 + 500 + 500 + 1000 steps are left. At 200, 100, 10, 100, 100, 100 and 100
     # steps per second the mean time of a step is 0.155 / 7 seconds; two run at a time: 44.29 s.
-    state = "7 runs: 1 done, 1 running, 1 probably running, 1 failed, 3 to do; about 0:00:44 left, "
-    state += "110 steps/s"
+    state = "7 runs: 1 done, 1 running, 1 probably running, 1 failed, 3 to do; "
+    state += "3,000 of 7,000 steps; about 44 s left, 110 steps/s"
     assert state in result.out
     assert re.search(rf"exit 1 +{log_of(failed)} +ValueError: broken\n", result.out)
 
@@ -223,15 +230,6 @@ def test_an_at_in_a_noises_argument_is_no_rate():
     keyed = "my_noises:Keyed(1, keys='a@b')"
     assert options.entry(keyed) == [(keyed, None)]
     assert options.entry(f"{keyed}@0.5+{A}@1:0") == [(keyed, 0.5), (A, "1:0")]
-
-
-def test_a_report_of_runs_without_logs_does_not_blame_the_disk(tmp_path):
-    grid = ["baseline", *GRID, "--total-timesteps", "1000", "--runs-dir", tmp_path]
-    [folder] = folders(*grid)
-    finish(folder)
-    (folder / "result.json").write_text("{")
-    result = view("report", *grid)
-    assert result.code == 1 and "damaged" in result.out and not result.err
 
 
 @pytest.fixture
@@ -248,7 +246,6 @@ def one(tmp_path):
         ({"steps": 20}, "", "--total-timesteps 20, not 1000"),
         ({"env_id": "Pendulum/v1"}, "", "--env-id Pendulum/v1, not Pendulum-v1"),  # one folder
         ({"gamma": 0.99}, "--gamma 0.5", "--gamma 0.99, not 0.5"),
-        ({"autotune": True, "gamma": 0.99}, "--no-autotune", "--autotune True, not False"),
         ({"learning_starts": 10}, "", "--learning-starts 10, not 5000"),  # an option of today's
         ({}, "--tau 0.1", "--tau 0.005, not 0.1"),  # an option that the run did not have
         ({"noise_rates": [0.5]}, "--gamma 0.9", "--gamma 0.99, not 0.9"),
@@ -369,7 +366,7 @@ def test_an_algorithm_is_a_script_of_the_project_or_of_the_callers_folder(elsewh
     start = f"env PYTHONPATH={ROOT} {sys.executable} {elsewhere}/redq_continuous_noisy.py --env-id "
     assert len(own) == 2 and all(command.startswith(start) for command in own)
     assert all("PYTHONPATH" not in command for _, command in lines if command not in own)
-    unknown = view("list", *grid, "--algos", "dqn", caller=elsewhere)
+    unknown = view("list", "custom", "--algos", "dqn", *grid[4:], caller=elsewhere)
     assert (
         unknown.code == 2 and f"no dqn_continuous_noisy.py in {ROOT} or {elsewhere}" in unknown.err
     )
@@ -379,21 +376,17 @@ def test_an_algorithm_is_a_script_of_the_project_or_of_the_callers_folder(elsewh
     scripts.scripts_in.cache_clear()
     both = view("list", *grid, caller=elsewhere)
     assert both.code == 2 and "differ: give one of them another name" in both.err
-    (elsewhere / "bad_continuous_noisy.py").write_text("class Args(:")
-    assert (
-        "bad_continuous_noisy.py: " in view("list", *grid, "--algos", "bad", caller=elsewhere).err
-    )
+    bad = view("list", "custom", "--algos", "bad", *grid[4:], caller=elsewhere)
+    assert "bad_continuous_noisy.py: " in bad.err
 
 
 @pytest.mark.parametrize(
     ("words", "made"),
     [
         ("--label text-1 --hidden 32 32", {"label": "text-1", "hidden": [32, 32]}),
-        ("--hidden=8", {"hidden": [8]}),
         ("--entropy -1e-3 --shift=-2", {"entropy": -0.001, "shift": -2.0}),
         ("--data /a/b.txt --width 1e6", {"data": "/a/b.txt", "width": 1_000_000}),
         ("--width None --kind b", {"width": None, "kind": "b"}),
-        ("--layer-norm", {"layer_norm": True}),
         ("--layer_norm --no-layer_norm", {"layer_norm": False}),
     ],
 )
@@ -436,21 +429,15 @@ def test_the_noise_of_tests_is_part_of_a_runs_name(tmp_path):
     stored = {"test_noise": ["RandomNormalNoisyAction(0.1)"], "test_noise_rate": [0.5]}
     finish(folder, 9, env_id="Pendulum-v1", exp_name="sac_continuous_noisy", **stored)
     assert "1 run, 0 to do" in view("list", *grid).err
-    wrong = view("list", *grid[:-4], "--test-noise", "Nope(1)", "--test-noise-rate", "1")
-    assert wrong.code == 2 and "error: --test-noise: bad noise 'Nope(1)'" in wrong.err
 
 
 def test_names_of_options_are_checked_where_nothing_is_to_do(one):
     grid, folder = one
     finish(folder, env_id="Pendulum-v1")
-    assert "1 run, 0 to do" in view("list", *grid).err
-    for words, message in {
-        "--gama 0.99": "sac_continuous_noisy.py has no option --gama; did you mean --gamma?",
-        "0.99": "sac_continuous_noisy.py has no option 0.99; after -- comes the name of an option",
-        "--no-gamma": "sac_continuous_noisy.py has no option --no-gamma; did you mean --gamma?",
-    }.items():
+    for words in ("--gama 0.99", "0.99", "--no-gamma"):
         result = view("list", *grid, "--", *words.split())
-        assert (result.code, result.out, result.err) == (2, "", f"error: {message}\n")
+        assert (result.code, result.out) == (2, "")
+        assert f"sac_continuous_noisy.py has no option {words.split()[0]}; " in result.err
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -505,71 +492,47 @@ def test_baselines_that_pay(noises, more, baselines):
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        ("nope", "unknown preset 'nope'; choose one of demo, baseline, best"),
         ("custom --noises Foo(1) --noise-rates 1", "bad noise 'Foo(1)': unknown name; valid are"),
-        ("paper --noise-rates 1.5", "1.5"),
         (
             "custom --noises RandomNormalNoisyReward(1)",
             '--noises needs --noise-rates, or a rate with each noise, as in "NOISE@0.1"',
         ),
-        ("best --envs Ant-v5", "the paper has no best noise for sac on Ant-v5"),
         ("custom --noise-rates 1", "--noise-rates needs --noises that have no rate of their own"),
-        (
-            f"custom --noises {A}@1 --noise-rates 1",
-            "--noise-rates needs --noises that have no rate",
-        ),
         (f"custom --noises {A}@1+{A}", "give each of these noises a rate with @, or none"),
-        (f"custom --noises {A}@x", "a noise_rate must be a number in [0, 1], or"),
-        (f"custom --noises {A} --noise-rates 0.5:", "got '0.5:'"),
         ("paper --budget 5", "--budget is an option of choose"),
-        ("choose --algos ppo", "choose needs --algos and --envs"),
-        ("choose --envs Hopper-v5", "choose needs --algos and --envs"),
         (f"{C} --seeds 1-3", "leave out --seeds"),
         (
             f"{C} --noises paper --budget 89",
             "--budget must be at least 90, a run for each configuration, not 89",
         ),
         (f"{C} --budget 100000", "--budget 100000 is too large: the best would run with"),
-        (f"{C} --confirm 3", "--confirm must be at least 4, not 3: with fewer seeds no difference"),
-        (f"{C} --envs Hopper Pusher-v5 --confirm 4", "--confirm must be at least 5, not 4: "),
-        (f"{C} --noises {A} --noise-rates 0", "there is no noise to choose from"),
-        (f"{C} --noises {A} --noise-rates 1 --exclude {A}@1", "there is no noise to choose from"),
+        (f"{C} Pusher-v5 --confirm 4", "--confirm must be at least 5, not 4: "),
         (f"{C} --exclude {A}@0.3", "--exclude: RandomNormalNoisyReward(1.0) at 0.3 is not among"),
         (f"{C} --exclude {A}", '--exclude needs a rate with each noise, as in "NOISE@0.1"'),
-        ("demo --envs Nope-v5", "--envs: there is no environment 'Nope-v5': "),
         ("demo --envs nope:Env-v0", "--envs: there is no environment 'nope:Env-v0': No module"),
         (
             "demo --seeds 1 2-1",
             "--seeds: takes numbers and ranges, separated by spaces: 1 2 3 or 1-3",
         ),
-        ("demo --seeds 1,2,3", "separated by spaces: 1 2 3 or 1-3, not '1,2,3'"),
-        ("demo --seeds 1-", "not '1-'"),
+        ("demo --seeds 1-3 --seeds 7", "--seeds is there twice: put all its values after one of"),
+        ("demo -- --exp-name a\tb", "'a\\tb': a command is one line, so its words have no tabs"),
+        ("demo -- --exp-name a\nb", "'a\\nb': a command is one line, so its words have no tabs"),
         ("demo --seeds 1-99999999999", "'1-99999999999' is more than 100,000 seeds"),
-        (f"{C} --baseline-seeds 1", "leave out --baseline-seeds"),
         (f"{C} --looks 13", "--looks must be from 1 to half of --confirm, not 13"),
         ("best -- --exp-name mine", "--exp-name: several algorithms would write into the same"),
-        ("demo --total-timesteps 1.5", "'1.5' is not a whole number, such as 1000000 or 1e6"),
-        ("demo --total-timesteps inf", "'inf' is not a whole number"),
-        ("demo --seed 1", "unknown option --seed; did you mean --seeds?"),
         ("demo --env-id Hopper-v5", "unknown option --env-id; did you mean --envs?"),
-        ("demo --exectuor local", "unknown option --exectuor; did you mean --executor?"),
         ("demo --gamma 0.9", "--gamma is an option of the scripts: put it at the end, after --"),
-        ("demo --gama 0.9", "did you mean --gamma, an option of the scripts, at the end after --?"),
-        ("demo --xyzzy 1", "unknown option --xyzzy; ./benchmark.sh --help lists them"),
         ("demo --runs-dir=-x", "--runs-dir must be a path"),
-        ("demo --runs-dir=", "--runs-dir must name a folder"),
         ("--algos sac demo", "unknown preset '--algos'"),
         ("demo -- --overwrite", "--overwrite would start interrupted runs afresh"),
-        ("demo --algos", "--algos: expected at least one argument"),
         ("demo --dry-run=1", "--dry-run takes no value"),
         ("demo --total-timesteps 0", "--total-timesteps must be at least 1, not 0"),
-        ("demo -- --help", "ppo_continuous_noisy.py has no option --help"),
         ("demo -- --seed 2", "--seed is part of the grid: use --seeds, before the --"),
         ("best --algos sac ppo -- --tau 0.1", "ppo_continuous_noisy.py has no option --tau"),
     ],
 )
 def test_bad_input(args, message, tmp_path):
-    first, *words = args.split()
+    first, *words = args.split(" ")
     result = view("list", first, "--runs-dir", tmp_path / "runs", *words)
     assert result.code == 2, result.out + result.err
     lines = [line for line in result.err.splitlines() if not line.endswith(" ms a step")]
@@ -578,10 +541,10 @@ def test_bad_input(args, message, tmp_path):
     assert not result.out and not list(tmp_path.iterdir())
 
 
-def test_environments_whose_folders_would_be_the_same_are_refused(tmp_path):
+def test_environments_whose_folders_would_be_the_same_are_refused():
     for name in ("mine/Boat-v0", "mine-Boat-v0"):
         gym.register(name, "gymnasium.envs.classic_control:PendulumEnv")
-    result = view("list", "baseline", "--envs", "mine/Boat", "mine-Boat", "--runs-dir", tmp_path)
+    result = view("list", "baseline", "--envs", "mine/Boat", "mine-Boat")
     assert result.code == 2 and "two of these would have the same folders" in result.err
 
 
