@@ -28,13 +28,15 @@ import tyro
 from analysis.choice import read_choice
 from analysis.comparisons import as_chosen, compare_all
 from analysis.errors import fail, take_over_terminal
-from analysis.figures import figures, write_figure
+from analysis.figures import COLUMN_END, INTERVAL, figures, write_figure
 from analysis.folders import CONFIRMATION, RETURN, SUCCESS, is_phase, is_run
-from analysis.formatting import WHOLE_WORDS, text_table, write_table
+from analysis.formatting import WHOLE_WORDS, in_markdown, shown, text_table
+from analysis.latex import latex_table
 from analysis.report import Results, write_report
 from analysis.robustness import analyse_robustness, read_robustness
 from analysis.runs import KEYS, MORE_TO_COME, finished, in_short, left_out, read_runs
 from analysis.studies import make_studies, version_notes
+from analysis.style import COLUMN, PAGE
 from analysis.tables import (
     all_equal_notes,
     family_notes,
@@ -60,6 +62,12 @@ class Args:
     """where the tables, the figures and report.html go; by default RUNS_DIR/results"""
     latex: bool = False
     """also write the tables as Markdown and LaTeX, and the figures as pdf"""
+    figure_width: float = PAGE
+    """inches of a paper's text, for which figures and LaTeX tables are made; every figure is also
+    made for a column of 3.25 inches. In ICML 6.75, in NeurIPS 5.5, in ACM's sigconf 7"""
+    band: Literal["interval", "std"] = INTERVAL
+    """what is shaded around a mean curve: the 95 % interval of the mean (with fewer than five seeds
+    there is none, and each seed is drawn), or one standard deviation over seeds"""
     metric: Literal["return", "success_rate"] = RETURN
     """what the verdicts judge by: final test returns, or rates of success in percent"""
     smallest_gain: float | None = None
@@ -81,7 +89,7 @@ def verdicts_in_short(results):
     if not results.headlines:
         yield "There is no noise to compare with a baseline yet."
     for line in results.headlines:
-        counts = ", ".join(f"{count} {word}" for word, count in line["counts"])
+        counts = ", ".join(f"{count:,} {word}" for word, count in line["counts"])
         yield f"{line['name']}: {line['tried']}: {counts}. {line['luck']}".strip()
     yield from results.clear["sentence"]
     if len(results.clear) and len(results.others):
@@ -103,17 +111,28 @@ def overview_of(entries, studies):
     return overview
 
 
-def write_results(out, results, latex):
+def write_table(out, table, latex, inches):
+    """Write {name}.csv, with all digits; with `latex` also .md and .tex, as people read it."""
+    csv = out / f"{table.name}.csv"
+    table.frame.to_csv(csv, index=False, float_format="%.10g", lineterminator="\n")
+    if latex:
+        text = shown(table)
+        csv.with_suffix(".md").write_text(in_markdown(table, text), "utf-8")
+        csv.with_suffix(".tex").write_text(latex_table(table, text, inches), "utf-8")
+
+
+def write_results(out, results, args):
     """Write all tables, all figures and the report; note which others there are in `out`."""
     out.mkdir(parents=True, exist_ok=True)
     for table in results.tables.values():
-        write_table(out, table, latex)
-    drawn = figures(results.studies, results.tables)
+        write_table(out, table, args.latex, args.figure_width)
+    drawn = figures(results.studies, results.tables, args.band)
     for drawing in drawn:
-        write_figure(out, drawing, latex)
+        write_figure(out, drawing, args.latex, args.figure_width)
     write_report(out, results, drawn)
-    ends = [".csv", ".svg", *([".tex", ".pdf"] if latex else [])]
-    names = [*results.tables, *(drawing.name for drawing in drawn)]
+    ends = [".csv", ".svg", *([".tex", ".pdf"] if args.latex else [])]
+    names = [*results.tables]
+    names += [drawing.name + end for drawing in drawn for end in ("", COLUMN_END)]
     written = {name + end for name in names for end in ends}
     kinds = {".csv", ".svg", ".tex", ".pdf"}
     old = {path.name for path in out.iterdir() if path.suffix in kinds} - written
@@ -203,7 +222,7 @@ def analyse(args, entries, choice):
     ]
     clear, others = clear_first(pd.concat(said, ignore_index=True))
     number = missing.frame["status"].value_counts(sort=False)
-    counts = ", ".join(f"{n} {status}" for status, n in number.items())
+    counts = ", ".join(f"{n:,} {status}" for status, n in number.items())
     return Results(
         studies=studies,
         tables=tables,
@@ -213,7 +232,7 @@ def analyse(args, entries, choice):
         rates=sentences_on_rates(compared, unit, args.smallest_gain),
         robustness=robustness,
         overview=overview_of(entries, studies),
-        problems=f"Runs left out: {number.sum()} ({counts})." if len(number) else "",
+        problems=f"Runs left out: {number.sum():,} ({counts})." if len(number) else "",
         notes=[
             *incomplete_note(number),
             *all_equal_notes(studies),
@@ -247,7 +266,7 @@ def incomplete_note(number):
     """Yield a note where a sweep is not complete; number: of the runs left out, by status."""
     due = {status: n for status, n in number.items() if status in MORE_TO_COME}
     if due:
-        counts = ", ".join(f"{n} {status}" for status, n in due.items())
+        counts = ", ".join(f"{n:,} {status}" for status, n in due.items())
         yield (
             f"this sweep is not complete ({counts}): more runs are due, and a verdict now is an "
             "extra look at the data, which makes false claims more frequent than 5 %"
@@ -266,6 +285,8 @@ def main(args):
     args = replace(args, metric=args.metric.replace("_", " "))
     if args.smallest_gain is not None and not args.smallest_gain > 0:
         fail(f"--smallest-gain must be above 0, not {args.smallest_gain}")
+    if not COLUMN <= args.figure_width <= 20:
+        fail(f"--figure-width must be between {COLUMN} and 20 inches, not {args.figure_width}")
     if not args.runs_dir.is_dir():
         fail(f"no folder {args.runs_dir}")
     if is_phase(args.runs_dir.resolve()):  # alone it would be corrected for too few comparisons
@@ -281,7 +302,7 @@ def main(args):
     entries = read_runs(args.runs_dir)
     results = analyse(args, entries, choice)
     try:
-        write_results(out, results, args.latex)
+        write_results(out, results, args)
     except OSError as error:
         fail(f"--out: {error}")
     print_results(out, results)
@@ -290,6 +311,4 @@ def main(args):
 
 if __name__ == "__main__":
     take_over_terminal()
-    if any(word.partition("=")[0] == "--compare" for word in sys.argv):
-        fail("--compare has moved: python -m results.study.paper RUNS_DIR OUT")
     sys.exit(main(tyro.cli(Args, description=__doc__)))

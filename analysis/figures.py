@@ -1,26 +1,34 @@
 """The figures of analyze.py."""
 
-import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from itertools import groupby, product
+from itertools import groupby
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
+from matplotlib.lines import Line2D
+from scipy import special
 
 from analysis import style
 from analysis.effects import effects_caption, effects_figure, heatmap
 from analysis.folders import RETURN, SUCCESS
-from analysis.formatting import percent, rounded, seeds_of, slug
+from analysis.formatting import percent, rounded, seeds_between, seeds_of, slug
 from analysis.runs import KEYS, STUDY, rows_of, study_name
+from analysis.statistics import SEEDS_FOR_INTERVAL
 from noisy_wrappers import BASELINE, rate_order
 
-ONE_STD = "\u00b1 one standard deviation"
-RETURN_LABELS = {RETURN: "test return\n(sum of rewards per episode)"}
-RETURN_LABELS[SUCCESS] = "test success rate (%)"
+COLUMN_END = "_column"  # of the name of a figure that is as wide as a column
+INTERVAL, STD = "interval", "std"  # what a band shows
+BANDS = {
+    INTERVAL: "the 95 % interval of the mean, with fewer than five seeds each seed",
+    STD: "\u00b1 one standard deviation over seeds",
+}
+LABELS = {RETURN: "test return", SUCCESS: "test success rate (%)"}
+PLACE = {"least": 1.28, "left": style.LINE + 0.05}  # of panels, in inches
+BESIDE = 0.4  # for their tick labels
+DUE = "training steps when tests were due"
 
 
 @dataclass
@@ -30,7 +38,7 @@ class Drawing:
     kind: str  # effects, best_curves, curves, parameters or robustness
     label: str  # what sets it apart from others of its kind
     caption: str
-    draw: Callable[[], Figure]
+    draw: Callable[..., Figure]  # of its width in inches, by default that of a page
 
     @property
     def name(self):
@@ -38,16 +46,18 @@ class Drawing:
         return f"{self.kind}_{slug(self.label)}"
 
 
-def figures(studies, tables):
+def figures(studies, tables, band=INTERVAL):
     """Return a Drawing for every figure, in the order of the report; each has another name."""
     drawings, used = [], set()
     for study in studies:
-        drawings += comparison_figures(study, tables["statistics"].frame, tables["best"].frame)
+        best = tables["best"].frame
+        drawings += comparison_figures(study, tables["statistics"].frame, best, band)
         for noise in study.noises or [""]:
             title = f"{study.name}, {noise or 'no noise'}"
-            caption = f"{title}: learning curves, mean over n seeds, shaded {ONE_STD}."
-            drawings.append(Drawing("curves", title, caption, partial(curves_figure, study, noise)))
-        drawings += ablation_figures(study, tables[f"summary_{slug(study.algorithm)}"].frame)
+            caption = f"{title}: learning curves, mean over n seeds; shaded: {BANDS[band]}."
+            draw = partial(curves_figure, study, noise, band)
+            drawings.append(Drawing("curves", title, caption, draw))
+        drawings += parameter_figures(study, band)
     if "robustness" in tables:
         drawings += robustness_figures(tables["robustness"].frame, studies[0].metric)
     for drawing in drawings:
@@ -57,178 +67,200 @@ def figures(studies, tables):
     return drawings
 
 
-def comparison_figures(study, statistics, best):
+def comparison_figures(study, statistics, best, band):
     """Yield the Drawing of a study's effects, and that of the curves of its best noises."""
     has_comparison = statistics["difference"].notna()
     compared = statistics[rows_of(statistics, study.key) & has_comparison]
     if len(compared):
-        draw = partial(effects_figure, compared, study.metric)
+        draw = partial(effects_figure, study, compared)
         yield Drawing("effects", study.name, effects_caption(study, compared), draw)
     if len(compared) and len(study.finals) > 2:
         caption = (
-            f"{study.name}: test {study.metric} without noise (black) and with the best noise of "
-            f"each environment, mean over n seeds, shaded {ONE_STD}. "
+            f"{study.name}: test {study.metric} without noise and with the best noise of each "
+            f"environment, mean over n seeds; shaded: {BANDS[band]}. "
             "The best of many looks better than it is."
         )
-        draw = partial(best_curves_figure, study, best[KEYS].merge(compared))
+        draw = partial(best_curves_figure, study, best[KEYS].merge(compared), band)
         yield Drawing("best_curves", study.name, caption, draw)
 
 
-def span(numbers):
-    """Write the numbers of seeds or environments behind a line or a panel: "5", or "3 to 5"."""
-    low, high = min(numbers, default=0), max(numbers, default=0)
-    return f"{low:.0f}" if low == high else f"{low:.0f} to {high:.0f}"
+def seeds_in(study, configs, e):
+    """Write the numbers of seeds in a panel; see seeds_between."""
+    noisy = [n for config in configs if config != BASELINE and (n := len(study.sample(config, e)))]
+    baseline = len(study.sample(BASELINE, e)) if BASELINE in configs else 0
+    noisy = noisy or [baseline]
+    return seeds_between(noisy, baseline or max(noisy))
 
 
-def panels(environments, labels, metric, below):
-    """Make one panel per environment, three in a row, above a legend with as many labels.
+def panels(study, titles, width, below, legend, **more):
+    """Make a panel for each title (lists of lines), above a legend of this height."""
+    alone = len(titles) == 1 or width <= style.COLUMN
+    heights = [min(2.4, 0.55 * width) if alone else 1.15] * len(titles)
+    more |= PLACE | {"beside": BESIDE, "below": below, "legend": legend}
+    fig, axes = style.panels(titles, width, heights, **more)
+    middle = np.mean([ax.get_position().intervaly.mean() for ax in axes])
+    fig.text(0.03 / width, middle, LABELS[study.metric], rotation=90, va="center", ha="left")
+    return fig, axes
 
-    below: the label of all x axes.
+
+def curve_panels(study, titles, width, legend):
+    """Make panels for learning curves; return their steps, too."""
+    unit, word = (1e6, "millions") if study.steps[-1] >= 1e6 else (1e3, "thousands")
+    fig, axes = panels(study, titles, width, f"{DUE} ({word})", legend)
+    for ax in axes:
+        ax.set_xlim(0, study.steps[-1] / unit)
+        style.set_ticks(ax, "x", 5)
+    return fig, axes, study.steps / unit
+
+
+def spread(runs, band):
+    """Return half of the band around the mean of runs (..., seeds), or None for each seed.
+
+    The interval is Student's, from five seeds on, as for differences.
     """
-    across = min(3, len(environments))
-    width = style.WIDTHS[across - 1]
-    down = -(-len(environments) // across)
-    columns = max(1, min(4, int(13 * width / max(map(len, labels)))))
-    legend = 0.2 + 0.2 * -(-len(labels) // columns)
-    height = max(style.HEIGHT, 2.4 * down + legend)
-    fig = Figure(figsize=(width, height))
-    # Placed by hand: matplotlib's automatic layouts take as long as the drawing itself.
-    bottom, top = (legend + 0.45) / height, 1 - 0.3 / height
-    fig.subplots_adjust(1.1 / width, bottom, 1 - 0.3 / width, top, wspace=0.25, hspace=0.45)
-    axes = [fig.add_subplot(down, across, i + 1) for i in range(len(environments))]
-    for ax, env in zip(axes, environments, strict=True):
-        style.set_title(ax, env, width / across)
-        ax.set(xlabel=below)
-        ax.yaxis.get_major_locator().set_params(nbins=5)
-        if ax.get_subplotspec().is_first_col():
-            ax.set_ylabel(RETURN_LABELS[metric])
-
-    def add_legend():
-        handles = axes[0].get_legend_handles_labels()[0]
-        fig.legend(handles, labels, loc="lower center", ncols=columns, frameon=False)
-
-    return fig, axes, add_legend
+    n = np.isfinite(runs).sum(axis=-1)
+    if np.max(n) < (SEEDS_FOR_INTERVAL if band == INTERVAL else 2):
+        return None
+    std = pd.DataFrame(np.atleast_2d(runs)).std(axis=1).to_numpy()
+    if band == STD:
+        return np.nan_to_num(std)
+    return np.nan_to_num(special.stdtrit(np.maximum(1, n - 1), 0.975) * std / np.sqrt(n))
 
 
-def best_curves_figure(study, best):
-    """Draw no noise against the best noise of each environment: means and standard deviations.
+def curve(ax, x, runs, band, **look):
+    """Draw the mean of runs (steps x seeds) with its band, or with thin lines of the seeds."""
+    runs = runs[:, np.isfinite(runs).any(axis=0)]
+    mean, half = pd.DataFrame(runs).mean(axis=1).to_numpy(), spread(runs, band)
+    ax.plot(x, mean, zorder=3, **look)
+    if half is not None:
+        ax.fill_between(x, mean - half, mean + half, alpha=0.2, linewidth=0, **look)
+    elif runs.shape[1] > 1:
+        ax.plot(x, runs, linewidth=0.4, alpha=0.7, **look)
+
+
+def best_curves_figure(study, best, band, width=None):
+    """Draw no noise against the best noise of each environment.
 
     best: the rows of statistics of these noises.
     """
-    labels = ["no noise", "best noise, in the colour of its verdict"]
-    steps, below = training_steps(study)
-    fig, axes, _ = panels(list(best["environment"]), labels, study.metric, below)
-    # Three lines of title above each panel
-    fig.subplots_adjust(top=1 - 0.6 / fig.get_figheight(), hspace=0.75)
+    width = width or style.PAGE
     configs = {(config.noise, config.noise_rate): config for config in study.finals}
-    for ax, row in zip(axes, best.itertuples(), strict=True):
-        e = study.environments.index(row.environment)
-        color = style.COLORS.get(row.verdict, style.UNCLEAR)
-        pairs = (BASELINE, "black"), (configs[row.noise, row.noise_rate], color)
-        for config, look in pairs:
-            curve(ax, steps, study.curves[config][:, :, e], 0.12, color=look, linewidth=1.6)
-        noise = row.noise if len(row.noise) < 50 else f"{row.noise[:47]}..."
+    chosen = [configs[row.noise, row.noise_rate] for row in best.itertuples()]
+    shown = dict.fromkeys(chosen)
+    colors = {BASELINE: "black"} | dict(zip(shown, style.hues(len(shown)), strict=True))
+    labels = {config: rate_named(config.noise, config.noise_rate, width) for config in colors}
+    titles = []
+    for row in best.itertuples():
         verdict = row.verdict if isinstance(row.verdict, str) else "not judged"
-        lines = f"{noise}, {row.noise_rate}\n{verdict} (n = {seeds_of(row.n, row.n_baseline)})"
-        style.set_title(ax, row.environment, style.WIDTH / 3, f"\n{lines}")
-    handles = [axes[0].lines[0], Rectangle((0, 0), 1, 1, color=style.UNCLEAR)]
-    fig.legend(handles, labels, loc="lower center", ncols=2, frameon=False)
+        seeds = seeds_of(row.n, row.n_baseline)
+        titles.append([style.short(row.environment), verdict, f"n = {seeds}"])
+    height = style.legend_columns(list(labels.values()), width)[1]
+    fig, axes, steps = curve_panels(study, titles, width, height)
+    for ax, row, config in zip(axes, best.itertuples(), chosen, strict=True):
+        e = study.environments.index(row.environment)
+        for one in (BASELINE, config):
+            curve(ax, steps, study.curves[one][..., e], band, color=colors[one])
+        style.set_ticks(ax, "y", 4)
+    handles = [Line2D([], [], color=color) for color in colors.values()]
+    style.add_legend(fig, handles, list(labels.values()))
     return fig
 
 
-def training_steps(study):
-    """Return the steps of the tests in thousands or millions, and the label of their axis."""
-    unit, word = (1e6, "millions") if study.steps[-1] >= 1e6 else (1e3, "thousands")
-    return study.steps / unit, f"training steps ({word})"
+def rate_named(noise, rate, width):
+    """Return a configuration as a label of a legend."""
+    return style.fitted(f"{noise} at rate {rate}", width - 0.6) if noise else "no noise"
 
 
-def curve(ax, x, runs, alpha=0.07, **look):
-    """Draw the mean of runs (steps x seeds), and shade one sample standard deviation around it."""
-    runs = pd.DataFrame(runs)
-    mean, std = runs.mean(axis=1), runs.std(axis=1).fillna(0)
-    ax.plot(x, mean, **look)
-    ax.fill_between(x, mean - std, mean + std, color=look["color"], alpha=alpha, linewidth=0)
-
-
-def curves_figure(study, noise):
-    """Draw learning curves: mean over seeds, one line per noise rate, shaded standard deviation.
+def curves_figure(study, noise, band=INTERVAL, width=None):
+    """Draw learning curves: one line per noise rate, and one without noise.
 
     There is a panel for each environment in which this noise was tried.
     """
+    width = width or style.PAGE
     configs = [config for config in study.finals if config.noise in ("", noise)]
-    noisy = [config.noise == noise for config in configs]
-    counts = np.stack([np.isfinite(study.finals[config]).sum(axis=0) for config in configs])
-    tried = np.flatnonzero(counts[noisy].any(axis=0))
-    labels = {}  # by the number of the configuration
-    for i, n in enumerate(counts[:, tried]):
-        name = "no noise" if configs[i] == BASELINE else f"rate {configs[i].noise_rate}"
-        if n.any():  # a search has no baseline
-            labels[i] = f"{name} (n = {span(n[n > 0])})"  # in the panels that have the line
-    environments = [study.environments[e] for e in tried]
-    steps, below = training_steps(study)
-    texts = list(labels.values())
-    fig, axes, add_legend = panels(environments, texts, study.metric, below)
-    every = max(1, len(steps) // 8)
-    for (e, ax), (i, label) in product(zip(tried, axes, strict=True), labels.items()):
-        look = style.line_style(i, len(configs)) | {"linewidth": 1.1 if i else 1.8}
-        look |= {"markevery": (min(i, every - 1), every), "markersize": 4.5, "label": label}
-        curve(ax, steps, study.curves[configs[i]][:, :, e], **look)
-    add_legend()
+    places = range(len(study.environments))
+    seeds = {config: [len(study.sample(config, e)) for e in places] for config in configs}
+    tried = [e for e in places if any(seeds[c][e] for c in configs if c.noise == noise)]
+    configs = [c for c in configs if any(seeds[c][e] for e in tried)]  # a search has no baseline
+    noisy = [config for config in configs if config != BASELINE]
+    colors = dict(zip(noisy, style.hues(len(noisy)), strict=True)) | {BASELINE: "black"}
+    labels = ["no noise" if c == BASELINE else f"rate {c.noise_rate}" for c in configs]
+    titles = [[style.short(study.environments[e]), seeds_in(study, configs, e)] for e in tried]
+    title = style.fitted(noise, width - 0.3)
+    height = style.legend_columns(labels, width, title)[1]
+    fig, axes, steps = curve_panels(study, titles, width, height)
+    for ax, e in zip(axes, tried, strict=True):
+        for config in configs:
+            if seeds[config][e]:
+                curve(ax, steps, study.curves[config][..., e], band, color=colors[config])
+        style.set_ticks(ax, "y", 4)
+    handles = [Line2D([], [], color=colors[config]) for config in configs]
+    style.add_legend(fig, handles, labels, title)
     return fig
 
 
-def ablation_figures(study, summary):
+def parameter_figures(study, band):
     """Yield a Drawing for every wrapper that a study has with several parameters."""
-    summary = summary[rows_of(summary, study.key)]
-    has_baseline = (summary["noise"] == "").any()  # a search has none
-    dotted = "; dotted: no noise" if has_baseline else ""
+    dotted = "" if not np.isfinite(study.finals[BASELINE]).any() else "; dotted: no noise"
     single = [config for config in study.finals if len(config.noises) == 1]  # sorted by noise
     for wrapper, configs in groupby(single, lambda config: config.wrappers[0]):
-        noises = sorted({config.noise for config in configs})
-        if len(noises) > 1:
+        configs = list(configs)
+        if len({config.noise for config in configs}) > 1:
             caption = (
-                f"{study.name}, {wrapper}: final test {study.metric} by parameters and noise rate. "
-                f"Bars: mean over n seeds, whiskers {ONE_STD}{dotted}."
+                f"{study.name}, {wrapper}: final test {study.metric} by parameters and noise rate, "
+                f"mean over n seeds; lines: {BANDS[band]}{dotted}."
             )
-            draw = partial(ablation_figure, study, summary, noises, has_baseline)
+            draw = partial(parameters_figure, study, configs, band)
             yield Drawing("parameters", f"{study.name} {wrapper}", caption, draw)
 
 
-def ablation_figure(study, summary, noises, has_baseline):
-    """Draw bars of the final return: a wrapper's parameters side by side, grouped by noise rate."""
-    labels = {}
-    for noise in ["", *noises] if has_baseline else noises:
-        n = summary.loc[summary["noise"] == noise, "n"]
-        labels[noise] = f"{noise or 'no noise'} (n = {span(n)})"
-    noisy = summary[summary["noise"].isin(noises)]
-    rates = sorted(set(noisy["noise_rate"]), key=rate_order)
-    environments = list(noisy["environment"].unique())
-    finals = summary.set_index(["environment", "noise", "noise_rate"])[["mean", "std"]]
-    texts = list(labels.values())
-    fig, axes, add_legend = panels(environments, texts, study.metric, "noise rate")
-    width = 0.8 / len(noises)
-    for ax, env in zip(axes, environments, strict=True):
-        if has_baseline:
-            baseline = finals.reindex([(env, BASELINE.noise, BASELINE.noise_rate)])
-            bars(ax, [-1], baseline, 0.6, color="white")
-            ax.axhline(baseline["mean"].iloc[0], color="black", linewidth=0.6, linestyle=":")
-        ax.axhline(0, color="black", linewidth=0.6)
-        for i, noise in enumerate(noises):
-            rows = finals.reindex([(env, noise, rate) for rate in rates])
-            place = np.arange(len(rates)) + width * (i - (len(noises) - 1) / 2)
-            color = style.line_style(i + 1, 1 + len(noises))["color"]
-            bars(ax, place, rows, width, color=color)
-        marks = ({-1: "none"} if has_baseline else {}) | dict(enumerate(rates))
-        ax.set_xticks(list(marks), marks.values())
-    add_legend()
+def parameters_figure(study, configs, band=INTERVAL, width=None):
+    """Draw points of the final return: a wrapper's parameters side by side, by noise rate."""
+    width = width or style.PAGE
+    noises = list(dict.fromkeys(config.noise for config in configs))
+    rates = sorted({config.noise_rate for config in configs}, key=rate_order)
+    colors = dict(zip(noises, style.hues(len(noises)), strict=True))
+    beside = dict(
+        zip(noises, 0.7 * ((np.arange(len(noises)) + 0.5) / len(noises) - 0.5), strict=True)
+    )
+    places = range(len(study.environments))
+    tried = [e for e in places if any(len(study.sample(config, e)) for config in configs)]
+    if any(len(study.sample(BASELINE, e)) for e in tried):
+        configs = [BASELINE, *configs]
+        rates = [BASELINE.noise_rate, *rates]
+        colors, beside = {"": "black"} | colors, {"": 0} | beside
+    ticks = ["none" if rate == BASELINE.noise_rate else rate for rate in rates]
+    labels = [style.fitted(noise, width - 0.6) or "no noise" for noise in colors]
+    titles = [[style.short(study.environments[e]), seeds_in(study, configs, e)] for e in tried]
+    height = style.legend_columns(labels, width)[1]
+    room = style.row_of(len(titles), width, **PLACE)[1] - BESIDE
+    longest = max(map(style.inches_of, ticks))
+    turned = {"rotation": 90} if (longest + 0.05) * len(ticks) > room else {}
+    more = {"ticks": longest + 0.12} if turned else {}
+    fig, axes = panels(study, titles, width, "noise rate", height, **more)
+    for ax, e in zip(axes, tried, strict=True):
+        for config in configs:
+            x = rates.index(config.noise_rate) + beside[config.noise]
+            point(ax, x, study.sample(config, e), band, colors[config.noise])
+        if BASELINE in configs and len(baseline := study.sample(BASELINE, e)):
+            ax.axhline(baseline.mean(), color="black", linewidth=0.6, linestyle=":")
+        ax.set_xticks(range(len(ticks)), ticks, **turned)
+        ax.set_xlim(-0.5, len(ticks) - 0.5)
+        style.set_ticks(ax, "y", 4)
+    handles = [Line2D([], [], color=color, marker="o", linestyle="") for color in colors.values()]
+    style.add_legend(fig, handles, labels)
     return fig
 
 
-def bars(ax, place, rows, width, **look):
-    """Draw bars of the means with whiskers of one standard deviation."""
-    whiskers = {"yerr": rows["std"].fillna(0), "capsize": 2, "error_kw": {"elinewidth": 0.8}}
-    look |= {"edgecolor": "black", "linewidth": 0.6, "label": "bars"}  # labelled: for the legend
-    ax.bar(place, rows["mean"], width, **whiskers, **look)
+def point(ax, x, sample, band, color):
+    """Draw the mean of a sample with its interval, or with its seeds."""
+    if len(sample) == 0:
+        return
+    half = spread(sample, band)
+    if half is None and len(sample) > 1:
+        ax.plot(np.full(len(sample), x), sample, ".", markersize=2.5, color=color, alpha=0.6)
+    yerr = 0 if half is None else half
+    ax.errorbar(x, sample.mean(), yerr, marker="o", markersize=3, linewidth=0.9, color=color)
 
 
 def robustness_figures(table, metric=RETURN):
@@ -257,8 +289,10 @@ def robustness_heatmap(algorithm, environment, rows, clean, metric):
     values, dots = (grid[name][tested.unique()] for name in ("value", "dot"))
     limit = style.color_limit(values, 100 if in_percent else np.inf)
     name = f"{algorithm} on {environment}"
+    low, high = rows["n"].min(), rows["n"].max()
+    seeds = f"{low:.0f}" if low == high else f"{low:.0f} to {high:.0f}"
     caption = (
-        f"{name} (seeds: {span(rows['n'])}): mean {metric} of policies by training and test, as "
+        f"{name} (seeds: {seeds}): mean {metric} of policies by training and test, as "
         f"its difference from the clean {metric} of policies trained without noise, in {unit}. "
         f"A dot marks a test on the noise of training. The colours end at \u00b1 {limit:.3g}."
     )
@@ -272,26 +306,40 @@ def names_of(noises, rates, none):
     return (noises + ", " + rates).where(noises != "", none)
 
 
-def heatmap_figure(name, grid, dots, limit, form):
-    """Draw a figure of one heatmap: see effects.heatmap."""
-    lines, columns = (list(map(style.broken, labels)) for labels in (grid.index, grid.columns))
-    high = 0.25 * sum(line.count("\n") + 1 for line in lines) + 0.05 * max(map(len, columns))
-    width = min(style.WIDTH, 4 + 0.9 * len(columns))
-    fig = Figure(figsize=(width, 1.2 + high), layout="constrained")
-    ax = fig.subplots()
-    heatmap(ax, grid, limit, form, dots, 8)
-    place = {"rotation": 35, "ha": "right", "rotation_mode": "anchor"}
-    ax.set_xticks(range(len(columns)), columns, fontsize=8, **place)
-    ax.set_yticks(range(len(lines)), lines, fontsize=8)
-    ax.set(xlabel=grid.columns.name, ylabel=grid.index.name)
-    ax.set_title(textwrap.fill(name, 60), fontsize=9)
+def heatmap_figure(name, grid, dots, limit, form, width=None):
+    """Draw a figure of one heatmap: see effects.heatmap. In a column its longer side is down."""
+    width = width or style.PAGE
+    if width <= style.COLUMN and grid.shape[1] > grid.shape[0]:
+        grid, dots = grid.T, dots.T
+    lines = [style.fitted(label, min(2.1, 0.5 * width)) for label in grid.index]
+    columns = [style.fitted(label, 1.6) for label in grid.columns]
+    left = max(map(style.inches_of, lines)) + 2 * style.LINE
+    most = max(label.count("\n") for label in (*lines, *columns)) + 1
+    fig, [ax] = style.panels(
+        [[name]],
+        width,
+        [len(lines) * (most * style.LINE + 0.05)],
+        least=1,
+        left=0,
+        beside=left,
+        below=grid.columns.name,
+        ticks=max(map(style.inches_of, columns)) + 0.15,
+    )
+    heatmap(ax, grid, limit, form, dots)
+    ax.set_xticks(range(len(columns)), columns, rotation=90)
+    ax.set_yticks(range(len(lines)), lines)
+    middle = ax.get_position().intervaly.mean()
+    fig.text(0.03 / width, middle, grid.index.name, rotation=90, va="center", ha="left")
     return fig
 
 
-def write_figure(out, drawing, latex=False):
-    """Write {name}.svg, with `latex` also .pdf; without dates, so equal figures are equal files."""
-    figure = drawing.draw()
-    figure.savefig(out / f"{drawing.name}.svg", metadata={"Date": None})
-    if latex:
-        figure.set_layout_engine("none")  # the layout is done
-        figure.savefig(out / f"{drawing.name}.pdf", metadata={"CreationDate": None})
+def write_figure(out, drawing, latex=False, width=style.PAGE):
+    """Write {name}.svg for a page and {name}_column.svg for a column, with `latex` also as pdf.
+
+    Without dates, so equal figures are equal files.
+    """
+    for end, inches in (("", width), (COLUMN_END, style.COLUMN)):
+        figure = drawing.draw(inches)
+        figure.savefig(out / f"{drawing.name}{end}.svg", metadata={"Date": None})
+        if latex:
+            figure.savefig(out / f"{drawing.name}{end}.pdf", metadata={"CreationDate": None})

@@ -1,4 +1,4 @@
-"""How results look as text: numbers, and tables in a terminal, in Markdown and in LaTeX."""
+"""How results look as text: numbers, and tables in a terminal and in Markdown."""
 
 import math
 import re
@@ -14,9 +14,6 @@ from analysis.folders import script_name
 from analysis.power import LEVEL
 from noisy_wrappers import rate_order
 
-LATEX = {character: f"\\{character}" for character in "&%$#_{}"}
-LATEX |= {"^": r"\^{}", "~": r"\textasciitilde{}", "\\": r"\textbackslash{}"}
-LATEX |= {sign: rf"\ensuremath{{{sign}}}" for sign in "<>"}
 WHOLE_WORDS = {"break_long_words": False, "break_on_hyphens": False}  # when text is wrapped
 DASH = "\u2013"  # of what does not exist
 _COLUMNS_WITH = {  # a format of numbers that have no spread
@@ -75,15 +72,26 @@ def seeds_of(n, n_baseline):
     return f"{n:.0f}" if n == n_baseline else f"{n:.0f}/{n_baseline:.0f}"
 
 
+def seeds_between(n, n_baseline):
+    """Write the seeds of several comparisons with one baseline: "n = 5", or "n = 3 to 5/10"."""
+    fewest = f"{min(n):.0f} to " if min(n) != max(n) else ""
+    return f"n = {fewest}{seeds_of(max(n), n_baseline)}"
+
+
 def two_digits(p):
     """Write a p-value with two significant digits, with more if it would look like LEVEL."""
     text = f"{p:.2g}"
     return f"{p:.4g}" if float(text) <= LEVEL < p else text
 
 
+def p_text(p):
+    """Write a p-value: "0.04", or "< 0.001"."""
+    return two_digits(p) if p >= 0.001 else "< 0.001"
+
+
 def p_value(p):
-    """Write a p-value for a sentence: "= 0.04", or "< 0.001"."""
-    return f"= {two_digits(p)}" if p >= 0.001 else "< 0.001"
+    """Write a p-value behind a p: "= 0.04", or "< 0.001"."""
+    return p_text(p) if p < 0.001 else f"= {p_text(p)}"
 
 
 def is_zero(text):
@@ -176,7 +184,7 @@ def text_of(name, value, spread=None):
     if isinstance(value, str):
         return value or ("no noise" if name == "noise" else DASH)
     if name in P_VALUES:
-        return two_digits(value)
+        return p_text(value)
     if name in ("difference_low", "difference_high") and spread is not None:
         return not_zero(value, spread)
     if name in FORMATS:
@@ -252,28 +260,9 @@ def text_table(table, width):
     return lines
 
 
-def write_table(out, table, latex=False):
-    """Write {name}.csv, with all digits; with `latex` also .md and .tex, as people read it."""
-    table.frame.to_csv(
-        out / f"{table.name}.csv", index=False, float_format="%.10g", lineterminator="\n"
-    )
-    if not latex:
-        return
-    text = shown(table)
+def in_markdown(table, text):
+    """Write a table in Markdown; text: as a person reads it."""
     cells = text.map(lambda cell: cell.replace("|", r"\|").replace("<", "&lt;"))
-    markdown = tabulate(cells.values, text.columns, tablefmt="pipe", disable_numparse=True)
+    lines = tabulate(cells.values, text.columns, tablefmt="pipe", disable_numparse=True)
     note = f"\n{table.note}\n" if table.note else ""
-    (out / f"{table.name}.md").write_text(f"{table.caption}\n\n{markdown}\n{note}", "utf-8")
-    lines = tabulate(text.values, text.columns, tablefmt="latex_longtable", disable_numparse=True)
-    columns = len(text.columns) * "l"
-    lines = lines.replace("{longtable}{}", f"{{longtable}}{{{columns}}}", 1)  # if it has no rows
-    lines = lines.replace("\n", f"\n\\caption{{{in_latex(table.caption)}}}\\\\\n", 1)
-    lines = f"{lines}\n{in_latex(note)}"
-    for sign, command in (("\u00b1", r"$\pm$"), (DASH, "--")):
-        lines = lines.replace(sign, command)
-    (out / f"{table.name}.tex").write_text(lines, "utf-8")
-
-
-def in_latex(text):
-    """Escape a text for LaTeX, as tabulate does in cells."""
-    return "".join(LATEX.get(character, character) for character in text)
+    return f"{table.caption}\n\n{lines}\n{note}"

@@ -4,7 +4,6 @@ Figures that the page shows folded are files beside it; all else is in the page.
 """
 
 import base64
-import os
 import re
 from collections import Counter, defaultdict
 from dataclasses import dataclass
@@ -14,7 +13,8 @@ import jinja2
 import pandas as pd
 from markupsafe import Markup, escape
 
-from analysis.formatting import DASH, shown
+from analysis.figures import COLUMN_END
+from analysis.formatting import DASH, shown, title
 from analysis.verdicts import tally
 
 SECTIONS = {
@@ -33,7 +33,45 @@ SECTIONS = {
 }
 FIGURES_OF = {"best_curves": "early_performance", "curves": "early_performance"}
 FOLDED = ("curves", "parameters")  # where there are several: one for each noise
-DOCS = Path(__file__).parents[1] / "docs/statistics.md"  # how all numbers are computed
+# What the columns of tables say, and the words of verdicts; for people who have only the report
+TERMS = {
+    "better": "The mean final return is higher than without noise; p corrected is at most 0.05.",
+    "worse": "The mean final return is lower than without noise; p corrected is at most 0.05.",
+    "no clear difference": """p corrected is above 0.05: the noise may help a little, harm a little,
+        or do nothing. The interval says how much of either is excluded.""",
+    "no such gain": "The interval excludes a gain as large as --smallest-gain asked for.",
+    "too few seeds": "One side has fewer than two seeds, so nothing can be tested.",
+    "all equal": "All tests of all runs have the same result, so nothing can be compared.",
+    "noise rate": "The probability with which the noise acts, at each step or in each episode.",
+    "difference": """Mean final return with noise minus that without, and its 95 % interval
+        (Welch's), which needs five seeds on both sides.""",
+    "difference %": """The same in percent of the mean without noise, where that is clearly not
+        zero; its interval is Fieller's.""",
+    "effect size": """The difference in standard deviations over seeds; over several environments
+        the median.""",
+    "p": """How often chance alone makes a difference as large, in either direction: a permutation
+        test with Welch's t.""",
+    "p corrected": """p, corrected for all comparisons with the same baseline (Benjamini and
+        Hochberg), or for all confirmations (Holm).""",
+    "n": """The number of seeds, or with rates together of runs; with / without noise where they
+        differ.""",
+    "n baseline": "The number of seeds without noise.",
+    "detectable": "The difference that these seeds find in 80 % of cases, before the correction.",
+    "luck 95 % (p)": """If no noise did anything, the best of as many configurations would still
+        look better than no noise: in 5 % of such sweeps by more than this. In brackets: how often
+        by at least what was observed.""",
+    "steps to baseline": """The first step at which the mean over seeds reaches the final mean
+        without noise.""",
+    "IQM": "Interquartile mean over seeds, with its 95 % interval.",
+    "IQM change %": "The change of the interquartile mean, in percent of that without noise.",
+    "P(improvement)": "The probability that a run with noise returns more than one without.",
+    "average improvement %": """Mean and standard deviation over environments of the difference in
+        percent.""",
+    "% of environments": "In how many environments the mean is at least that without noise.",
+    "score % (baseline)": """The mean return over the test conditions that count, in percent of the
+        clean return of policies that were trained without noise. In brackets: theirs.""",
+}
+TERMS = {name: " ".join(text.split()) for name, text in TERMS.items()}
 
 
 @dataclass
@@ -55,8 +93,9 @@ class Results:
 
 def breakable(text):
     """Mark where a browser may break a cell: a noise between its words, but never a number."""
-    if re.match("[-+]?[0-9]", text):
-        text = text.replace(" \u00b1 ", "\u00a0\u00b1\u00a0").replace(", ", ",\u00a0")
+    if re.match("(< )?[-+]?[0-9]", text):
+        for sign in (" \u00b1 ", ", ", "< "):
+            text = text.replace(sign, sign.replace(" ", "\u00a0"))
         whole = Markup('<span class="whole">{}</span>')  # a browser would break "1e-05"
         parts = [whole.format(part) if "e-" in part else part for part in text.split(" ")]
         return Markup(" ").join(parts)
@@ -82,20 +121,25 @@ def write_report(out, results, drawn):
 
     filled = tables.keys() | figures.keys() | folded.keys()
 
-    def source(name):  # a URL that contains the figure
-        picture = (out / f"{name}.svg").read_bytes()
+    def embedded(file):  # a URL that contains the figure
+        picture = (out / file).read_bytes()
         return f"data:image/svg+xml;base64,{base64.b64encode(picture).decode()}"
 
     pages = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True
     )
-    pages.filters |= {"breakable": breakable, "source": source, "tally": tally}
+    pages.filters |= {"breakable": breakable, "embedded": embedded, "tally": tally}
+    used = {name for texts in tables.values() for _, text in texts for name in text}
+    used |= {title(name) for table in results.tables.values() for name in table.frame}
+    for frame in (results.clear, results.others, results.rates):
+        used |= set(frame["verdict"])
     html = pages.get_template("report.html.jinja").render(
         results=results,
         sections={key: title for key, title in SECTIONS.items() if key in filled},
         tables=tables,
         figures=figures,
         folded=folded,
-        docs=os.path.relpath(DOCS, out),
+        column_end=COLUMN_END,
+        terms={name: text for name, text in TERMS.items() if name in used},
     )
     (out / "report.html").write_text(html, "utf-8")

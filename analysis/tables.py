@@ -8,7 +8,7 @@ import pandas as pd
 from analysis import statistics, verdicts
 from analysis.comparisons import IQM, IQM_CHANGE, PROBABILITY, compare_all, results
 from analysis.folders import SEARCH, SUCCESS
-from analysis.formatting import Table, listed, seeds_of, slug, two_digits
+from analysis.formatting import Table, listed, p_text, seeds_of, slug
 from analysis.luck import add_luck, luck_of_studies
 from analysis.power import LEVEL
 from analysis.runs import KEYS, STUDY, study_name
@@ -133,11 +133,11 @@ def family_notes(noises):
     for (*study, size, smallest), same in best.groupby(keys, sort=False, dropna=False):
         seeds = counted(same[["n", "n_baseline"]].min(axis=None), "seed")
         start = f"{study_name(*study)}, {', '.join(same['environment'])}: with {seeds}"
-        possible = f"smallest possible p: {two_digits(smallest)}"
+        possible = f"smallest possible p: {p_text(smallest)}"
         if smallest > LEVEL:
             notes.append(f"{start} no difference can be significant ({possible}).")
         elif round(size * smallest, 9) > LEVEL:
-            corrected = two_digits(min(1, size * smallest))
+            corrected = p_text(min(1, size * smallest))
             notes.append(
                 f"{start} and {size:.0f} comparisons no difference alone can be significant "
                 f"after the correction ({possible}, corrected {corrected})."
@@ -159,7 +159,7 @@ def lopsided_notes(compared):
             seeds = sorted({seeds_of(*pair) for pair in group[["n", "n_baseline"]].to_numpy()})
             notes.append(
                 f"{study_name(*key)}, {', '.join(group['environment'].unique())}: with "
-                f"{listed(seeds)} seeds with and without noise {said} (docs/statistics.md)"
+                f"{listed(seeds)} seeds with and without noise {said}"
             )
     return notes
 

@@ -12,10 +12,10 @@ from analysis.formatting import (
     is_zero,
     listed,
     not_zero,
+    p_text,
     p_value,
     percent,
     rounded,
-    two_digits,
 )
 from analysis.power import LEVEL
 from analysis.runs import STUDY, rows_of, study_name
@@ -126,7 +126,7 @@ def corrected(p, number, what):
     """Write a p-value that is corrected for a number of comparisons, if there are several."""
     if number == 1:
         return ""
-    return f", corrected for {number:.0f} {what}s {p_value(p).removeprefix('= ')}"
+    return f", corrected for {counted(number, what)} {p_text(p)}"
 
 
 def borderline(row):
@@ -142,7 +142,7 @@ def borderline(row):
 def smallest(row):
     """Say which p is the smallest possible where a comparison has too few seeds for an interval."""
     few = min(row.n, row.n_baseline) < SEEDS_FOR_INTERVAL and significant(row.smallest_p)
-    return f" (smallest possible: {row.smallest_p:.2g})" if few else ""
+    return f" (smallest possible: {p_text(row.smallest_p)})" if few else ""
 
 
 def cannot_show(row):
@@ -155,7 +155,7 @@ def cannot_show(row):
         seeds += f" against {m} to {most}"
     elif n != m:
         seeds += f" against {m}"
-    return f"; {seeds} cannot show any (smallest possible p: {two_digits(row.smallest_p)})"
+    return f"; {seeds} cannot show any (smallest possible p: {p_text(row.smallest_p)})"
 
 
 # ---------------------------------------------------------------------------------------- sentences
@@ -217,7 +217,7 @@ def what_all_runs_do(value, metric):
 def tally(verdicts):
     """Count verdicts in words: "3 comparisons: 1 better, 2 no clear difference"."""
     counts = verdicts.value_counts()
-    parts = [f"{counts[name]} {name}" for name in VERDICTS if name in counts]
+    parts = [f"{counts[name]:,} {name}" for name in VERDICTS if name in counts]
     return f"{counted(len(verdicts), 'comparison')}: {', '.join(parts)}"
 
 

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from sweeps import RESULTS, SCALE, main, row, run, small_sweep, write_pairs, write_run
+from sweeps import NAN, RESULTS, SCALE, main, row, run, small_sweep, write_pairs, write_run
 
 import analyze
 
@@ -56,7 +56,7 @@ def test_odd_sweeps_are_analysed_too(tmp_path):
     write_run(tmp_path / "runs", [1.0], folder="c", noise=SCALE, rate=0.1, exp_name=name)
     write_run(tmp_path / "runs", [2.0], folder="d")
     tables = run(tmp_path, drawn=True)
-    assert len(list((tmp_path / "results").glob("curves_*.svg"))) == 2
+    assert len(list((tmp_path / "results").glob("curves_*_column.svg"))) == 2
     assert row(tables["summary_SAC"], exp_name="sac_continuous_noisy")["mean"] == 2
 
 
@@ -94,23 +94,23 @@ def test_results_go_beside_the_runs(tmp_path):
     assert not (tmp_path / "runs/best.csv").exists()
 
 
-def test_the_smallest_gain_is_positive(tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("smallest_gain", 0.0), ("smallest_gain", NAN), ("figure_width", 1.0), ("figure_width", NAN)],
+)
+def test_numbers_that_make_no_sense_are_refused(option, value, tmp_path, capsys):
     write_run(tmp_path / "runs", [1])
-    for gain in (0.0, -3.0, float("nan")):
-        with pytest.raises(SystemExit):
-            main(analyze.Args(tmp_path / "runs", smallest_gain=gain))
-        assert "--smallest-gain must be above 0" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(analyze.Args(tmp_path / "runs", **{option: value}))
+    assert f"--{option.replace('_', '-')} must be " in capsys.readouterr().err
 
 
 @pytest.mark.slow
-def test_compare_has_moved_and_help_shows_every_option():
-    done = command("--compare", "results/paper")
-    assert done.returncode == 2 and done.stderr.count("\n") == 1
-    assert "python -m results.study.paper" in done.stderr
+def test_help_shows_every_option():
     text = command("--help", check=True).stdout
     assert "python analyze.py --runs-dir runs/demo --out somewhere" in text
-    assert all(option in text for option in ("--runs-dir", "--out", "--smallest-gain"))
-    assert "--compare" not in text
+    options = ("--runs-dir", "--out", "--smallest-gain", "--figure-width", "--band")
+    assert all(option in text for option in options)
 
 
 @pytest.mark.slow

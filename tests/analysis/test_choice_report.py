@@ -78,21 +78,6 @@ def test_the_phases_are_folders_and_high_seeds_are_seeds(tmp_path):
     assert "choice" not in tables
 
 
-def test_other_sweeps_in_the_folder_of_a_choice_stay_as_they_are(tmp_path):
-    write_choice(tmp_path / "runs")
-    for algorithm, env in (("PPO", "Pusher-v5"), ("SAC", "Hopper-v5")):
-        for seed in (1, 2, 3):
-            write_run(tmp_path / "runs", [100.0 + seed], algorithm, env, seed=seed)
-            write_run(tmp_path / "runs", [110.0 + seed], algorithm, env, SCALE, 1.0, seed)
-    tables = run(tmp_path)
-    found = tables["noises"]
-    assert set(zip(found["algorithm"], found["phase"], found["environment"], strict=True)) == {
-        ("PPO", "confirmation", "Hopper-v5"),
-        ("PPO", "", "Pusher-v5"),
-        ("SAC", "", "Hopper-v5"),
-    }
-
-
 def test_a_choice_in_a_folder_of_its_own_disturbs_no_other_sweep(tmp_path):
     for seed in (1, 2, 3):
         write_run(tmp_path / "runs", [100.0 + seed], "PPO", seed=seed)

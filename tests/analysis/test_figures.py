@@ -1,12 +1,12 @@
-"""The figures of analyze.py: what stands where, in which colour, with which n."""
+"""The figures of analyze.py: what stands where, in which colour, with which n, at which size."""
 
 import re
-from itertools import product
+from itertools import combinations, product
 
 import numpy as np
 import pandas as pd
 import pytest
-from sweeps import ENDING, NAN, RESULTS, SCALE, drawn_of, small_sweep, write_run
+from sweeps import ENDING, NAN, RESULTS, SCALE, drawn_of, small_sweep, write_pairs, write_run
 
 import analysis.effects
 import analysis.figures
@@ -16,49 +16,115 @@ from analysis.studies import make_studies
 from noisy_wrappers import BASELINE, Configuration
 
 OTHER = "RandomUniformScaleReward(0.8, 1.2)"
+ENVS = ["HalfCheetah-v5", "Hopper-v5", "Humanoid-v5", "Pusher-v5", "Walker2d-v5"]
 
 
 def texts(items):
     return [item.get_text() for item in items]
 
 
-def test_effects_have_in_every_environment_the_rows_that_were_tried_there(tmp_path):
-    """A filled mark in the colour of a clear verdict, a hollow grey one for the others."""
+def titles(figure):
+    return [ax.get_title() for ax in figure.axes]
+
+
+@pytest.fixture(scope="module")
+def five(tmp_path_factory):
+    """Five environments of several scales; one noise of two parameters, and another one."""
+    path = tmp_path_factory.mktemp("five")
+    levels = dict(zip(ENVS, (12_000, 2900, 0.4, -25, 1e6), strict=True))
+    configs = [("", 0.0), *product((SCALE, OTHER, ENDING), (0.05, 0.2, 1.0))]
+    for (env, level), (i, (noise, rate)), seed in product(
+        levels.items(), enumerate(configs), (1, 2, 3)
+    ):
+        final = level * (1 + 0.03 * i + 0.1 * np.sin(7 * seed + i))
+        more = {"noise": noise, "rate": rate} if noise else {}
+        write_run(path, [0.3 * final, final], env=env, seed=seed, every=500_000, **more)
+    return drawn_of(path)
+
+
+def check_room(figure, name):
+    """Check that all text has eight points, that no two touch, and that nothing is cut off."""
+    figure.draw_without_rendering()
+    marks = list(figure.texts)
+    for legend in figure.legends:
+        marks += [legend.get_title(), *legend.get_texts()]
+    for ax in figure.axes:
+        marks += [ax.title, *ax.texts, *ax.get_xticklabels(), *ax.get_yticklabels()]
+    marks = [text for text in marks if text.get_text() and text.get_visible()]
+    assert {text.get_fontsize() for text in marks} == {8}
+    boxes = {text: text.get_window_extent() for text in marks}
+    for text, box in boxes.items():
+        assert box.x0 >= -1 and box.x1 <= figure.bbox.x1 + 1, (name, text)
+        assert box.y0 >= -1 and box.y1 <= figure.bbox.y1 + 1, (name, text)
+    for one, other in combinations(boxes, 2):
+        touches = boxes[one].padded(-1).overlaps(boxes[other].padded(-1))
+        assert not touches, (name, one.get_text(), other.get_text())
+
+
+@pytest.mark.parametrize("width", [3.25, 5.5, 6.75])
+def test_all_text_has_eight_points_and_room(width, five):
+    """Five environments stand in one row of a page, and in a column each has a row."""
+    assert len(five) == 6
+    for name, drawing in five.items():
+        figure = drawing.draw(width)
+        assert figure.get_figwidth() == width
+        check_room(figure, name)
+        across = len({round(ax.get_position().x0, 3) for ax in figure.axes})
+        assert width == 5.5 or across == {3.25: 1, 6.75: 5}[width]
+
+
+@pytest.mark.parametrize("width", [3.25, 6.75])
+def test_a_heatmap_of_robustness_has_room(width):
+    tested = ["clean", *(f"{noise}, {rate}" for noise in (SCALE, OTHER) for rate in (0.1, 0.5, 1))]
+    grid = pd.DataFrame(-12.5, index=["no noise", f"{SCALE}, 1.00"], columns=tested)
+    grid = grid.rename_axis(index="trained with", columns="tested with")
+    figure = analysis.figures.heatmap_figure("PPO", grid, grid > 0, 20, "{:.0f}".format, width)
+    check_room(figure, "robustness")
+    assert len(figure.axes[0].texts) == 14
+
+
+def test_effects_are_rows_with_filled_marks_where_verdicts_are_clear(tmp_path):
+    """Each panel has the marks of what was tried there; an environment without noise has none."""
     for seed in range(1, 6):
-        write_run(tmp_path, [100 + seed], env="Ant-v5", seed=seed)  # no noise, no panel
+        write_run(tmp_path, [100 + seed], env="Ant-v5", seed=seed)
         for env, noise, factor in (("Hopper-v5", SCALE, 1.5), ("Walker2d-v5", ENDING, 0.5)):
             write_run(tmp_path, [100 + seed], env=env, seed=seed)
             write_run(tmp_path, [factor * (100 + seed)], env=env, seed=seed, noise=noise, rate=0.1)
             write_run(tmp_path, [100 + seed], env=env, seed=seed, noise=noise, rate=0.2)
     drawing = drawn_of(tmp_path)["effects_SAC"]
     figure = drawing.draw()
-    assert [ax.get_title() for ax in figure.axes] == ["Hopper-v5", "Walker2d-v5"]
-    labels = [texts(ax.get_yticklabels()) for ax in figure.axes]
-    tried = [SCALE.replace("(", "\n("), ENDING]
-    assert labels == [[f"{noise}, {rate}" for rate in ("0.10", "0.20")] for noise in tried]
+    assert titles(figure) == ["Hopper-v5\nn = 5", "Walker2d-v5\nn = 5"]
+    first = figure.axes[0]
+    assert texts(first.get_yticklabels()) == ["0.10", "0.20", "0.10", "0.20"]
+    assert [text.replace("\n", "") for text in texts(first.texts)] == [ENDING, SCALE]
     assert "Filled marks are clear verdicts." in drawing.caption
-    looks = []
+    places, looks = list(first.get_yticks()), []
     for ax in figure.axes:
         marks = [line for line in ax.lines if line.get_marker() == "o"]
-        looks.append({line.get_ydata()[0]: line.get_markerfacecolor() for line in marks})
+        found = {places.index(line.get_ydata()[0]): line.get_markerfacecolor() for line in marks}
+        looks.append(found)
     better, worse = analysis.style.BETTER, analysis.style.WORSE
-    assert looks == [{0: better, 1: "white"}, {0: worse, 1: "white"}]
-    assert texts(figure.axes[0].texts) == ["5", "5", "n"]
+    assert looks == [{2: better, 3: "white"}, {0: worse, 1: "white"}]
+    assert texts(figure.legends[0].get_texts()) == ["better", "worse", "no clear difference"]
 
 
-def test_an_infinite_effect_has_the_strongest_colour():
-    ax, grid = analysis.effects.Figure().subplots(), pd.DataFrame([[np.inf, 1.0], [NAN, -2.0]])
-    image = analysis.effects.heatmap(ax, grid, 2.0, "{:+.1f}".format, grid.isna() & False, 6)
-    assert image.get_array().tolist() == [[2.0, 1.0], [None, -2.0]]
-    assert texts(ax.texts) == ["+inf", "+1.0", "-2.0"]
-
-
-def test_the_id_of_an_environment_fits_above_its_panel():
-    ax = analysis.effects.Figure(figsize=(3, 3)).subplots()
-    analysis.style.set_title(ax, "my_company_robotics.envs:WarehousePickAndPlaceDense-v12", 3)
-    assert ax.get_title() == "WarehousePickAndPlaceDense-v12" and ax.title.get_fontsize() == 9
-    analysis.style.set_title(ax, "A" * 60, 3)
-    assert ax.title.get_fontsize() < 9
+@pytest.mark.parametrize(("seeds", "reach"), [(3, 30), (4, 30), (5, None)])
+def test_few_seeds_are_shown_with_room_for_what_could_be_found(seeds, reach, tmp_path):
+    spread = 10 * np.arange(seeds)
+    write_pairs(tmp_path, 100 + spread, 101 + spread)
+    drawing = drawn_of(tmp_path)["effects_SAC"]
+    [ax] = drawing.draw().axes
+    dots = [line.get_xdata().tolist() for line in ax.lines if line.get_marker() == "."]
+    if reach is None:
+        assert not dots and "five, small dots" not in drawing.caption
+        return
+    assert dots == [
+        pytest.approx(spread - spread.mean()),
+        pytest.approx(1 + spread - spread.mean()),
+    ]
+    assert texts(ax.get_yticklabels()) == ["no noise", "0.10"] and "small dots" in drawing.caption
+    low, high = ax.get_xlim()
+    assert low < -reach and high > reach
 
 
 def test_effects_of_many_configurations_are_a_heatmap(tmp_path):
@@ -78,63 +144,96 @@ def test_effects_of_many_configurations_are_a_heatmap(tmp_path):
     assert [round(x - 0.36) for x in dots] == [0, 1]  # better, worse
 
 
-def test_curves_have_labels_units_and_n(tmp_path):
+def test_an_infinite_effect_has_the_strongest_colour():
+    ax, grid = analysis.figures.Figure().subplots(), pd.DataFrame([[np.inf, 1.0], [NAN, -2.0]])
+    image = analysis.effects.heatmap(ax, grid, 2.0, "{:+.1f}".format, grid.isna() & False)
+    assert image.get_array().tolist() == [[2.0, 1.0], [None, -2.0]]
+    assert texts(ax.texts) == ["+inf", "+1.0", "-2.0"]
+
+
+def test_a_long_name_is_broken_between_its_words_or_anywhere():
+    fitted = analysis.style.fitted
+    assert fitted("WarehousePickAndPlace-v12", 0.9) == "WarehousePick\nAndPlace-v12"
+    assert fitted("RandomUniformNoisyReward(-0.1, 0.1)", 1.7).split("\n")[1] == "(-0.1, 0.1)"
+    lines = fitted(60 * "A", 1).split("\n")
+    assert "".join(lines) == 60 * "A" and all(analysis.style.inches_of(x) <= 1 for x in lines)
+    assert analysis.style.short("my_company.envs:Warehouse-v12") == "Warehouse-v12"
+
+
+def test_curves_have_the_noise_units_and_n(tmp_path):
     small_sweep(tmp_path)
     drawings = drawn_of(tmp_path)
-    assert set(drawings) == {
-        *("effects_SAC", "best_curves_SAC", "curves_SAC_RandomEarlyTermination_50"),
-        "curves_SAC_RandomUniformScaleReward_0.5_1.5",
-    }
-    curves = drawings["curves_SAC_RandomUniformScaleReward_0.5_1.5"].draw()
-    lines = ["no noise (n = 4)", "rate 0.05 (n = 4)", "rate 0.20 (n = 4)"]
-    assert texts(curves.legends[0].get_texts()) == lines
-    hopper, pusher = curves.axes
-    assert hopper.get_title() == "Hopper-v5" and hopper.get_xlabel() == "training steps (thousands)"
-    assert "return" in hopper.get_ylabel()
-    assert hopper.lines[1].get_ydata().tolist() == pytest.approx([29, 58, 87, 116, 145])
-    assert len({(line.get_linestyle(), line.get_marker()) for line in hopper.lines}) == 3
-    band = pusher.collections[0].get_paths()[0].vertices[:, 1]
-    assert band.min() == pytest.approx(-40 * 1.8 - 1.8 * np.sqrt(200 / 3))  # one sample std
+    figure = drawings["curves_SAC_RandomUniformScaleReward_0.5_1.5"].draw()
+    lines = ["no noise", "rate 0.05", "rate 0.20"]
+    assert texts(figure.legends[0].get_texts()) == lines
+    assert figure.legends[0].get_title().get_text() == SCALE
+    assert titles(figure) == ["Hopper-v5\nn = 4", "Pusher-v5\nn = 4"]
+    below, beside = texts(figure.texts)
+    assert below == "training steps when tests were due (thousands)" and "return" in beside
+    hopper = [line for line in figure.axes[0].lines if line.get_linewidth() > 1]
+    assert hopper[1].get_ydata().tolist() == pytest.approx([29, 58, 87, 116, 145])
+    assert {line.get_linestyle() for line in hopper} == {"-"}
+    assert len({line.get_color() for line in hopper}) == 3
+    best = drawings["best_curves_SAC"].draw()
+    assert f"{SCALE} at rate 0.05" in texts(best.legends[0].get_texts())
 
     [study], _ = make_studies(read_runs(tmp_path))
     for config in study.finals:  # an environment without this noise has no panel
         study.finals[config][:, 0] = NAN if config.noise == ENDING else 1.0
-    fig = analysis.figures.curves_figure(study, ENDING)
-    assert [ax.get_title() for ax in fig.axes] == ["Pusher-v5"]
+    assert titles(analysis.figures.curves_figure(study, ENDING)) == ["Pusher-v5\nn = 4"]
     # nor has a rate that was not tried, or the baseline of a search, a line
     study.finals[Configuration.parse(SCALE, 0.05)][:, 0] = NAN
     study.finals[BASELINE][:] = NAN
-    fig = analysis.figures.curves_figure(study, SCALE)
-    assert texts(fig.legends[0].get_texts()) == lines[1:] and len(fig.axes) == 2
-    fig.axes[0].set_ylim(-12_000, -11_000)
-    fig.draw_without_rendering()
-    assert fig.axes[0].yaxis.label.get_window_extent().x0 >= 0
+    figure = analysis.figures.curves_figure(study, SCALE)
+    assert texts(figure.legends[0].get_texts()) == lines[1:] and len(figure.axes) == 2
 
 
-def test_ablation_bars_stand_side_by_side(tmp_path):
+@pytest.mark.parametrize("band", ["interval", "std"])
+def test_a_band_is_the_interval_of_the_mean_or_each_seed(band, tmp_path):
+    finals = {5: [10.0, 12, 14, 16, 18], 4: [10.0, 12, 14, 16]}
+    for seeds, values in finals.items():
+        for seed, value in enumerate(values):
+            write_run(tmp_path / str(seeds), [value, value], seed=seed)
+    for seeds, values in finals.items():
+        [study], _ = make_studies(read_runs(tmp_path / str(seeds)))
+        [ax] = analysis.figures.curves_figure(study, "", band).axes
+        if band == "interval" and seeds == 4:
+            assert not ax.collections and len(ax.lines) == 1 + seeds
+            continue
+        [shaded] = ax.collections
+        half = 2.7764 * np.std(values, ddof=1) / np.sqrt(5)  # Student's t of 4 degrees of freedom
+        half = np.std(values, ddof=1) if band == "std" else half
+        top = shaded.get_paths()[0].vertices[:, 1].max()
+        assert top == pytest.approx(np.mean(values) + half, rel=1e-4) and len(ax.lines) == 1
+
+
+def test_parameters_are_points_side_by_side(tmp_path):
     finals = {(): 10, (SCALE, 0.05): 20, (OTHER, 0.05): 30, (OTHER, 0.5): 40}
-    for config, seed in product(finals, (1, 2)):
+    for config, seed in product(finals, range(1, 6)):
         more = dict(zip(("noise", "rate"), config, strict=False))
         write_run(tmp_path, [finals[config] * seed], seed=seed, **more)
     figure = drawn_of(tmp_path)["parameters_SAC_RandomUniformScaleReward"].draw()
-    (ax,) = figure.axes
-    np.testing.assert_equal([bar.get_height() for bar in ax.patches], [15, 30, NAN, 45, 60])
+    [ax] = figure.axes
+    points = {c.lines[0].get_xdata()[0]: c.lines[0].get_ydata()[0] for c in ax.containers}
+    assert list(points.values()) == [30, 60, 90, 120]
+    assert list(points) == pytest.approx([0, 1 - 0.175, 1 + 0.175, 2 + 0.175])
+    half = 2.7764 * np.std([20, 40, 60, 80, 100], ddof=1) / np.sqrt(5)
+    whisker = ax.containers[1].lines[2][0].get_segments()[0][:, 1]
+    assert whisker == pytest.approx([60 - half, 60 + half], rel=1e-4)
     assert texts(ax.get_xticklabels()) == ["none", "0.05", "0.50"]
-    legend = texts(figure.legends[0].get_texts())
-    assert legend == ["no noise (n = 2)", f"{SCALE} (n = 2)", f"{OTHER} (n = 2)"]
+    assert titles(figure) == ["Hopper-v5\nn = 5"]
+    assert texts(figure.legends[0].get_texts()) == ["no noise", SCALE, OTHER]
 
 
-def test_ablation_bars_of_a_search_show_no_baseline(tmp_path):
+def test_parameters_of_a_search_show_no_baseline(tmp_path):
     """Also of a module of one's own that begins with an underscore."""
     noises = ["_mine:Foo(1)", "_mine:Foo(2)"]
     for noise, seed in product(noises, (1, 2)):
         write_run(tmp_path, [10 * seed], seed=seed, noise=noise, rate=0.5)
     drawing = drawn_of(tmp_path)["parameters_SAC__mine_Foo"]
     figure = drawing.draw()
-    (ax,) = figure.axes
-    assert texts(ax.get_xticklabels()) == ["0.50"] and len(ax.patches) == 2
-    assert texts(figure.legends[0].get_texts()) == [f"{noise} (n = 2)" for noise in noises]
-    assert "dotted" not in drawing.caption
+    assert texts(figure.axes[0].get_xticklabels()) == ["0.50"]
+    assert texts(figure.legends[0].get_texts()) == noises and "dotted" not in drawing.caption
 
 
 def test_figures_of_experiments_with_similar_names_have_names_of_their_own(tmp_path):
@@ -151,12 +250,11 @@ def test_changing_rates_and_combinations_have_lines(tmp_path):
     write_run(tmp_path, [10])
     write_run(tmp_path, [20], noise=(ENDING, SCALE), rate=(0.5, "1.0:0.0"))
     drawn = drawn_of(tmp_path)
-    lines = texts(drawn["effects_SAC"].draw().axes[0].get_yticklabels())
-    lines = [line.replace("\n(", "(") for line in lines]  # broken where there is little room
-    assert f"{ENDING} +\n{SCALE}, 0.50 +\n1.00 to 0.00" in lines
-    legend = drawn["curves_SAC_RandomUniformScaleReward_0.5_1.5"].draw().legends[0].get_texts()
-    named = [text.partition(" (")[0] for text in texts(legend)]
-    assert named == ["no noise", "rate 1.00 to 0.00", "rate 1.00"]
+    ax = drawn["effects_SAC"].draw().axes[0]
+    assert "0.50 + 1.00 to 0.00" in texts(ax.get_yticklabels())
+    assert f"{ENDING} +{SCALE}" in [text.replace("\n", "") for text in texts(ax.texts)]
+    legend = drawn["curves_SAC_RandomUniformScaleReward_0.5_1.5"].draw().legends[0]
+    assert texts(legend.get_texts()) == ["no noise", "rate 1.00 to 0.00", "rate 1.00"]
 
 
 def test_committed_figures_are_those_that_a_page_shows():

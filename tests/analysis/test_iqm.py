@@ -112,21 +112,6 @@ def test_noise_that_does_nothing_improves_nothing(name):
     assert ((low > 0) | (high < 0)).mean() <= 0.08
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("spread", [500, 50])
-def test_ten_noisy_seeds_do_not_make_up_for_three_of_the_baseline(spread):
-    """Percent of useless noises said to help or harm: 10 noisy seeds, 3 of the baseline.
-
-    With degrees of freedom of the noisy seeds alone, as is usual, it is 10 and 20 %.
-    """
-    rng, trials, wrong = np.random.default_rng(0), 500, 0
-    for _ in range(trials):
-        x, y = rng.normal(3000, spread, (10, 1)), rng.normal(3000, 500, (3, 1))
-        _, low, high = bootstrap_iqm(x, y, resamples=300)
-        wrong += low > 0 or high < 0
-    assert 100 * wrong / trials <= 7
-
-
 def test_satterthwaites_interval_of_three_seeds_is_welchs():
     """With three seeds the IQM is the mean, so the bootstrap has a known limit: Welch's interval.
 
@@ -150,18 +135,14 @@ def test_iqm_is_scipys():
         assert np.isnan(iqm(scores)).sum() == 1
 
 
-def test_seeds_that_are_all_alike_have_an_interval_of_one_point():
-    assert bootstrap_iqm(np.full((5, 1), 30.0), np.full((3, 1), 20.0)) == (
-        50,
-        50,
-        50,
-    )
-
-
-def test_an_iqm_has_no_percent_of_what_may_be_zero():
+def test_an_iqm_has_no_percent_of_what_may_be_zero_or_is_small_beside_the_span():
     x, y = np.full((3, 2), 5.0), np.array([[10.0, -1], [11, 1], [12, 2]])
     assert np.isnan(bootstrap_iqm(x, y)).all()
     assert np.isfinite(bootstrap_iqm(x[:, :1], y[:, :1])).all()
+    x, y = np.array([[92.0], [93], [94]]), np.array([[1.0], [1.1], [1.2]])
+    assert np.isnan(bootstrap_iqm(x, y)).all()
+    assert np.isfinite(bootstrap_iqm(x / 10, y)).all()
+    assert bootstrap_iqm(np.full((5, 1), 30.0), np.full((3, 1), 20.0)) == (50, 50, 50)
 
 
 def test_the_change_of_an_iqm_is_relative_to_the_baselines_iqm():
@@ -177,9 +158,3 @@ def test_no_change_of_positive_returns_is_below_minus_100_percent():
     assert value == low == -100
     found = bootstrap_iqm(np.array([[1.0], [2], [90]]), np.array([[100.0], [110], [120]]))
     assert found[0] > found[1] == -100
-
-
-def test_an_iqm_has_no_percent_of_what_is_small_beside_the_span():
-    x, y = np.array([[92.0], [93], [94]]), np.array([[1.0], [1.1], [1.2]])
-    assert np.isnan(bootstrap_iqm(x, y)).all()
-    assert np.isfinite(bootstrap_iqm(x / 10, y)).all()

@@ -287,8 +287,8 @@ def test_heatmap(tmp_path):
     )
 
     ax = drawn[heatmap].draw().axes[0]
-    rows = [label.get_text() for label in ax.get_yticklabels()]
-    columns = [label.get_text() for label in ax.get_xticklabels()]
+    rows = [label.get_text().replace("\n", "") for label in ax.get_yticklabels()]
+    columns = [label.get_text().replace("\n", "") for label in ax.get_xticklabels()]
     assert rows == ["no noise", f"{PUSH}, 1.00", f"{SENSOR}, 0.20"]
     assert columns[0] == "clean" and f"{SENSOR}, 0.20" in columns
     numbers = {text.get_position(): text.get_text() for text in ax.texts}

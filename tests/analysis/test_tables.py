@@ -220,13 +220,6 @@ def test_names_of_environments_say_nothing_about_a_row(tmp_path):
     assert tables["noises_together"]["verdict"].tolist() == ["better"]
 
 
-def test_several_noises_are_one_configuration(tmp_path):
-    write_run(tmp_path / "runs", [10])
-    write_run(tmp_path / "runs", [20], noise=(ENDING, SCALE), rate=(0.05, 0.125))
-    best = run(tmp_path)["best"].iloc[0]
-    assert best["noise"] == f"{ENDING} + {SCALE}" and best["noise_rate"] == "0.05 + 0.125"
-
-
 def test_seeds_are_replicates_and_episodes_are_not(tmp_path):
     for seed, final in enumerate([1, 2, 4]):
         write_run(tmp_path / "runs", [final], seed=seed, spread=1000)
@@ -308,14 +301,6 @@ def test_five_against_five_cannot_reach_significance_alone_among_90(tmp_path):
     assert "with 5 seeds and 9 comparisons no difference alone can be significant" in note
 
 
-def test_two_seeds_have_no_interval(tmp_path):
-    write_pairs(tmp_path / "runs", [11, 12], [21, 22])
-    table = run(tmp_path)["statistics"]
-    assert table["iqm"].notna().all()
-    assert table.filter(regex="_(low|high)$").isna().all(axis=None)
-    assert table["smallest_p"].iloc[1] == pytest.approx(1 / 3)
-
-
 def test_rates_that_change_are_read_and_sorted(tmp_path):
     for rate in (1.0, "1.0:0.0", 0.05, "0.0:1.0"):
         write_run(tmp_path / "runs", [12], noise=PUSH, rate=rate)
@@ -331,25 +316,9 @@ def test_rates_that_change_are_read_and_sorted(tmp_path):
 # ------------------------------------------------------------------------------------------ as text
 
 
-def test_markdown_and_latex_tables(sweep):
-    markdown, latex = read(sweep, "best.md"), read(sweep, "best.tex")
+def test_markdown_tables(sweep):
+    markdown = read(sweep, "best.md")
     assert "115 \u00b1 13 " in markdown and "+30 (+26 %)" in markdown
-    assert r"115 $\pm$ 13 " in latex and r"\caption{" in latex
-    assert latex.count(r"\begin{longtable}") == latex.count(r"\end{longtable}") == 1
-    body = re.sub(r"\\[%&_#]", "", latex)
-    assert "%" not in body and "_" not in body and latex.isascii()
-
-
-def test_captions_and_notes_are_escaped_as_cells_are(tmp_path):
-    text = r"a~b^c {d} <e> 5 % of $x_1$ & #1 \n"
-    table = analysis.formatting.Table("t", pd.DataFrame({"x": [text]}), text, "", note=text)
-    analysis.formatting.write_table(tmp_path, table, latex=True)
-    lines = (tmp_path / "t.tex").read_text()
-    escaped = (
-        r"a\textasciitilde{}b\^{}c \{d\} \ensuremath{<}e\ensuremath{>} 5 \% of \$x\_1\$ \& \#1 "
-        r"\textbackslash{}n"
-    )
-    assert lines.count(escaped) == 3
 
 
 def test_numbers_that_are_shown_as_one_have_the_digits_of_their_spread():

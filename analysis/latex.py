@@ -1,0 +1,174 @@
+"""Tables for a paper in LaTeX: over both columns, no wider than its text.
+
+They need the packages array, booktabs and graphicx.
+"""
+
+import re
+import textwrap
+from dataclasses import dataclass
+
+from analysis.formatting import DASH
+
+SPECIAL = {character: f"\\{character}" for character in "&%$#_{}"}
+SPECIAL |= {"^": r"\^{}", "~": r"\textasciitilde{}", "\\": r"\textbackslash{}", DASH: "--"}
+SPECIAL |= {sign: rf"\ensuremath{{{sign}}}" for sign in "<>"}
+SPECIAL |= {"\u00b1": r"$\pm$", "\u2212": "$-$"}
+CHARACTER, BETWEEN = 3.7, 7.0  # points at \footnotesize: of a character, and between columns
+# Characters in a line of a column of text, which is broken there
+MOST_OF_NAMES, MOST_OF_WORDS = 24, 12
+KEPT = ("environment", "noise", "noise rate", "steps millions", "algorithm, environment")
+SECONDARY = ("P(improvement)", "IQM change %", "effect size", "chosen from")  # left out first
+MOST_LINES = 48  # of a table; what is left has a table of its own
+NUMBER = re.compile(r"((?:< ?)?[-+]?(?:[0-9]|inf)[^ ]*) ?(.*)")
+TWO_PARTS = "r@{~}l"
+NUMBERS = {"r": 1, TWO_PARTS: 2}  # forms of columns of numbers: how many columns each is
+OF_STUDY = ("algorithm", "exp name", "phase", "tested")  # in the caption where all rows share it
+
+
+@dataclass
+class Column:
+    """A column of a table in LaTeX."""
+
+    head: str
+    form: str  # as in \begin{tabular}{...}
+    cells: list
+    width: float  # in points, about
+    lines: list  # how many each cell takes
+
+
+def escaped(text):
+    """Escape a text, with real minus signs and powers of ten."""
+    text = re.sub(r"(?<![\w.)])-(?=[0-9]|inf)", "\u2212", str(text))
+    text = "".join(SPECIAL.get(character, character) for character in text)
+    return re.sub(r"(?<=[0-9])e([-+]?)\+?0*([0-9]+)", power_of_ten, text)
+
+
+def power_of_ten(found):
+    """Write the exponent that a regular expression has found."""
+    sign, digits = found.groups()
+    return rf"$\cdot10^{{{sign.strip('+')}{digits}}}$"
+
+
+def headed(name, form, cells, characters, lines=None):
+    """Make a Column whose head is broken to be about as wide as its cells."""
+    words = textwrap.wrap(name, max(9, characters), break_long_words=False)
+    width = CHARACTER * max(characters, *map(len, words)) + BETWEEN
+    head = escaped(words[0])
+    if len(words) > 1:
+        head = "\\shortstack{" + r"\\".join(map(escaped, words)) + "}"
+    if form in NUMBERS:
+        head = rf"\multicolumn{{{NUMBERS[form]}}}{{c}}{{{head}}}"
+    return Column(head, form, cells, width, lines or [1] * len(cells))
+
+
+def number_column(name, values):
+    """Make a Column of numbers, which meet at the sign behind them: "115" and "± 13"."""
+    found = [NUMBER.fullmatch(value) for value in values]
+    pairs = [match.groups() if match else (DASH, "") for match in found]
+    first, second = (max(map(len, parts), default=0) for parts in zip(*pairs, strict=True))
+    if not second:
+        return headed(name, "r", [escaped(number) for number, _ in pairs], first)
+    cells = [f"{escaped(number)} & {escaped(rest)}" for number, rest in pairs]
+    return headed(name, TWO_PARTS, cells, first + 1 + second)
+
+
+def text_column(name, values):
+    """Make a Column of text, which is broken between the words of a name where it is long."""
+    most = MOST_OF_NAMES if name == "noise" or "environment" in name else MOST_OF_WORDS
+    longest = max(map(len, values), default=0)
+    if longest <= most:
+        return headed(name, "l", list(map(escaped, values)), longest)
+    pieces = [re.split(r"(?<=[a-z0-9])(?=[A-Z(])", value) for value in values]
+    cells = [r"\allowbreak{}".join(map(escaped, parts)) for parts in pieces]
+    lines = [-(-len(value) // (3 * most // 4)) for value in values]
+    form = rf">{{\raggedright\arraybackslash}}p{{{CHARACTER * most:.0f}pt}}"
+    return headed(name, form, cells, most, lines)
+
+
+def is_number(name, values):
+    """Tell whether a column has nothing but numbers."""
+    if name == "noise rate" or not values:
+        return False
+    return all(value == DASH or NUMBER.fullmatch(value) for value in values)
+
+
+def fitting(text, points):
+    """Return the Columns of a table that have room, and the names of those that have none.
+
+    The secondary ones are left out first, then the last ones. What a row is about stays, and the
+    columns of noise rates.
+    """
+    columns = {}
+    for name in text:
+        values = list(text[name])
+        make = number_column if is_number(name, values) else text_column
+        columns[name] = make(name, values)
+    out = [name for name in SECONDARY if name in columns]
+    out += [name for name in reversed(columns) if name not in (*out, *KEPT) and name[0].isalpha()]
+    left_out = []
+    while out and sum(column.width for column in columns.values()) > points:
+        left_out.append(out.pop(0))
+        del columns[left_out[-1]]
+    return list(columns.values()), left_out
+
+
+def latex_table(table, text, inches):
+    """Write a table in LaTeX that is at most so wide; text: as a person reads it.
+
+    Columns are left out where there is no room for them, and a comment names them. A value that is
+    that of the row above is not said again. What all rows share is said in the caption.
+    """
+    caption = f"{table.caption} {table.note}".strip()
+    shared = [name for name in OF_STUDY if name in text and text[name].nunique() == 1]
+    if shared and len(text) > 1:
+        caption = f"{', '.join(text.iloc[0][shared])}: {caption}"
+        text = text.drop(columns=shared)
+    columns, left_out = fitting(text, 72 * inches)
+    lines = []
+    if left_out:
+        lines.append(f"% no room for: {', '.join(left_out)} (see {table.name}.csv)")
+    for start, end in parts_of(columns, len(text)):
+        continued = " (continued)" if start else ""
+        lines += [
+            r"\begin{table*}[t]",
+            r"\centering",
+            rf"\caption{{{escaped(caption if not start else table.caption)}{continued}}}",
+            r"\vspace{3pt}",
+            r"\footnotesize\setlength{\tabcolsep}{3pt}",
+            r"\resizebox{\ifdim\width>\textwidth\textwidth\else\width\fi}{!}{%",
+            rf"\begin{{tabular}}{{@{{}}{''.join(column.form for column in columns)}@{{}}}}",
+            r"\toprule",
+            " & ".join(column.head for column in columns) + r" \\",
+            r"\midrule",
+            *rows_of(columns, start, end),
+            r"\bottomrule",
+            r"\end{tabular}}",
+            r"\end{table*}",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def parts_of(columns, number):
+    """Yield the first row and the end of each part of a table that is as long as a page."""
+    start = lines = 0
+    for i in range(number):
+        height = max(column.lines[i] for column in columns)
+        if lines and lines + height > MOST_LINES:
+            yield start, i
+            start, lines = i, 0
+        lines += height
+    yield start, number
+
+
+def rows_of(columns, start, end):
+    """Yield the rows of a table; a text that the row above has, too, is left out."""
+    for i in range(start, end):
+        cells, same = [], i > start
+        for column in columns:
+            is_text = column.form not in NUMBERS
+            same = same and is_text and column.cells[i] == column.cells[i - 1]
+            cells.append("" if same else column.cells[i])
+        first = columns[0].cells
+        if i > start and first[i] != first[i - 1] and first[i] in first[i + 1 : i + 2]:
+            yield r"\addlinespace"
+        yield " & ".join(cells) + r" \\"
