@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 from string import Formatter
 
-RATE = re.compile(r"(?<=[`)]), p = ")  # behind a noise, as in the csv files and in the paper
+RATE = re.compile(r"(?<=[`)a-z]), p = ")  # behind a noise, as in older csv files and in the paper
 TABLES = Path(__file__).parents[1] / "tables"
 COMPARISON = {  # of the columns of compare.comparisons
     "environment": "{environment}",
