@@ -221,7 +221,7 @@ def test_advance_gives_the_same_whenever_it_is_asked():
     [(0, "normal", (0.012, 0.042), (28, 34)), (1, "normal", (0.89, 0.96), (32, 38))],
 )
 def test_the_simulation_of_a_confirmation(gain, draw, share, runs):
-    """A small one of tools/simulate_choose.py, whose tables are in docs/sweeps.md."""
+    """A small one of tools/simulate_choose.py, whose tables are in docs/statistics.md."""
     draw = simulate_choose.DRAWS[draw]
     _, _, claims, used = simulate_choose.simulate(1, simulate_choose.FIVE, gain, draw, trials=600)
     assert share[0] <= claims <= share[1] and runs[0] <= used <= runs[1]
