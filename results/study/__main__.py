@@ -8,8 +8,9 @@ from results.study.compare import by_the_tool, comparisons, in_looks
 from results.study.returns import RESULTS, read_returns
 
 SETS = ("ppo_hopper", "sac_200k", "td3_200k")  # A, B and C of plans.md
-# F and G, with their environments and seeds: a table as soon as two environments have runs
-NEW_SETS = {"td3_fresh": (3, 8), "ppo_relative": (4, 6)}
+# F and G, with their environments, seeds with noise and without; they get a table when they have
+# runs in two environments
+NEW_SETS = {"td3_fresh": (3, 8, 8), "ppo_relative": (4, 6, 9)}
 
 
 def tables():

@@ -179,7 +179,7 @@ NAMES |= {
 }
 
 
-def by_the_tool(folder, environments, seeds):
+def by_the_tool(folder, environments, seeds, seeds_without):
     """Compare the runs of a set as analyze.py does: sets F and G of plans.md.
 
     The rows "together", one for each noise, have the verdicts, corrected for each other, when all
@@ -192,9 +192,11 @@ def by_the_tool(folder, environments, seeds):
     if together.empty:
         return together
     together["holm"] = holm(together["p"])
-    complete = (together["environments"] == environments) & (together["n"] == seeds)
-    verdicts = pd.Series(list(map(in_words, together["t"], together["holm"])), together.index)
-    together["verdict"] = verdicts.where(complete, "under way")
+    sizes = together[["environments", "n", "n_baseline"]]
+    if (sizes == [environments, seeds, seeds_without]).all(axis=None):
+        together["verdict"] = list(map(in_words, together["t"], together["holm"]))
+    else:
+        together["verdict"] = "under way"
     columns = ["environment", "noise", "rate", "n", "mean", "sd", "n_without", "mean_without"]
     columns += ["sd_without", "difference", "difference_percent", "low_percent", "high_percent"]
     columns += ["effect_size", "p", "holm", "verdict"]

@@ -260,7 +260,7 @@ def test_the_levels_of_set_e_stand_in_its_plan():
 def test_sets_f_and_g_are_compared_as_analyze_does(data):
     """One verdict a noise, over environments; two noises are corrected for each other."""
     (data / "set").mkdir()
-    assert compare.by_the_tool("set", 2, 6).empty
+    assert compare.by_the_tool("set", 2, 6, 6).empty
     rng = np.random.default_rng(0)
     for env_id, level in {"Hopper-v5": 100, "Pusher-v5": -50}.items():
         for noise, change in (("", 0), (NOISE, 0), (SCALE, -9)):
@@ -268,14 +268,14 @@ def test_sets_f_and_g_are_compared_as_analyze_does(data):
                 tests = level + change + rng.normal(size=10)
                 named = {"noise": noise, "rate": 1.0} if noise else {}
                 sweeps.write_run(data / "set", tests, "PPO", env_id, seed=seed, **named)
-    table = compare.by_the_tool("set", 2, 6).set_index(["environment", "noise"])
+    table = compare.by_the_tool("set", 2, 6, 6).set_index(["environment", "noise"])
     assert len(table) == 6 and set(table["n"]) == {6}
     assert table["verdict"]["together", SCALE] == "harms"
     assert table["verdict"]["together", NOISE] == "undecided"
     assert table["holm"]["together", SCALE] == pytest.approx(2 * table["p"]["together", SCALE])
     assert table["difference_percent"]["Hopper", SCALE] == pytest.approx(-9, abs=1)
     assert pd.isna(table["verdict"]["Hopper", SCALE])
-    for planned in ((3, 6), (2, 8)):
+    for planned in ((3, 6, 6), (2, 8, 6), (2, 6, 9)):
         table = compare.by_the_tool("set", *planned)
         assert set(table["verdict"].dropna()) == {"under way"}
 
