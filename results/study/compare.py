@@ -4,7 +4,11 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+from analysis.comparisons import compare_all, results
+from analysis.runs import read_runs
 from analysis.statistics import at_least_minus_100, fieller
+from analysis.studies import make_studies
+from results.study import returns
 
 LEVEL = 0.05
 SHUFFLES = 100_000
@@ -131,7 +135,7 @@ def in_words(effect, p):
     return "helps" if effect > 0 else "harms"
 
 
-# Set E of plans.md: after so many seeds a side, the nominal level of p, and what t must reach
+# Set E of plans.md: after so many seeds a side, the nominal level of p, and what |t| must reach
 LOOKS = {
     10: (0.0000011, 0.0),
     20: (0.00079, 0.3),
@@ -141,19 +145,64 @@ LOOKS = {
 }
 
 
-def in_looks(table):
-    """Return comparisons with the verdict of set E's rule in place of that of one look."""
-    table = table.copy()
-    for index, row in table.iterrows():
-        n = row["n"]
-        t = row["difference"] / np.sqrt(row["sd"] ** 2 / n + row["sd_without"] ** 2 / n)
-        level, least_t = LOOKS.get(n, (0.0, 0.0))
-        if row["p"] <= level:
-            verdict = "helps" if row["difference"] > 0 else "harms"
+def in_looks(runs):
+    """Compare the runs of set E, in the order of their seeds, at each look and after the last seed.
+
+    The look that decides, or sees too little hope, is the last row: what comes after it does not
+    count.
+    """
+    sides = runs.groupby("seed")["seed"].transform("size")
+    seeds = runs.loc[sides == 2, "seed"].sort_values().unique()  # with noise and without
+    rows = []
+    for n in sorted({*LOOKS, len(seeds)}):
+        if n > len(seeds):
+            break
+        row = comparisons(runs[runs["seed"].isin(seeds[:n])]).iloc[0].drop("holm")
+        x, y = row["sd"], row["sd_without"]
+        row["t"] = row["difference"] / np.sqrt((x**2 + y**2) / n)
+        row["level"], least_t = LOOKS.get(n, (np.nan, 0.0))
+        if row["p"] <= row["level"]:
+            row["verdict"] = "helps" if row["difference"] > 0 else "harms"
         else:
-            verdict = "undecided" if abs(t) < least_t else "under way"
-        table.loc[index, "verdict"] = verdict
-    return table
+            row["verdict"] = "undecided" if abs(row["t"]) < least_t else "under way"
+        rows.append(row)
+        if row["verdict"] != "under way":
+            break
+    return pd.DataFrame(rows)
+
+
+NAMES = {"std": "sd", "n_baseline": "n_without", "baseline_mean": "mean_without"}
+NAMES |= {
+    "baseline_std": "sd_without",
+    "percent_low": "low_percent",
+    "percent_high": "high_percent",
+}
+
+
+def by_the_tool(folder, environments, seeds, seeds_without):
+    """Compare the runs of a set as analyze.py does: sets F and G of plans.md.
+
+    The rows "together", one for each noise, have the verdicts, corrected for each other, when all
+    environments have all seeds. A set without a noise in two environments has no table yet.
+    """
+    studies, _ = make_studies(read_runs(returns.DATA / folder))
+    compared = compare_all(studies)
+    together = compared.noises_together.assign(environment="together")
+    alone = results(studies, compared).query("noise != ''").drop(columns="verdict")
+    if together.empty:
+        return together
+    together["holm"] = holm(together["p"])
+    sizes = together[["environments", "n", "n_baseline"]]
+    if (sizes == [environments, seeds, seeds_without]).all(axis=None):
+        together["verdict"] = list(map(in_words, together["t"], together["holm"]))
+    else:
+        together["verdict"] = "under way"
+    columns = ["environment", "noise", "rate", "n", "mean", "sd", "n_without", "mean_without"]
+    columns += ["sd_without", "difference", "difference_percent", "low_percent", "high_percent"]
+    columns += ["effect_size", "p", "holm", "verdict"]
+    table = pd.concat([alone, together]).rename(columns=NAMES | {"noise_rate": "rate"})
+    table["environment"] = table["environment"].str.split("-").str[0]
+    return table[columns].reset_index(drop=True)
 
 
 def judge_claim(tests, claimed=1, of=all):

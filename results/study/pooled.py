@@ -7,7 +7,6 @@ once. The test is that of the first page, Mann-Whitney's.
 import pandas as pd
 
 from analysis.folders import read_run
-from noisy_wrappers import run_name
 from results.study.compare import average_change, compare, holm, mann_whitney_p
 from results.study.returns import (
     DATA,
@@ -15,7 +14,6 @@ from results.study.returns import (
     RESULTS,
     curve_of,
     each_run_once,
-    read_curve,
     read_returns,
     select,
 )
@@ -24,23 +22,6 @@ BATCHES = ("runs", "paper_tests", "robustness", "ablation", "choice", "schedules
 PAPER_FINAL = 9515  # of SAC on HalfCheetah without noise, in the paper's early_performance table
 SCALE = "RandomUniformScaleReward(0.5, 1.5)"
 EARLY_STEPS = 200_000
-
-
-def batches():
-    """Return PPO's returns without noise in each batch of a million steps.
-
-    `also_elsewhere` of the n runs are in a batch above, too.
-    """
-    runs = read_returns(*BATCHES).query("noise == '' and algorithm == 'PPO'")
-    runs["also_elsewhere"] = ~runs.index.isin(each_run_once(runs).index)
-    groups = runs.groupby(["environment", "folder"], sort=False)
-    table = groups.agg(
-        n=("test", "size"),
-        also_elsewhere=("also_elsewhere", "sum"),
-        mean=("test", "mean"),
-        sd=("test", "std"),
-    )
-    return table.reset_index().sort_values("environment", kind="stable")
 
 
 def best_noises():
@@ -55,6 +36,14 @@ def best_noises():
         row = case | {"paper_percent": paper.improvement_percent}
         rows.append(row | compare(*samples, mann_whitney_p))
     return pd.DataFrame(rows).assign(holm=holm([row["p"] for row in rows]))
+
+
+def hopper():
+    """Compare PPO's best noise on Hopper with no noise: all runs, and the fresh ones of set A."""
+    runs = each_run_once(read_returns(*BATCHES, "ppo_hopper"))
+    case = {"environment": "Hopper", "noise": "RandomNormalNoisyReward(1.0)", "rate": "1.0"}
+    samples = (select(runs, "PPO", *c) for c in (case.values(), ["Hopper"]))
+    return pd.DataFrame([case | compare(*samples, mann_whitney_p)])
 
 
 def sac_early():
@@ -99,23 +88,6 @@ def first(curve, value):
     """Return the first step at which a curve is at a value, or an empty text."""
     there = curve.index[curve >= value]
     return there[0] if len(there) else ""
-
-
-def pusher_steps():
-    """Return when the mean of PPO on Pusher is at the last mean without noise, by seeds."""
-    rows = []
-    for low, high in ((1, 10), (11, 30), (1, 30)):
-        means = []
-        for noises, rates in (([], []), (["RandomEarlyTermination(50)"], [1.0])):
-            run = ("Pusher-v5", "ppo_continuous_noisy", noises, rates)
-            paths = [DATA / "runs" / run_name(*run, seed) for seed in range(low, high + 1)]
-            means.append(pd.DataFrame(map(read_curve, paths)).mean())
-        without, noisy = means
-        last = without.iloc[-1]
-        row = {"seeds": f"{low} to {high}", "last mean without noise": round(last, 1)}
-        row |= {"steps without": first(without, last), "steps with": first(noisy, last)}
-        rows.append(row)
-    return pd.DataFrame(rows)
 
 
 def consistent_rows():

@@ -36,11 +36,6 @@ def read_returns(*names, step=None):
     return pd.DataFrame(rows)
 
 
-def read_curve(folder):
-    """Return the mean test returns of a run, indexed by step."""
-    return curve_of(read_run(folder))
-
-
 def curve_of(run):
     """Return the mean test returns of a Run, indexed by step."""
     return pd.Series(run.curve.returns, index=run.curve.steps)

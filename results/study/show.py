@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 from string import Formatter
 
-RATE = re.compile(r"(?<=[`)]), p = ")  # behind a noise, as in the csv files and in the paper
+RATE = re.compile(r"(?<=[`)a-z]), p = ")  # behind a noise, as in older csv files and in the paper
 TABLES = Path(__file__).parents[1] / "tables"
 COMPARISON = {  # of the columns of compare.comparisons
     "environment": "{environment}",
@@ -18,7 +18,10 @@ COMPARISON = {  # of the columns of compare.comparisons
     "with noise": "{mean:,.1f} ± {sd:,.1f}",
     "without": "{mean_without:,.1f} ± {sd_without:,.1f}",
     "change [95 %]": "{difference_percent:+z.0f} % [{low_percent:z.0f}, {high_percent:z.0f}]",
+    "effect, sd": "{effect_size:+.2f}",
+    "t": "{t:.2f}",
     "p": "{p:.2g}",
+    "p needed": "{level:.2g}",
     "Holm": "{holm:.2g}",
     "verdict": "{verdict}",
 }

@@ -9,8 +9,10 @@ import pytest
 import sweeps
 from scipy import stats
 
+from analysis import permutation
 from analysis.statistics import fieller
-from results.study import __main__, baselines, claims, compare, paper, physics, returns
+from results import recompute
+from results.study import __main__, claims, compare, paper, returns
 
 NOISE = "RandomNormalNoisyReward(1.0)"
 SCALE = "RandomUniformScaleReward(0.5, 1.5)"
@@ -150,66 +152,9 @@ def test_reading_runs(data):
     assert list(returns.read_returns("a", step=10)["test"]) == [0, 0]
 
 
-def write_physics(folder, env_id, training, seed, final, changed):
-    """Write a run of set D: two episodes of a test, whose mean is `changed` under other physics."""
-    path = write_run(folder, final, training, seed=seed, env_id=env_id)
-    rows = ["noise,noise_rate,episode,episodic_return,episodic_length"]
-    for test, noise in physics.NOISES.items():
-        mean = changed + test - 1 if test in physics.CHANGED else final
-        for episode, offset in enumerate((-1, 1)):
-            rows.append(f'"{noise}",{1.0 if noise else 0.0},{episode},{mean + offset},9')
-        rows.append(f'"{noise}",0.5,0,1e9,9')  # another rate: not in the plan
-    (path / "robustness.csv").write_text("\n".join(rows) + "\n")
-    return path
-
-
-def test_physics(data, tmp_path, monkeypatch):
-    """With dynamics in training, 10 less in the clean environment and 50 more in a changed one."""
-    monkeypatch.setattr(physics, "ENVIRONMENTS", ["Hopper", "Pusher"])
-    gains = {"": (0, 0), physics.DYNAMICS: (-10, 50)} | dict.fromkeys(physics.CHEAP, (0, 40))
-    gains[physics.CHEAP[1]] = 0, 60
-    assert physics.tables() == {}
-    for seed in range(1, 6):
-        assert physics.read_tests().empty == (seed < 3)  # one seed alone has no deviation
-        for env_id, level in {"Hopper-v5": 100, "Pusher-v5": -100}.items():
-            for training, (clean, changed) in gains.items():
-                values = level + seed + clean, level + seed + changed
-                path = write_physics(data / "physics", env_id, training, seed, *values)
-    (path / "robustness.csv").unlink()  # of the last seed, in one environment: it is not whole
-    tests = physics.read_tests()
-    assert list(tests.index) == [(e, s) for e in ("Hopper", "Pusher") for s in range(1, 5)]
-
-    shown = physics.by_training(tests).set_index(["environment", "trained with"])
-    assert shown["clean"]["Hopper", "no noise"] == "102.5 ± 1.3" and set(shown["n"]) == {4}
-    assert shown["factor 0.7"]["Pusher", physics.DYNAMICS] == "-47.8 ± 1.3"
-    assert shown["changed physics"]["Pusher", physics.DYNAMICS] == "-47.5 ± 1.3"
-    assert shown["delay 2"]["Hopper", physics.DYNAMICS] == "92.5 ± 1.3"
-
-    clean, gain, more = physics.questions(tests).to_dict("records")
-    assert clean["seeds"] == 4
-    without = 102.5, 97.5  # |mean return| without noise
-    assert clean["change_percent"] == pytest.approx(np.mean([-1000 / mean for mean in without]))
-    assert gain["change_percent"] == pytest.approx(np.mean([5000 / mean for mean in without]))
-    assert more["change_percent"] == pytest.approx(0)
-    assert clean["p"] == pytest.approx(2 / 70**2, abs=2e-4) and more["p"] > 0.9
-    assert clean["holm"] == pytest.approx(3 * clean["p"])
-    assert [row["verdict"] for row in (clean, gain, more)] == ["harms", "helps", "undecided"]
-
-    physics.draw(tests, tmp_path / "a.svg")
-    physics.draw(tests, tmp_path / "b.svg")
-    drawn = (tmp_path / "a.svg").read_bytes()
-    assert drawn == (tmp_path / "b.svg").read_bytes()
-    assert b"Hopper" in drawn and b"Pusher" in drawn and b"no noise" in drawn
-
-
 @pytest.mark.slow
 def test_the_study_agrees_with_the_finished_one():
-    """Another program computed the finished tables: its p, standard errors and percent are here."""
-    theirs = pd.read_csv(returns.RESULTS / "tables/baselines.csv")
-    sac = theirs[theirs["baseline"] == "SAC on HalfCheetah-v5"].iloc[0]
-    ours = baselines.sac_and_td3().query("algorithm == 'SAC' and steps == 1_000_000")
-    assert list(ours["p"]) == pytest.approx([sac["paper_p"], sac["cleanrl_p"]], rel=1e-4)
-    assert list(ours["se"]) == pytest.approx([sac["paper_se"], sac["cleanrl_se"]], rel=1e-4)
+    """Another program computed the finished tables: its p, intervals and percent are here."""
     table = pd.read_csv(returns.RESULTS / "tables/early_termination.csv", index_col=0)
     row = table.loc["terminated at 50, none: fresh seeds 11 to 30"]
     runs = returns.read_returns("runs").query("11 <= seed <= 30")
@@ -256,23 +201,138 @@ def test_the_papers_tables_stand_beside_ours(tmp_path):
     assert len(early) == 75 and len(tables["consistent"]) == 29  # the paper's rows
 
 
-def test_set_e_is_judged_by_its_looks():
-    """Numbers of plans.md: p against the look's level, then t against the limit of futility."""
-    rows = [
-        (10, 0.0000011, 5.0, "harms"),
-        (10, 0.0072, 3.2, "under way"),
-        (11, 0.0000001, 9.0, "under way"),  # no look
-        (20, 0.0008, 0.29, "undecided"),
-        (20, 0.0008, 0.31, "under way"),
-        (30, 0.0074, 2.8, "harms"),
-        (40, 0.0221, 1.29, "undecided"),
-        (50, 0.0424, 2.03, "undecided"),
-    ]
-    table = pd.DataFrame(
-        [
-            {"n": n, "p": p, "difference": -t, "sd": np.sqrt(n / 2), "sd_without": np.sqrt(n / 2)}
-            for n, p, t, _ in rows
-        ]
+def runs_of_set_e(n, change, spread=1.0, seed=0):
+    """Return n seeds a side whose means differ by exactly `change` and deviate by `spread`."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for noise, mean in (("", 100.0), (SCALE, 100.0 + change)):
+        for block in range(0, n, 10):  # so the means are exact at every look
+            values = rng.normal(size=min(10, n - block))
+            values = (values - values.mean()) / values.std() * spread + mean
+            for i, value in enumerate(values):
+                rate = "0.05" if noise else ""
+                row = {"algorithm": "PPO", "environment": "Walker2d", "steps": 1_000_000}
+                row |= {"noise": noise, "rate": rate, "seed": 101 + block + i, "test": value}
+                rows.append(row)
+    return pd.DataFrame(rows)
+
+
+@pytest.mark.parametrize(
+    ("n", "change", "verdicts"),
+    [
+        (9, 0.8, ["under way"]),
+        (10, 0.0, ["under way"]),  # the first look has no limit
+        (10, 9.0, ["under way"]),  # and its p is never small enough: 2 / 184,756 at least
+        (20, 1.5, ["under way", "helps"]),
+        (20, -1.5, ["under way", "harms"]),
+        (20, 0.05, ["under way", "undecided"]),
+        (20, 0.5, ["under way", "under way"]),
+        (23, -1.5, ["under way", "harms"]),  # what comes after the decision does not count
+        (23, 0.5, ["under way", "under way", "under way"]),
+        (30, 0.1, ["under way", "under way", "undecided"]),
+        (30, -0.9, ["under way", "under way", "harms"]),
+        (40, 0.28, 3 * ["under way"] + ["undecided"]),
+        (50, 0.39, 4 * ["under way"] + ["undecided"]),
+        (50, -0.45, 4 * ["under way"] + ["harms"]),
+    ],
+)
+def test_set_e_ends_at_the_look_that_decides(n, change, verdicts, monkeypatch):
+    """Runs of both directions: better, worse, too little hope, and going on."""
+    monkeypatch.setattr(compare, "SHUFFLES", 20_000)
+    runs = runs_of_set_e(n, change)
+    half = runs.iloc[[0]].assign(seed=999)  # a seed with one side only
+    table = compare.in_looks(pd.concat([runs, half]))
+    assert list(table["verdict"]) == verdicts
+    assert list(table["n"]) == [*[k for k in compare.LOOKS if k <= n], n][: len(verdicts)]
+    looks = table[table["n"].isin(compare.LOOKS)]
+    assert list(looks["level"]) == [compare.LOOKS[k][0] for k in looks["n"]]
+
+
+def test_the_levels_of_set_e_stand_in_its_plan():
+    plan = (returns.RESULTS / "plans.md").read_text().split("## E. ")[1]
+    rows = [line.strip("| ").split(" | ") for line in plan.splitlines() if line.startswith("| ")]
+    seeds, levels, least = rows[:3]
+    assert list(map(int, seeds[1:])) == list(compare.LOOKS)
+    assert [float(text) for text in levels[1:]] == [p for p, _ in compare.LOOKS.values()]
+    assert [float(text) for text in least[2:5]] == [t for _, t in compare.LOOKS.values()][1:4]
+
+
+def test_sets_f_and_g_are_compared_as_analyze_does(data):
+    """One verdict a noise, over environments; two noises are corrected for each other."""
+    (data / "set").mkdir()
+    assert compare.by_the_tool("set", 2, 6, 6).empty
+    rng = np.random.default_rng(0)
+    for env_id, level in {"Hopper-v5": 100, "Pusher-v5": -50}.items():
+        for noise, change in (("", 0), (NOISE, 0), (SCALE, -9)):
+            for seed in range(201, 207):
+                tests = level + change + rng.normal(size=10)
+                named = {"noise": noise, "rate": 1.0} if noise else {}
+                sweeps.write_run(data / "set", tests, "PPO", env_id, seed=seed, **named)
+    table = compare.by_the_tool("set", 2, 6, 6).set_index(["environment", "noise"])
+    assert len(table) == 6 and set(table["n"]) == {6}
+    assert table["verdict"]["together", SCALE] == "harms"
+    assert table["verdict"]["together", NOISE] == "undecided"
+    assert table["holm"]["together", SCALE] == pytest.approx(2 * table["p"]["together", SCALE])
+    assert table["difference_percent"]["Hopper", SCALE] == pytest.approx(-9, abs=1)
+    assert pd.isna(table["verdict"]["Hopper", SCALE])
+    for planned in ((3, 6, 6), (2, 8, 6), (2, 6, 9)):
+        table = compare.by_the_tool("set", *planned)
+        assert set(table["verdict"].dropna()) == {"under way"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("environments", "n", "m", "shift", "test"),
+    [
+        (3, 5, 5, 1.1, "joint"),  # set B
+        (3, 4, 4, 1.3, "joint"),  # set C
+        (4, 10, 10, 0.64, "joint"),  # set D
+        (3, 8, 8, 0.85, "tool"),  # set F
+        (4, 6, 9, 0.76, "tool"),  # set G, uncorrected
+    ],
+)
+def test_the_plans_and_physics_say_the_power(environments, n, m, shift, test, monkeypatch):
+    """A shift of so many standard deviations in every environment is found in 80 % of cases."""
+    monkeypatch.setattr(compare, "SHUFFLES", 499)
+    monkeypatch.setattr(permutation, "RANDOM_PARTITIONS", 999)
+    rng, found, trials = np.random.default_rng(0), 0, 300
+    for _ in range(trials):
+        x, y = rng.normal(shift, 1, (n, environments)), rng.normal(0, 1, (m, environments))
+        if test == "joint":
+            found += compare.joint_p(list(zip(x.T, y.T, strict=True))) <= 0.05
+        else:
+            found += permutation.permutation_t(x, y)[1] <= 0.05
+    assert found / trials == pytest.approx(0.8, abs=0.07)
+
+
+def test_the_second_computation_has_its_own_statistics():
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(5, 1, 6), rng.normal(4, 2, 8)
+    assert recompute.tail(2.0, 7.3) == pytest.approx(stats.t.sf(2.0, 7.3), rel=1e-6)
+    assert recompute.quantile(4.2) == pytest.approx(stats.t.ppf(0.975, 4.2), rel=1e-5)
+    assert recompute.fieller(x, y)[1:] == pytest.approx(fieller(x, y), rel=1e-4)
+    assert recompute.mann_whitney(x, y) == pytest.approx(compare.mann_whitney_p(x, y))
+    assert recompute.one(x, y) == pytest.approx(compare.permutation_p(x, y), rel=1e-9)
+    assert recompute.average([(x, y)] * 2) == pytest.approx(
+        compare.average_change([(x, y)] * 2)[:3], rel=1e-4
     )
-    verdicts = compare.in_looks(table.assign(verdict=""))["verdict"]
-    assert list(verdicts) == [verdict for *_, verdict in rows]
+    assert recompute.holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
+
+
+def test_a_number_that_differs_is_found(monkeypatch):
+    monkeypatch.setattr(recompute, "wrong", [])
+    row = {"a": "-1,259 [-1,769, -748]", "p": "2.8e-11", "b": "", "c": "-0 %"}
+    recompute.check("t", row, "a", -1259.4, -1768.6, -748.0)
+    recompute.check("t", row, "p", 2.83e-11)
+    recompute.check("t", row, "b", np.nan, np.nan)
+    recompute.check("t", row, "c", -0.4)
+    assert recompute.wrong == []
+    recompute.check("t", row, "a", -1259.4, -1767.0, -748.0)
+    recompute.check("t", row, "p", 2.87e-11)
+    recompute.check("t", row, "b", 1.0)
+    assert len(recompute.wrong) == 3
+
+
+@pytest.mark.slow
+def test_the_tables_are_right_by_the_second_computation(capsys):
+    assert recompute.main() == 0, capsys.readouterr().out

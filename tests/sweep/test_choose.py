@@ -220,7 +220,7 @@ def test_advance_gives_the_same_whenever_it_is_asked():
     [(0, "normal", (0.005, 0.05), (27, 35)), (1, "normal", (0.88, 0.97), (31, 39))],
 )
 def test_the_simulation_of_a_confirmation(gain, draw, share, runs):
-    """A small one of tools/simulate_choose.py, whose tables are in docs/sweeps.md."""
+    """A small one of tools/simulate_choose.py, whose tables are in docs/statistics.md."""
     draw = simulate_choose.DRAWS[draw]
     _, _, claims, used = simulate_choose.simulate(1, simulate_choose.FIVE, gain, draw, trials=300)
     assert share[0] <= claims <= share[1] and runs[0] <= used <= runs[1]
