@@ -49,7 +49,8 @@ import noisy_wrappers as noisy
 from analysis import folders
 from analysis.errors import fail, in_words, take_over_terminal, with_place
 from analysis.folders import NOT_SETTINGS, PHASES, DamageError
-from analysis.formatting import rounded, slug
+from analysis.formatting import DASH, rounded, slug
+from analysis.matrices import matrices
 from analysis.runs import (
     ROBUSTNESS_COLUMNS,
     study_name,
@@ -443,7 +444,10 @@ def names_of(players):
 
 
 def print_table(players, conditions, stored, episodes):
-    """Print mean and sample standard deviation over seeds: one table for each noise of the test."""
+    """Print mean and sample standard deviation over seeds: one table for each noise of the test.
+
+    Two noises that were combined with several numbers of each are matrices instead.
+    """
     trained = {}
     for player, name in zip(players, names_of(players), strict=True):
         run = player.run
@@ -451,18 +455,30 @@ def print_table(players, conditions, stored, episodes):
         noise = run.configuration.noise or "no noise"
         row = where, name, noise, run.configuration.noise_rate
         trained.setdefault(row, []).append(player)
-    noises = dict.fromkeys(condition.noise for condition in conditions if condition.noise)
+
+    def cell(seeds, condition):
+        return mean_return([stored[one][one.key(condition)] for one in seeds], episodes)
+
+    found = matrices(conditions)
+    arranged = {one for matrix in found for one in matrix.cells.values()} - {noisy.BASELINE}
+    alone = [condition for condition in conditions if condition not in arranged]
+    noises = dict.fromkeys(condition.noise for condition in alone if condition.noise)
     for noise in noises or [""]:
-        columns = [condition for condition in conditions if condition.noise in ("", noise)]
+        columns = [condition for condition in alone if condition.noise in ("", noise)]
         headers = ["environment", "algorithm", "trained with", "at rate", "seeds"]
         headers += [f"at {column.columns[1]}" if column.noise else "clean" for column in columns]
-        rows = []
-        for row, seeds in trained.items():
-            played = [[stored[one][one.key(column)] for one in seeds] for column in columns]
-            rows.append([*row, len(seeds), *(mean_return(results, episodes) for results in played)])
+        rows = [
+            [*row, len(seeds), *(cell(seeds, column) for column in columns)]
+            for row, seeds in trained.items()
+        ]
         if noise:
             print(f"\nMean return, tested with {noise}")
         print(tabulate(rows, headers, disable_numparse=True))
+    for matrix, ((where, name, noise, rate), seeds) in itertools.product(found, trained.items()):
+        print(f"\nMean return, tested with {matrix.name}")
+        print(f"{name} on {where}, trained with {noise} at rate {rate}, seeds: {len(seeds)}")
+        cells = matrix.frame({one: cell(seeds, one) for one in matrix.cells.values()}).fillna(DASH)
+        print(tabulate(cells, cells.columns, disable_numparse=True))
 
 
 def mean_return(played, episodes):
