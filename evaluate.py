@@ -357,6 +357,13 @@ def exit_now(status):
     os._exit(status)
 
 
+def exit_at_signals():
+    """End at once when this process is terminated or its terminal is closed."""
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) != signal.SIG_IGN:  # as nohup has it
+            signal.signal(number, lambda number, frame: exit_now(128 + number))
+
+
 def attempt(task, args):
     """Return what `play` returns of a task, (player, condition), or in words why it cannot."""
     try:
@@ -388,6 +395,7 @@ def end_with_program():
         exit_now(1)
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    exit_at_signals()
     threading.Thread(target=wait, daemon=True).start()
 
 
@@ -592,7 +600,7 @@ def main(args):
 
 if __name__ == "__main__":
     take_over_terminal()
-    signal.signal(signal.SIGTERM, lambda number, frame: exit_now(128 + number))
+    exit_at_signals()
     try:
         sys.exit(main(tyro.cli(Args, description=__doc__)))
     except KeyboardInterrupt:

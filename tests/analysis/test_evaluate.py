@@ -584,6 +584,42 @@ gym.register("Blind-v0", lambda **given: Blind(gym.make("InvertedPendulum-v5", *
     assert list(videos.iterdir()) == [videos / f"{second.name}__clean.mp4"]
 
 
+ENDLESS = """
+import time
+import numpy as np
+
+class Endless(gym.Wrapper):
+    def step(self, action):
+        time.sleep(0.01)
+        return self.env.reset()[0], 0.0, False, False, {}
+
+    def render(self):
+        return np.zeros((64, 64, 3), np.uint8)
+
+gym.register("Endless-v0", lambda **given: Endless(gym.make("InvertedPendulum-v5", **given)))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number, jobs", [(signal.SIGTERM, 1), (signal.SIGHUP, 2)])
+def test_a_killed_video_leaves_no_hidden_folder(runs, tmp_path, number, jobs):
+    """A terminal that is closed tells all processes at once."""
+    register(tmp_path, "endless", ENDLESS)
+    other_environment(one(runs, "PPO"), "endless:Endless-v0")
+    videos = tmp_path / "videos"
+    options = command(one(runs, "PPO"), "--video", videos, "--jobs", jobs, MUJOCO_GL="egl")
+    process = subprocess.Popen(cwd=tmp_path, start_new_session=True, **options)
+    while not list(videos.glob(".*/video")):
+        assert process.poll() is None
+        time.sleep(0.1)
+    os.killpg(process.pid, number)
+    assert process.wait(timeout=60) == 128 + number
+    deadline = time.time() + 60  # the processes of --jobs end by themselves
+    while list(videos.iterdir()) and time.time() < deadline:
+        time.sleep(0.1)
+    assert list(videos.iterdir()) == []
+
+
 @pytest.mark.slow
 def test_without_an_opengl_library(runs, tmp_path):
     """PyOpenGL is told to load a library that does not exist."""
