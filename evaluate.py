@@ -20,6 +20,7 @@ cannot be tested are listed; the exit status is 1 then, and 2 if there are no ot
 """
 
 import csv
+import gzip
 import hashlib
 import importlib.util
 import itertools
@@ -32,6 +33,7 @@ import sys
 import tempfile
 import threading
 import warnings
+import zlib
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -62,6 +64,7 @@ from analysis.statistics import mean_std
 
 PROJECT = Path(__file__).resolve().parent
 SCRIPTS = {}  # path -> the module, and the SHA-256 of its text
+BAD_FILES = (csv.Error, zlib.error)  # which are no ValueErrors
 UNFINISHED_VIDEOS = set()  # folders that an end of the program deletes
 DISPLAY = "import glfw; assert glfw.init() and glfw.get_primary_monitor()"
 
@@ -289,6 +292,9 @@ def check_players(players, conditions, bad, args):
                 for condition in conditions:
                     condition.wrap(env)
             told |= dict.fromkeys(str(note.message) for note in notes)
+            if player.elsewhere and (kwargs := player.run.args.get("env_kwargs")):
+                text = f"{player.elsewhere} is made without the training's --env-kwargs"
+                told[f"{text}: {' '.join(kwargs)}"] = None
             if not player.run.finished:
                 step = step_of(player)
                 print(f"{player.folder.name} is not finished: its policy of step {step} is tested")
@@ -402,19 +408,27 @@ def end_with_program():
 def read_stored(player):
     """Read robustness.csv: {(noise, noise rate, environment): (return, length, success) of each}.
 
-    The environment is empty for that of the training. Raises DamageError.
+    It may be compressed, as analyze.py reads it, too. The environment is empty for that of the
+    training. Raises DamageError.
     """
     path = player.folder / "robustness.csv"
+    packed = path.with_suffix(".csv.gz")
     stored = {}
     try:
         text = path.read_text("utf-8") if path.exists() else ""
+        if packed.exists() and not path.exists():
+            path = packed
+            text = gzip.decompress(packed.read_bytes()).decode("utf-8")
         for row in csv.DictReader(text.splitlines()):
             success = float(row.get("success") or "nan")
             result = float(row["episodic_return"]), int(row["episodic_length"]), success
             key = row["noise"], row["noise_rate"], row.get("environment") or ""
-            stored.setdefault(key, []).append(result)
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, csv.Error) as error:
-        text = f"robustness.csv: {in_words(error)}; delete that file to play everything again"
+            episodes = stored.setdefault(key, [])
+            if int(row["episode"]) != len(episodes):
+                raise ValueError(f"episode {len(episodes)} is not where it belongs")
+            episodes.append(result)
+    except (OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, *BAD_FILES) as error:
+        text = f"{path.name}: {in_words(error)}; delete that file to play everything again"
         raise DamageError(text) from None
     return stored
 

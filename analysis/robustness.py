@@ -121,8 +121,10 @@ def read_episodes(path, metric=RETURN):
         results = 100 * pd.to_numeric(table.get("success", np.nan))
     table = table.assign(environment=table.get("environment", ""), result=results)
     found = {}
-    for (noise, rate, environment), group in table.groupby(keys, sort=False)["result"]:
-        condition = Configuration.parse(noise, rate)
+    for (noise, rate, environment), rows in table.groupby(keys, sort=False):
+        condition, group = Configuration.parse(noise, rate), rows["result"]
+        if rows["episode"].tolist() != list(range(len(rows))):  # episode i begins alike everywhere
+            raise ValueError(f"episodes under {condition} are lost, repeated or out of order")
         unknown = [name for name in condition.wrappers if name not in WRAPPERS and ":" not in name]
         if unknown:  # and none of the user's own
             raise ValueError(f"unknown noise {unknown[0]!r}")

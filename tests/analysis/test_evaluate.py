@@ -1,6 +1,7 @@
 """evaluate.py as a user meets it: stored returns, the table, videos, bad input."""
 
 import csv
+import gzip
 import importlib
 import json
 import math
@@ -25,8 +26,9 @@ import evaluate
 import ppo_continuous_noisy as ppo
 import sac_continuous_noisy as sac
 import td3_continuous_noisy as td3
-from analysis.folders import Run
+from analysis.folders import DamageError, Run
 from analysis.formatting import rounded
+from analysis.robustness import read_episodes
 from evaluate import Args, main
 from noisy_wrappers import BASELINE, Configuration
 
@@ -298,6 +300,33 @@ def test_what_is_played_is_stored_by_the_process_that_plays_and_the_longer_resul
     for results in (short, long, short):
         evaluate.store(finished, ("", "0.0", ""), results)
     assert evaluate.read_stored(finished)["", "0.0", ""] == long
+
+
+def test_what_is_stored_in_a_compressed_file_is_kept(runs):
+    """Or analyze.py, which takes the file that is not compressed, would lose it."""
+    run_dir = one(runs, "PPO")
+    main(Args((run_dir,), (OBSERVATION,), episodes=2))
+    before = stored(run_dir)
+    (run_dir / "robustness.csv.gz").write_bytes(
+        gzip.compress((run_dir / "robustness.csv").read_bytes())
+    )
+    (run_dir / "robustness.csv").unlink()
+    main(Args((run_dir,), (ACTION,), episodes=2))
+    assert stored(run_dir)[:4] == before and len(stored(run_dir)) == 6
+
+
+@pytest.mark.parametrize("change", [lambda rows: rows[1:], lambda rows: rows + rows])
+def test_episodes_that_are_lost_or_repeated_are_damage(runs, change):
+    """Or the others would count as episodes that begin in other states."""
+    [finished], _ = evaluate.find_players([one(runs, "PPO")])
+    evaluate.store(finished, ("", "0.0", ""), [(1.0, 1, 1.0), (2.0, 2, 0.0)])
+    path = finished.folder / "robustness.csv"
+    header, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([header, *change(rows)]) + "\n")
+    with pytest.raises(DamageError, match="delete that file"):
+        evaluate.read_stored(finished)
+    with pytest.raises(ValueError, match="episodes under no noise"):
+        read_episodes(path)
 
 
 def test_success_that_some_conditions_do_not_tell_is_empty_there(runs):
@@ -749,6 +778,11 @@ def test_another_environment(runs, capsys):
     table = capsys.readouterr().out.splitlines()[-1]
     assert f"{home}, tested in Heavy-v0" in table
     refused(Args((run_dir,), env_id="Pendulum-v1"), "its observation space is Box", runs, capsys)
+    args = json.loads((run_dir / "config.json").read_text())["args"]
+    edit_config(run_dir, args=args | {"env_kwargs": ["frame_skip:3"]})
+    main(Args((run_dir,), env_id="Heavy-v0", episodes=2))
+    told = "Heavy-v0 is made without the training's --env-kwargs: frame_skip:3\n"
+    assert capsys.readouterr().err == told
 
 
 def refused(args, message, runs, capsys):
