@@ -16,7 +16,6 @@ from statistics import fmean
 from typing import NamedTuple
 
 import gymnasium as gym
-import numpy as np
 
 import noisy_wrappers as noisy
 from analysis.errors import fail, with_place
@@ -72,7 +71,7 @@ def ask(env_id, configurations=(), max_episode_steps=None, env_kwargs=()):
                 timed_steps=steps,
                 episode_steps=declared or length,
                 observed=math.prod(env.observation_space.shape),
-                bounded=bool(np.isfinite([env.action_space.low, env.action_space.high]).all()),
+                bounded=noisy.is_bounded(env.action_space),
                 tried=tried,
                 rewards=len(timed.rewards) if steps >= STEPS else MANY,
             )

@@ -144,6 +144,7 @@ def test_what_an_environment_that_records_its_episodes_cannot_have():
         ("DiscreteAction", ["ppo"], "DiscreteAction-v0: needs Box actions of floats in one dim"),
         ("SequenceObservation", ["ppo"], "SequenceObservation-v0: needs Box observations of"),
         ("Unbounded", ["ppo", "sac"], "SAC needs bounded actions; some actions of toy_envs:Unb"),
+        ("FloatMax", ["sac"], "SAC needs bounded actions; some actions of toy_envs:FloatMax"),
         ("BuggyConstructor", ["ppo"], "BuggyConstructor-v0: KeyError: 'missing' ("),
         ("BuggyStep", ["ppo"], "/tests/toy_envs.py, line "),
         ("OneReset", ["ppo"], "OneReset-v0: RuntimeError: the window is open already ("),
