@@ -60,9 +60,10 @@ def ask(env_id, configurations=(), max_episode_steps=None, env_kwargs=()):
         declared = made.spec.max_episode_steps
         with noisy.make_flat(made, STEP_LIMIT) as env:
             limit = env.spec.max_episode_steps
-            timed = RewardCounter(env)
+            timed = Watched(env)
             seconds, steps, length = time_steps(timed, limit, deadline, declared is None)
             env.reset()  # a failure after this one is the noise's
+            limit = min(limit, timed.limit())
             tried = {}
             for n in configurations:  # at every rate: it may fail at one of them
                 tried[n.noise] = tried.get(n.noise) or why_unfit(env, n, limit, deadline)
@@ -77,20 +78,41 @@ def ask(env_id, configurations=(), max_episode_steps=None, env_kwargs=()):
             )
 
 
-class RewardCounter(gym.Wrapper):
-    """Collects the different rewards of an environment, until there are many."""
+class Watched(gym.Wrapper):
+    """Notes the different rewards of an environment, until there are many, and its ends."""
 
     def __init__(self, env):
         """Begin with none."""
         super().__init__(env)
         self.rewards = set()
+        self.steps = 0  # of the episode
+        self.ends = []  # of each episode, its steps and whether it was terminated
+
+    def reset(self, **kwargs):
+        """Begin an episode."""
+        self.steps = 0
+        return self.env.reset(**kwargs)
 
     def step(self, action):
-        """Make a step; remember its reward."""
+        """Make a step; remember its reward, and the end of an episode."""
         result = self.env.step(action)
+        self.steps += 1
         if len(self.rewards) < MANY:
             self.rewards.add(float(result[1]))
+        if result[2] or result[3]:
+            self.ends.append((self.steps, result[2]))
         return result
+
+    def limit(self):
+        """Return a time limit that the environment has inside, as dm_control's do, or infinity.
+
+        That is the length of two or more episodes, if all were truncated there.
+        """
+        ends = set(self.ends)
+        if len(self.ends) < 2 or len(ends) > 1:
+            return math.inf
+        [(steps, terminated)] = ends
+        return math.inf if terminated else steps
 
 
 def time_steps(env, time_limit, deadline, whole=False):

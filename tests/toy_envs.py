@@ -133,13 +133,14 @@ class Parts(Count):
 class Endless(Count):
     """Ends its episodes after `length` steps, and never without; it declares no time limit."""
 
-    def __init__(self, length=np.inf):
+    def __init__(self, length=np.inf, truncated=False):
         super().__init__()
-        self.length = length
+        self.length, self.truncated = length, truncated
 
     def step(self, action):
         observation, reward, _, _, info = super().step(action)
-        return observation, reward, self.steps >= self.length, False, info
+        ends = self.steps >= self.length
+        return observation, reward, ends and not self.truncated, ends and self.truncated, info
 
 
 class Slow(Count):

@@ -130,6 +130,17 @@ def test_an_episode_without_a_declared_limit_is_played_to_its_end(monkeypatch):
     assert environment.time_steps(env, 10_000, deadline)[1:] == (environment.STEPS, 10_000)
 
 
+@pytest.mark.parametrize(
+    ("length", "truncated", "said"),
+    [(20, True, "an episode has at most 20 steps"), (20, False, ""), (60, True, "")],
+)
+def test_a_time_limit_inside_the_environment_counts(length, truncated, said):
+    """One that truncates: a policy may live longer than random actions, which terminate."""
+    kwargs = {"length": length, "truncated": truncated}
+    gym.register("Inside-v0", toy_envs.Endless, kwargs=kwargs)
+    assert ask("Inside-v0", [Configuration.read([LATE], [1.0])]).tried[LATE] == said
+
+
 def test_what_an_environment_that_records_its_episodes_cannot_have():
     recorder = gym.wrappers.RecordEpisodeStatistics
     gym.register("Recorded-v0", lambda **given: recorder(gym.make("Pendulum-v1", **given)))
