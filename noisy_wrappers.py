@@ -2022,6 +2022,7 @@ def _generators(env: Env) -> dict[str, Any]:
     They are named by their places, such as "0._np_random". Nothing else is looked into.
     """
     kinds: tuple[Any, ...] = (np.random.Generator, np.random.RandomState, random.Random)
+    kinds += (np.random.SeedSequence,)  # which counts the children that it spawned
     if torch := sys.modules.get("torch"):
         kinds += (torch.Generator,)
     holders: dict[str, Any] = {}
@@ -2052,6 +2053,8 @@ def _parts_of_space(place: str, space: gym.Space[Any]) -> dict[str, gym.Space[An
 
 def _stream(generator: Any) -> Any:
     """Return the state of a generator, or of random or np.random, in Python's own types."""
+    if isinstance(generator, np.random.SeedSequence):
+        return _without_arrays(generator.state)
     if isinstance(generator, np.random.Generator):
         stream = {"state": generator.bit_generator.state}
         if isinstance(seeds := generator.bit_generator.seed_seq, np.random.SeedSequence):
@@ -2065,7 +2068,9 @@ def _stream(generator: Any) -> Any:
 
 
 def _set_stream(generator: Any, stream: Any) -> None:
-    if isinstance(generator, np.random.Generator):
+    if isinstance(generator, np.random.SeedSequence):
+        generator.__init__(**stream)
+    elif isinstance(generator, np.random.Generator):
         generator.bit_generator.state = stream["state"]
         if "seeds" in stream:  # in place, because whoever spawns may hold it, too
             generator.bit_generator.seed_seq.__init__(**stream["seeds"])
