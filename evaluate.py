@@ -343,7 +343,7 @@ def record(env, policy, seed, path):
         try:
             results = played(video, policy, 1, seed)
         finally:
-            if video.recording:
+            if video.recorded_frames:  # an episode that failed, or was stopped
                 video.stop_recording()
         (folder / "rl-video-episode-0.mp4").replace(path)
     UNFINISHED_VIDEOS.discard(temporary)
