@@ -20,6 +20,7 @@ cannot be tested are listed; the exit status is 1 then, and 2 if there are no ot
 """
 
 import csv
+import gzip
 import hashlib
 import importlib.util
 import itertools
@@ -32,6 +33,7 @@ import sys
 import tempfile
 import threading
 import warnings
+import zlib
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -49,7 +51,8 @@ import noisy_wrappers as noisy
 from analysis import folders
 from analysis.errors import fail, in_words, take_over_terminal, with_place
 from analysis.folders import NOT_SETTINGS, PHASES, DamageError
-from analysis.formatting import rounded, slug
+from analysis.formatting import DASH, rounded, slug
+from analysis.matrices import matrices
 from analysis.runs import (
     ROBUSTNESS_COLUMNS,
     study_name,
@@ -61,6 +64,7 @@ from analysis.statistics import mean_std
 
 PROJECT = Path(__file__).resolve().parent
 SCRIPTS = {}  # path -> the module, and the SHA-256 of its text
+BAD_FILES = (csv.Error, zlib.error)  # which are no ValueErrors
 UNFINISHED_VIDEOS = set()  # folders that an end of the program deletes
 DISPLAY = "import glfw; assert glfw.init() and glfw.get_primary_monitor()"
 
@@ -288,6 +292,9 @@ def check_players(players, conditions, bad, args):
                 for condition in conditions:
                     condition.wrap(env)
             told |= dict.fromkeys(str(note.message) for note in notes)
+            if player.elsewhere and (kwargs := player.run.args.get("env_kwargs")):
+                text = f"{player.elsewhere} is made without the training's --env-kwargs"
+                told[f"{text}: {' '.join(kwargs)}"] = None
             if not player.run.finished:
                 step = step_of(player)
                 print(f"{player.folder.name} is not finished: its policy of step {step} is tested")
@@ -336,7 +343,7 @@ def record(env, policy, seed, path):
         try:
             results = played(video, policy, 1, seed)
         finally:
-            if video.recording:
+            if video.recorded_frames:  # an episode that failed, or was stopped
                 video.stop_recording()
         (folder / "rl-video-episode-0.mp4").replace(path)
     UNFINISHED_VIDEOS.discard(temporary)
@@ -354,6 +361,13 @@ def exit_now(status):
     for folder in UNFINISHED_VIDEOS:
         shutil.rmtree(folder, ignore_errors=True)
     os._exit(status)
+
+
+def exit_at_signals():
+    """End at once when this process is terminated or its terminal is closed."""
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) != signal.SIG_IGN:  # as nohup has it
+            signal.signal(number, lambda number, frame: exit_now(128 + number))
 
 
 def attempt(task, args):
@@ -387,25 +401,34 @@ def end_with_program():
         exit_now(1)
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    exit_at_signals()
     threading.Thread(target=wait, daemon=True).start()
 
 
 def read_stored(player):
     """Read robustness.csv: {(noise, noise rate, environment): (return, length, success) of each}.
 
-    The environment is empty for that of the training. Raises DamageError.
+    It may be compressed, as analyze.py reads it, too. The environment is empty for that of the
+    training. Raises DamageError.
     """
     path = player.folder / "robustness.csv"
+    packed = path.with_suffix(".csv.gz")
     stored = {}
     try:
         text = path.read_text("utf-8") if path.exists() else ""
+        if packed.exists() and not path.exists():
+            path = packed
+            text = gzip.decompress(packed.read_bytes()).decode("utf-8")
         for row in csv.DictReader(text.splitlines()):
             success = float(row.get("success") or "nan")
             result = float(row["episodic_return"]), int(row["episodic_length"]), success
             key = row["noise"], row["noise_rate"], row.get("environment") or ""
-            stored.setdefault(key, []).append(result)
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, csv.Error) as error:
-        text = f"robustness.csv: {in_words(error)}; delete that file to play everything again"
+            episodes = stored.setdefault(key, [])
+            if int(row["episode"]) != len(episodes):
+                raise ValueError(f"episode {len(episodes)} is not where it belongs")
+            episodes.append(result)
+    except (OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, *BAD_FILES) as error:
+        text = f"{path.name}: {in_words(error)}; delete that file to play everything again"
         raise DamageError(text) from None
     return stored
 
@@ -443,7 +466,10 @@ def names_of(players):
 
 
 def print_table(players, conditions, stored, episodes):
-    """Print mean and sample standard deviation over seeds: one table for each noise of the test."""
+    """Print mean and sample standard deviation over seeds: one table for each noise of the test.
+
+    Two noises that were combined with several numbers of each are matrices instead.
+    """
     trained = {}
     for player, name in zip(players, names_of(players), strict=True):
         run = player.run
@@ -451,18 +477,30 @@ def print_table(players, conditions, stored, episodes):
         noise = run.configuration.noise or "no noise"
         row = where, name, noise, run.configuration.noise_rate
         trained.setdefault(row, []).append(player)
-    noises = dict.fromkeys(condition.noise for condition in conditions if condition.noise)
+
+    def cell(seeds, condition):
+        return mean_return([stored[one][one.key(condition)] for one in seeds], episodes)
+
+    found = matrices(conditions)
+    arranged = {one for matrix in found for one in matrix.cells.values()} - {noisy.BASELINE}
+    alone = [condition for condition in conditions if condition not in arranged]
+    noises = dict.fromkeys(condition.noise for condition in alone if condition.noise)
     for noise in noises or [""]:
-        columns = [condition for condition in conditions if condition.noise in ("", noise)]
+        columns = [condition for condition in alone if condition.noise in ("", noise)]
         headers = ["environment", "algorithm", "trained with", "at rate", "seeds"]
         headers += [f"at {column.columns[1]}" if column.noise else "clean" for column in columns]
-        rows = []
-        for row, seeds in trained.items():
-            played = [[stored[one][one.key(column)] for one in seeds] for column in columns]
-            rows.append([*row, len(seeds), *(mean_return(results, episodes) for results in played)])
+        rows = [
+            [*row, len(seeds), *(cell(seeds, column) for column in columns)]
+            for row, seeds in trained.items()
+        ]
         if noise:
             print(f"\nMean return, tested with {noise}")
         print(tabulate(rows, headers, disable_numparse=True))
+    for matrix, ((where, name, noise, rate), seeds) in itertools.product(found, trained.items()):
+        print(f"\nMean return, tested with {matrix.name}")
+        print(f"{name} on {where}, trained with {noise} at rate {rate}, seeds: {len(seeds)}")
+        cells = matrix.frame({one: cell(seeds, one) for one in matrix.cells.values()}).fillna(DASH)
+        print(tabulate(cells, cells.columns, disable_numparse=True))
 
 
 def mean_return(played, episodes):
@@ -576,7 +614,7 @@ def main(args):
 
 if __name__ == "__main__":
     take_over_terminal()
-    signal.signal(signal.SIGTERM, lambda number, frame: exit_now(128 + number))
+    exit_at_signals()
     try:
         sys.exit(main(tyro.cli(Args, description=__doc__)))
     except KeyboardInterrupt:

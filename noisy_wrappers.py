@@ -1839,6 +1839,7 @@ def _generators(env: Env) -> dict[str, Any]:
             if issubclass(type(value), gym.Space):
                 holders |= _parts_of_space(f"{i}.{name}", value)
     kinds = (np.random.Generator, np.random.RandomState, random.Random)
+    kinds += (np.random.SeedSequence,)  # which counts the children that it spawned
     found = {}
     for place, holder in holders.items():
         for name, value in vars(holder).items():
@@ -1860,6 +1861,8 @@ def _parts_of_space(place: str, space: gym.Space[Any]) -> dict[str, gym.Space[An
 
 def _stream(generator: Any) -> Any:
     """Return the state of a generator, or of random or np.random, in Python's own types."""
+    if isinstance(generator, np.random.SeedSequence):
+        return _without_arrays(generator.state)
     if generator is random or isinstance(generator, random.Random):
         return generator.getstate()
     if generator is np.random or isinstance(generator, np.random.RandomState):  # dm_control's
@@ -1871,7 +1874,9 @@ def _stream(generator: Any) -> Any:
 
 
 def _set_stream(generator: Any, stream: Any) -> None:
-    if generator is random or isinstance(generator, random.Random):
+    if isinstance(generator, np.random.SeedSequence):
+        generator.__init__(**stream)
+    elif generator is random or isinstance(generator, random.Random):
         version, words, normal = stream
         generator.setstate((version, tuple(words), normal))
     elif generator is np.random or isinstance(generator, np.random.RandomState):

@@ -15,6 +15,7 @@ from analysis import style
 from analysis.effects import effects_caption, effects_figure, heatmap
 from analysis.folders import RETURN, SUCCESS
 from analysis.formatting import percent, rounded, seeds_between, seeds_of, slug
+from analysis.heatmap import heatmaps
 from analysis.runs import KEYS, STUDY, rows_of, study_name
 from analysis.statistics import SEEDS_FOR_INTERVAL
 from noisy_wrappers import BASELINE, rate_order
@@ -60,6 +61,8 @@ def figures(studies, tables, band=INTERVAL):
         drawings += parameter_figures(study, band)
     if "robustness" in tables:
         drawings += robustness_figures(tables["robustness"].frame, studies[0].metric)
+        matrices = heatmaps(tables["robustness"].frame, studies[0].metric)
+        drawings += [Drawing("robustness", *matrix) for matrix in matrices]
     for drawing in drawings:
         while drawing.name in used:  # of "lr 1" and "lr_1", say, which are one name of a file
             drawing.label += " again"

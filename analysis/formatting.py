@@ -17,8 +17,8 @@ from noisy_wrappers import rate_order
 WHOLE_WORDS = {"break_long_words": False, "break_on_hyphens": False}  # when text is wrapped
 DASH = "\u2013"  # of what does not exist
 _COLUMNS_WITH = {  # a format of numbers that have no spread
-    "z,.0f": """n n_baseline n_baseline_most environments conditions chosen_from seeds
-        steps_to_baseline percent_of_environments""",
+    "z,.0f": """n n_baseline n_baseline_most environments conditions conditions_tested
+        chosen_from seeds steps_to_baseline percent_of_environments""",
     "z.2f": "probability_of_improvement probability_low probability_high effect_size t",
     "g": "steps_millions",
 }

@@ -3,10 +3,10 @@
 evaluate.py writes these files. The unit of replication is the seed: a run's value under a test
 condition is the mean over its episodes there.
 
-The primary figure is the mean return over the conditions that count (is_unseen), compared with that
-of the policies trained without noise under the same conditions by the test of all verdicts, with
-Holm's correction; docs/statistics.md has the details. All of this may be of the rate of success
-instead of the return, in percentage points.
+The primary figure is the mean return over all conditions but those of the training itself, compared
+with that of the policies trained without noise under the same conditions by the test of all
+verdicts, with Holm's correction; docs/statistics.md has the details. All of this may be of the rate
+of success instead of the return, in percentage points.
 """
 
 import zlib
@@ -21,6 +21,7 @@ from analysis.formatting import p_value, percent
 from analysis.runs import KEYS, ROBUSTNESS_COLUMNS, STUDY, study_name, study_of, where_tested
 from analysis.statistics import compare, holm, mean_std, percent_of
 from analysis.tables import table_of
+from analysis.words import counted
 from noisy_wrappers import BASELINE, WRAPPERS, Configuration
 
 EPISODES = 100  # of a condition, as evaluate.py plays by default
@@ -28,7 +29,7 @@ CLEAN = BASELINE  # a condition of a test is a Configuration, too
 RUN_COLUMNS = [*STUDY, "environment", "configuration", "seed", "elsewhere", "condition", "mean"]
 COLUMNS = [*KEYS, "test_noise", "test_rate", "tested_on", "n", "mean", "std", "difference"]
 COLUMNS += ["change_percent", "score_percent"]
-SCORE_COLUMNS = """environment noise noise_rate n n_baseline conditions difference
+SCORE_COLUMNS = """environment noise noise_rate n n_baseline conditions conditions_tested difference
     difference_low difference_high difference_percent effect_size p p_holm detectable score_percent
     baseline_score_percent clean_change_percent t pooled_std smallest_p"""
 SCORE_COLUMNS = [*STUDY, *SCORE_COLUMNS.split()]
@@ -121,23 +122,16 @@ def read_episodes(path, metric=RETURN):
         results = 100 * pd.to_numeric(table.get("success", np.nan))
     table = table.assign(environment=table.get("environment", ""), result=results)
     found = {}
-    for (noise, rate, environment), group in table.groupby(keys, sort=False)["result"]:
-        condition = Configuration.parse(noise, rate)
+    for (noise, rate, environment), rows in table.groupby(keys, sort=False):
+        condition, group = Configuration.parse(noise, rate), rows["result"]
+        if rows["episode"].tolist() != list(range(len(rows))):  # episode i begins alike everywhere
+            raise ValueError(f"episodes under {condition} are lost, repeated or out of order")
         unknown = [name for name in condition.wrappers if name not in WRAPPERS and ":" not in name]
         if unknown:  # and none of the user's own
             raise ValueError(f"unknown noise {unknown[0]!r}")
         told = group.notna().any()
         found[condition, environment] = group.fillna(0 if told else np.nan).to_numpy(float)
     return found
-
-
-def is_unseen(condition, config):
-    """Tell whether a test condition counts in the score of a training configuration."""
-    ends = "RandomEarlyTermination" in condition.wrappers
-    rewards = [n for n in condition.wrappers if n in WRAPPERS and WRAPPERS[n].kind == "reward"]
-    changes_behaviour = not rewards and not ends
-    new = set(condition.wrappers).isdisjoint(config.wrappers)
-    return condition != CLEAN and changes_behaviour and new
 
 
 def tested_on(condition, config):
@@ -220,8 +214,8 @@ def environment_score(runs, config, metric=RETURN):
     conditions = [
         name
         for name in complete.index[complete]
-        # a reward noise of one's own, say, changes no return
-        if is_unseen(name, config) and not (x[name].equals(x[CLEAN]) and y[name].equals(y[CLEAN]))
+        # noise on rewards leaves returns as they are: that is the clean test once more
+        if name != config and not (x[name].equals(x[CLEAN]) and y[name].equals(y[CLEAN]))
     ]
     if not conditions:
         return None
@@ -242,7 +236,13 @@ def environment_score(runs, config, metric=RETURN):
         "baseline_score_percent": in_percent(y.mean() - clean.mean()),
         "clean_change_percent": in_percent(clean_x.mean() - clean.mean()),
     }
-    return row | {"x": x, "y": y, "conditions": len(conditions)}
+    tested = set(runs["condition"]) - {CLEAN}
+    return row | {
+        "x": x,
+        "y": y,
+        "conditions": len(conditions),
+        "conditions_tested": len(tested),
+    }
 
 
 def average_score(scores, metric=RETURN):
@@ -250,7 +250,7 @@ def average_score(scores, metric=RETURN):
     table = pd.DataFrame(scores)
     x, y = (np.array([*zip_longest(*table[name], fillvalue=np.nan)]) for name in ("x", "y"))
     row = scores[0] | compare(x, y, episodes=EPISODES if metric == SUCCESS else None)._asdict()
-    row |= {"environment": "", "conditions": table["conditions"].min()}
+    row |= {"environment": "", **table[["conditions", "conditions_tested"]].sum()}
     return row | table.filter(like="percent").mean(skipna=False).to_dict()
 
 
@@ -289,17 +289,18 @@ def robustness_sentences(scores, metric):
         where = row.environment or row.where
         study = study_name(*(getattr(row, name) for name in STUDY))
         start = f"{study} on {where}, trained with {row.noise} at rate {row.noise_rate}"
-        shown, limit = "no clear difference in robustness to new noise", ""
+        over = f"over {row.conditions} of {counted(row.conditions_tested, 'test condition')}"
+        shown, limit = "no clear difference in robustness", ""
         evidence = verdicts.difference_in_words(row, unit)
         if pd.isna(row.p):
-            shown = "too few seeds for a test of robustness to new noise"
+            shown = "too few seeds for a test of robustness"
         else:
             corrected = p_value(row.p_holm).removeprefix("= ")
             evidence += f", p {p_value(row.p)}, Holm {corrected}"
             limit = verdicts.excluded(row, unit) + verdicts.cannot_show(row)
         if verdicts.significant(row.p_holm):
-            shown = f"{'more' if row.t > 0 else 'less'} robust to new noise"
+            shown = "more robust" if row.t > 0 else "less robust"
             limit = ""
         if pd.notna(row.clean_change_percent):
             evidence += f"; clean return {percent(row.clean_change_percent)}"
-        yield f"{start}: {shown} ({evidence}){limit}.{verdicts.borderline(row)}"
+        yield f"{start}: {shown} {over} ({evidence}){limit}.{verdicts.borderline(row)}"

@@ -203,8 +203,8 @@ mean final returns with its 95 % interval, and its test. Effect sizes are standa
 deviation over n seeds, and the difference from no noise in percentage points.""",
     "choice": """How the noise was chosen: each round of the search drops the worse half, and fresh
 seeds confirm the winner or not.""",
-    "robustness_score": """Primary figure of robustness: the mean return under noise that was not in
-training, of policies trained with noise and without.""",
+    "robustness_score": """Primary figure of robustness: the mean return over all test conditions
+but that of the training, of policies trained with noise and without.""",
     "robustness_together": """Primary figure of robustness over all environments, which count
 equally.""",
     "robustness": """The return under every test condition: mean \u00b1 standard deviation over n

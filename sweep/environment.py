@@ -16,7 +16,6 @@ from statistics import fmean
 from typing import NamedTuple
 
 import gymnasium as gym
-import numpy as np
 
 import noisy_wrappers as noisy
 from analysis.errors import fail, with_place
@@ -61,8 +60,10 @@ def ask(env_id, configurations=(), max_episode_steps=None, env_kwargs=()):
         declared = made.spec.max_episode_steps
         with noisy.make_flat(made, STEP_LIMIT) as env:
             limit = env.spec.max_episode_steps
-            seconds, steps, length, rewards = time_steps(env, limit, deadline, declared is None)
+            timed = Ends(env)
+            seconds, steps, length, rewards = time_steps(timed, limit, deadline, declared is None)
             env.reset()  # a failure after this one is the noise's
+            limit = min(limit, timed.limit())
             tried = {}
             for n in configurations:  # at every rate: it may fail at one of them
                 tried[n.noise] = tried.get(n.noise) or why_unfit(env, n, limit, deadline)
@@ -71,10 +72,44 @@ def ask(env_id, configurations=(), max_episode_steps=None, env_kwargs=()):
                 timed_steps=steps,
                 episode_steps=declared or length,
                 observed=math.prod(env.observation_space.shape),
-                bounded=bool(np.isfinite([env.action_space.low, env.action_space.high]).all()),
+                bounded=noisy.is_bounded(env.action_space),
                 tried=tried,
                 rewards=rewards if steps >= STEPS else MANY,
             )
+
+
+class Ends(gym.Wrapper):
+    """Notes how the episodes of an environment end."""
+
+    def __init__(self, env):
+        """Begin with none."""
+        super().__init__(env)
+        self.steps = 0  # of the episode
+        self.ends = []  # of each episode, its steps and whether it was terminated
+
+    def reset(self, **kwargs):
+        """Begin an episode."""
+        self.steps = 0
+        return self.env.reset(**kwargs)
+
+    def step(self, action):
+        """Make a step, and note the end of an episode."""
+        result = self.env.step(action)
+        self.steps += 1
+        if result[2] or result[3]:
+            self.ends.append((self.steps, result[2]))
+        return result
+
+    def limit(self):
+        """Return a time limit that the environment has inside, as dm_control's do, or infinity.
+
+        That is the length of two or more episodes, if all were truncated there.
+        """
+        ends = set(self.ends)
+        if len(self.ends) < 2 or len(ends) > 1:
+            return math.inf
+        [(steps, terminated)] = ends
+        return math.inf if terminated else steps
 
 
 def time_steps(env, time_limit, deadline, whole=False):

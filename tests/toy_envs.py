@@ -133,13 +133,14 @@ class Parts(Count):
 class Endless(Count):
     """Ends its episodes after `length` steps, and never without; it declares no time limit."""
 
-    def __init__(self, length=np.inf):
+    def __init__(self, length=np.inf, truncated=False):
         super().__init__()
-        self.length = length
+        self.length, self.truncated = length, truncated
 
     def step(self, action):
         observation, reward, _, _, info = super().step(action)
-        return observation, reward, self.steps >= self.length, False, info
+        ends = self.steps >= self.length
+        return observation, reward, ends and not self.truncated, ends and self.truncated, info
 
 
 class Slow(Count):
@@ -214,6 +215,8 @@ register("Endless", Endless, None)
 register("NoLimit", Endless, None, length=20)
 register("DiscreteAction", Other, 8, action_space=gym.spaces.Discrete(3))
 register("Unbounded", Other, 8, action_space=Box(-np.inf, np.inf, (1,)))
+largest = float(np.finfo(np.float32).max)  # which stands for no bound
+register("FloatMax", Other, 8, action_space=Box(-largest, largest, (1,)))
 register("BuggyConstructor", Buggy, 8, where="constructor")
 register("BuggyReset", Buggy, 8, where="reset")
 register("BuggyStep", Buggy, 8, where="step")

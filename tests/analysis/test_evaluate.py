@@ -1,6 +1,7 @@
 """evaluate.py as a user meets it: stored returns, the table, videos, bad input."""
 
 import csv
+import gzip
 import importlib
 import json
 import math
@@ -12,6 +13,7 @@ import subprocess
 import sys
 import time
 import zlib
+from collections import Counter
 from pathlib import Path
 
 import commands
@@ -24,14 +26,16 @@ import evaluate
 import ppo_continuous_noisy as ppo
 import sac_continuous_noisy as sac
 import td3_continuous_noisy as td3
-from analysis.folders import Run
+from analysis.folders import DamageError, Run
 from analysis.formatting import rounded
+from analysis.robustness import read_episodes
 from evaluate import Args, main
 from noisy_wrappers import BASELINE, Configuration
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = {"SAC": sac, "TD3": td3, "PPO": ppo}
 OBSERVATION, ACTION = "RandomNormalNoisyObservation(0.1)", "RandomNormalNoisyAction(0.5)"
+RATES = (0, 0.5, 1.0)
 SEED = 2_000_000  # of the first episode, unless --seed says otherwise
 COMBINED = "RandomUniformScaleReward(-3, 5)+RandomEarlyTermination(6)"
 
@@ -177,22 +181,19 @@ def test_what_is_stored_is_not_played_again(runs, monkeypatch, capsys):
     assert f" {rounded(means[one(runs, 'TD3')])} " in capsys.readouterr().out  # of the first two
 
 
-def test_more_episodes_replay_only_the_conditions_that_have_fewer(runs, monkeypatch):
+def test_more_episodes_replay_only_the_conditions_that_have_fewer(runs):
     run_dir = one(runs, "PPO")
     main(Args((run_dir,), noises=(OBSERVATION,), noise_rates=(0.5, 1.0), episodes=2))
     first = stored(run_dir)
     main(Args((run_dir,), noises=(OBSERVATION, ACTION), noise_rates=(0.5,), episodes=3))
     again = stored(run_dir)
-    counts = {}
-    for row in again:
-        key = row["noise"], row["noise_rate"]
-        counts[key] = counts.get(key, 0) + 1
-    assert list(counts.items()) == [
-        (("", "0.0"), 3),
-        ((OBSERVATION, "0.5"), 3),
-        ((OBSERVATION, "1.0"), 2),
-        ((ACTION, "0.5"), 3),
-    ]
+    counts = Counter((row["noise"], row["noise_rate"]) for row in again)
+    assert counts == {
+        ("", "0.0"): 3,
+        (OBSERVATION, "0.5"): 3,
+        (OBSERVATION, "1.0"): 2,
+        (ACTION, "0.5"): 3,
+    }
     assert [row for row in again if row["episode"] != "2" and row["noise"] != ACTION] == first
 
 
@@ -201,18 +202,14 @@ def test_another_seed_plays_everything_and_stores_nothing(runs, capsys):
     run_dir = one(runs, "PPO")
     main(Args((run_dir,), (OBSERVATION,), (0.5,), episodes=3))
     before, default = files(runs), capsys.readouterr().out
-    args = Args((run_dir,), (OBSERVATION,), (0.5, 1.0), episodes=3, seed=7)
+    args = Args((run_dir,), (OBSERVATION,), RATES[1:], episodes=3, seed=7)
     main(args)
     said, *table = capsys.readouterr().out.splitlines()
-    assert said == "--seed 7 is not the default: everything is played, nothing is stored"
-    assert files(runs) == before
+    assert "nothing is stored" in said and files(runs) == before
     [finished], _ = evaluate.find_players([run_dir])
-    means = []
-    for rate in (0, 0.5, 1.0):
-        played = evaluate.play(finished, Configuration.read([OBSERVATION], [rate]), args)
-        means.append(rounded(np.mean(played, axis=0)[0]))
-    assert table[-1].split()[-3:] == means
-    assert means[0] != default.split()[-2]
+    played = [evaluate.play(finished, Configuration.read([OBSERVATION], [r]), args) for r in RATES]
+    means = [rounded(np.mean(results, axis=0)[0]) for results in played]
+    assert table[-1].split()[-3:] == means and means[0] != default.split()[-2]
 
 
 @pytest.mark.slow
@@ -227,20 +224,10 @@ def test_a_kill_leaves_whole_conditions_and_the_same_command_goes_on(runs):
     commands.ended(process)
     rows = stored(run_dir)
     assert [int(row["episode"]) for row in rows] == [*range(30)] * (len(rows) // 30)
-    again = Args((run_dir,), (OBSERVATION, ACTION), (0.3, 0.6), episodes=30)
-    main(again)
-    before = (run_dir / "robustness.csv").read_bytes()
-    (run_dir / "robustness.csv").unlink()
-    main(again)
-    assert (run_dir / "robustness.csv").read_bytes() == before
-
-
-def test_what_is_played_is_stored_by_the_process_that_plays(runs):
-    """So nothing waits for an earlier condition that still plays in another process."""
-    run_dir = one(runs, "PPO")
-    [finished], _ = evaluate.find_players([run_dir])
-    evaluate.play(finished, Configuration.read([OBSERVATION], [0.5]), Args((run_dir,), episodes=2))
-    assert [row["noise"] for row in stored(run_dir)] == [OBSERVATION] * 2
+    main(Args((run_dir,), (OBSERVATION, ACTION), (0.3, 0.6), episodes=30))
+    conditions = Counter((row["noise"], row["noise_rate"]) for row in stored(run_dir))
+    assert len(conditions) == 5 and set(conditions.values()) == {30}
+    assert stored(run_dir)[: len(rows)] == rows
 
 
 @pytest.mark.slow
@@ -304,12 +291,42 @@ def test_a_run_is_found_once_by_whatever_path(runs, tmp_path):
     assert len(found) == len({run.folder.resolve() for run in found})
 
 
-def test_the_longer_of_two_results_is_kept(runs):
+def test_what_is_played_is_stored_by_the_process_that_plays_and_the_longer_result_is_kept(runs):
+    """So nothing waits for an earlier condition that still plays in another process."""
     [finished], _ = evaluate.find_players([one(runs, "PPO")])
+    evaluate.play(finished, Configuration.read([OBSERVATION], [0.5]), Args((), episodes=2))
+    assert [row["noise"] for row in stored(finished.folder)] == [OBSERVATION] * 2
     short, long = [(1.0, 1, 1.0)], [(1.0, 1, 1.0), (2.0, 2, 0.0)]
     for results in (short, long, short):
         evaluate.store(finished, ("", "0.0", ""), results)
-    assert evaluate.read_stored(finished) == {("", "0.0", ""): long}
+    assert evaluate.read_stored(finished)["", "0.0", ""] == long
+
+
+def test_what_is_stored_in_a_compressed_file_is_kept(runs):
+    """Or analyze.py, which takes the file that is not compressed, would lose it."""
+    run_dir = one(runs, "PPO")
+    main(Args((run_dir,), (OBSERVATION,), episodes=2))
+    before = stored(run_dir)
+    (run_dir / "robustness.csv.gz").write_bytes(
+        gzip.compress((run_dir / "robustness.csv").read_bytes())
+    )
+    (run_dir / "robustness.csv").unlink()
+    main(Args((run_dir,), (ACTION,), episodes=2))
+    assert stored(run_dir)[:4] == before and len(stored(run_dir)) == 6
+
+
+@pytest.mark.parametrize("change", [lambda rows: rows[1:], lambda rows: rows + rows])
+def test_episodes_that_are_lost_or_repeated_are_damage(runs, change):
+    """Or the others would count as episodes that begin in other states."""
+    [finished], _ = evaluate.find_players([one(runs, "PPO")])
+    evaluate.store(finished, ("", "0.0", ""), [(1.0, 1, 1.0), (2.0, 2, 0.0)])
+    path = finished.folder / "robustness.csv"
+    header, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([header, *change(rows)]) + "\n")
+    with pytest.raises(DamageError, match="delete that file"):
+        evaluate.read_stored(finished)
+    with pytest.raises(ValueError, match="episodes under no noise"):
+        read_episodes(path)
 
 
 def test_success_that_some_conditions_do_not_tell_is_empty_there(runs):
@@ -322,22 +339,6 @@ def test_success_that_some_conditions_do_not_tell_is_empty_there(runs):
         ",0.0,0,2.0,2,1,Heavy-v0",
         ",0.0,1,-3.0,3,0,Heavy-v0",
     ]
-
-
-def test_training_again_deletes_nothing_of_a_write(runs, monkeypatch):
-    """The command that trained a run is called again in the middle of a write."""
-    run_dir = one(runs, "PPO")
-    arguments = json.loads((run_dir / "config.json").read_text())["args"]
-    arguments = ppo.Args(**arguments | {"runs_dir": str(runs)})
-    fsync = os.fsync
-
-    def train_then_fsync(descriptor):
-        ppo.train(arguments)
-        fsync(descriptor)
-
-    monkeypatch.setattr(os, "fsync", train_then_fsync)
-    main(Args((run_dir,), episodes=1))
-    assert len(stored(run_dir)) == 1
 
 
 def test_a_full_disk_leaves_the_previous_file(runs, monkeypatch, capsys):
@@ -359,16 +360,13 @@ def test_a_full_disk_leaves_the_previous_file(runs, monkeypatch, capsys):
 def test_a_copy_of_a_script_plays_its_own_policy(tmp_path, monkeypatch, capsys):
     """Its environment and its network are its own: the returns are those of its last test."""
     script = (ROOT / "ppo_continuous_noisy.py").read_text()
-    script = script.replace("nn.Linear(inputs, 64), nn.Linear(64, 64)", "nn.Linear(inputs, 64), W")
-    script = script.replace(
-        "W, nn.Linear(64, outputs)", "nn.Linear(64, 32), nn.Linear(32, outputs)"
-    )
-    script = script.replace("layers[1], nn.Tanh()", "layers[1], nn.ReLU()")
     flat = "    return noisy.make_flat(env, STEP_LIMIT)"
-    reward = "gym.wrappers.TransformReward(env, lambda r: 2 * r + 1)"
-    assert flat in script
-    script = script.replace(flat, f"    return noisy.make_flat({reward}, STEP_LIMIT)")
-    (tmp_path / "wide_continuous_noisy.py").write_text(script)
+    changed = (
+        "    return noisy.make_flat(gym.wrappers.TransformReward(env, lambda r: 2 * r + 1), 500)"
+    )
+    script = script.replace("64), nn.Linear(64, outputs)", "32), nn.Linear(32, outputs)")
+    assert flat in script and "nn.Linear(32, outputs)" in script
+    (tmp_path / "wide_continuous_noisy.py").write_text(script.replace(flat, changed))
     monkeypatch.chdir(tmp_path)
     options = "--env-id InvertedPendulum-v5 --total-timesteps 256 --num-steps 128 --no-compile"
     line = [sys.executable, "wide_continuous_noisy.py", *options.split(), "--eval-episodes", "3"]
@@ -398,12 +396,6 @@ def test_an_unfinished_run_plays_if_it_is_named_and_stores_nothing(runs, capsys)
 
 
 def test_the_table_of_known_returns(capsys):
-    def a_run(noise, rate):
-        folder, configuration = Path(str(len(seen))), Configuration.parse(noise, rate)
-        names = "PPO", "ppo_continuous_noisy.py", "E", "ppo_continuous_noisy", configuration
-        run = Run(folder, "", {"args": {}}, *names, BASELINE, 1, 1, "0.4")
-        return evaluate.Player(run)
-
     seen = {}
     for noise, rate, clean, noisy in [
         ("", "0.00", [10, 30], [1, 2]),  # means 20 and 1.5
@@ -411,62 +403,69 @@ def test_the_table_of_known_returns(capsys):
         ("", "0.00", [40, 20], [4, 3]),  # means 30 and 3.5
         ("", "0.00", [10, 90], [-5, 0]),  # means 50 and -2.5
     ]:
+        folder, configuration = Path(str(len(seen))), Configuration.parse(noise, rate)
+        names = "PPO", "ppo_continuous_noisy.py", "E", "ppo_continuous_noisy", configuration
+        run = Run(folder, "", {"args": {}}, *names, BASELINE, 1, 1, "0.4")
         # A third episode is stored and not asked for; the second number is the length.
-        seen[a_run(noise, rate)] = {
+        seen[evaluate.Player(run)] = {
             ("", "0.0", ""): [(value, 1, math.nan) for value in (*clean, 1000)],
             ("A(1) + B(2)", "0.1 + 0.1", ""): [(value, 1, math.nan) for value in (*noisy, 1000)],
-            ("C(3)", "0.5", ""): [(-value, 1, math.nan) for value in (*noisy, 1000)],
         }
-    conditions = [
-        BASELINE,
-        Configuration.parse("A(1) + B(2)", "0.1 + 0.1"),
-        Configuration.parse("C(3)", "0.5"),
-    ]
+    conditions = [BASELINE, Configuration.parse("A(1) + B(2)", "0.1 + 0.1")]
     evaluate.print_table(list(seen), conditions, seen, episodes=2)
     lines = [re.split(r" {2,}", line.strip()) for line in capsys.readouterr().out.splitlines()]
     # sd of (20, 30, 50): sqrt((13.33^2 + 3.33^2 + 16.67^2) / 2); of (1.5, 3.5, -2.5) about 0.833
     assert lines[1] == ["Mean return, tested with A(1) + B(2)"]
     assert lines[2][-2:] == ["clean", "at 0.1 + 0.1"]
-    assert lines[4:6] == [
+    assert lines[4:] == [
         ["E", "PPO", "no noise", "0.00", "3", "33 ± 15", "0.8 ± 3.1"],
         ["E", "PPO", "A(1)", "0.50", "1", "5.000", "7.500"],
     ]
-    assert lines[7] == ["Mean return, tested with C(3)"]
-    assert lines[8][-2:] == ["clean", "at 0.5"]
-    assert lines[10][-2:] == ["33 ± 15", "-0.8 ± 3.1"]
-    evaluate.print_table(list(seen), conditions[:1], seen, episodes=2)
-    alone = capsys.readouterr().out
-    assert "tested with" not in alone and alone.splitlines()[0].endswith("clean")
 
 
-def test_trainings_with_other_settings_are_other_rows_of_the_table(runs, capsys):
+def test_masses_by_delays_are_a_matrix(runs, capsys):
+    names = ["RandomDynamics(0.7, 0.7)", "RandomDynamics(1.3, 1.3)"]
+    pairs = [f"{mass}+RandomActionDelay({delay})" for mass in names for delay in (1, 2)]
+    run_dir = one(runs, "PPO")
+    main(Args((run_dir,), (*pairs, names[0]), episodes=2))
+    table = capsys.readouterr().out.splitlines()
+    assert not [line for line in table if "tested with RandomDynamics(0" in line]
+    start = table.index("Mean return, tested with RandomDynamics(x, x) + RandomActionDelay(y)")
+    lines = [re.split(r" {2,}", line) for line in table[start + 2 :]]
+    assert lines[0] == ["", "none", "y = 1", "y = 2"]
+    means = {}
+    for row in stored(run_dir):
+        means.setdefault(row["noise"], []).append(float(row["episodic_return"]))
+    means = {noise: rounded(np.mean(returns)) for noise, returns in means.items()}
+    cells = [means[pair.replace("+", " + ")] for pair in pairs]
+    assert lines[2:] == [
+        ["none", means[""], "–", "–"],
+        ["x = 0.7", means[names[0]], *cells[:2]],
+        ["x = 1.3", "–", *cells[2:]],
+    ]
+
+
+def test_other_settings_and_phases_of_a_choice_are_other_rows_of_the_table(runs, capsys):
     first, second = sorted(runs.glob("*ppo_continuous_noisy*"))
     args = json.loads((second / "config.json").read_text())["args"]
-    edit_config(second, args=args | {"total_timesteps": 2560, "gamma": 0.9})
-    result = (second / "result.json").read_text()
-    (second / "result.json").write_text(result.replace('_timesteps": 256,', '_timesteps": 2560,'))
-    main(Args((first, second, one(runs, "TD3")), episodes=1))
+    edit_config(second, args=args | {"gamma": 0.9})
+    for phase, folder in (("search", first), ("confirmation", second)):
+        shutil.copytree(folder, runs / "choice" / phase / folder.name)
+    main(Args((first, second, one(runs, "TD3"), runs / "choice"), episodes=1))
     table = [re.split(r" {2,}", line) for line in capsys.readouterr().out.splitlines()]
-    assert [(row[1], row[4]) for row in table[2:]] == [
-        ("PPO, gamma=0.99, total_timesteps=256", "1"),
+    assert {(row[1], row[4]) for row in table[2:]} == {
+        ("PPO, gamma=0.9", "1"),
         ("PPO", "1"),
         ("TD3", "1"),
-    ]
+        ("PPO [search]", "1"),
+        ("PPO [confirmation]", "1"),
+    }
 
 
 def test_what_a_noise_warns_of_is_said_once_in_a_line(runs, capsys):
     main(Args((runs,), noises=("RandomEarlyTermination(5000)",), episodes=1))
     lines = [line for line in capsys.readouterr().err.splitlines() if "never acts" in line]
-    assert len(lines) == 1 and lines[0].startswith("RandomEarlyTermination(5000) never acts: ")
-
-
-def test_the_phases_of_a_choice_are_other_rows_of_the_table(runs, capsys):
-    folders = list(runs.glob("*__ppo_*"))
-    for phase, folder in zip(("search", "confirmation"), folders, strict=False):
-        shutil.copytree(folder, runs / "choice" / phase / folder.name)
-    main(Args((runs / "choice",), episodes=1))
-    table = capsys.readouterr().out
-    assert "PPO [search]" in table and "PPO [confirmation]" in table
+    assert len(lines) == 1
 
 
 def test_a_folder_stands_for_its_finished_runs(runs, capsys):
@@ -509,12 +508,6 @@ def test_videos(runs, tmp_path):
     assert f"return {rounded(float(row['episodic_return']))}, " in result.stdout
 
 
-def test_videos_of_runs_of_one_name(runs, tmp_path, capsys):
-    other = shutil.copytree(one(runs, "PPO"), tmp_path / "other" / one(runs, "PPO").name)
-    args = Args((one(runs, "PPO"), other), video=tmp_path / "videos")
-    refused(args, "the same name", tmp_path, capsys)
-
-
 def register(tmp_path, name, code):
     """A module of one's own with a pendulum, which is Mine-v0."""
     pendulum = "gymnasium.envs.mujoco.inverted_pendulum_v5:InvertedPendulumEnv"
@@ -524,61 +517,78 @@ def register(tmp_path, name, code):
 
 @pytest.mark.slow
 def test_a_run_that_cannot_be_drawn_is_skipped_and_named(runs, tmp_path):
-    """As dm_control does, its environment reads how to draw when it is imported.
-
-    It lies in the folder of the caller, with another module that it imports late.
-    """
+    """As dm_control does, its environment reads how to draw when it is imported."""
     code = """
 import os
 os.environ["MUJOCO_GL"]
 
 class Blind(gym.Wrapper):
-    frames = 0
-
-    def reset(self, **kwargs):
-        import my_physics
-        return self.env.reset(**kwargs)
-
     def render(self):
-        self.frames += 1
-        if self.frames == 4:
-            raise RuntimeError("nothing to see")
-        return self.env.render()
+        raise RuntimeError("nothing to see")
 
 gym.register("Blind-v0", lambda **given: Blind(gym.make("InvertedPendulum-v5", **given)))
 """
     register(tmp_path, "blind", code)
-    (tmp_path / "my_physics.py").touch()
     first, second = sorted(runs.glob("*ppo_continuous_noisy*"))
     other_environment(first, "blind:Blind-v0")
     videos = tmp_path / "videos"
     result = run(first, second, "--video", videos, "--jobs", 2, cwd=tmp_path)
     assert result.returncode == 1
-    cause = r"\w+Error: nothing to see \(.*blind.py, line \d+\)"
-    assert re.fullmatch(
-        rf"error: cannot draw {re.escape(first.name)}, clean: {cause}\n", result.stderr
-    )
-    assert result.stdout.startswith(f"{second.name}, clean: return")
+    told = rf"error: cannot draw {re.escape(first.name)}.*nothing to see \(.*blind.py, line \d+\)\n"
+    assert re.fullmatch(told, result.stderr)
     assert list(videos.iterdir()) == [videos / f"{second.name}__clean.mp4"]
+
+
+ENDLESS = """
+import time
+import numpy as np
+
+class Endless(gym.Wrapper):
+    def step(self, action):
+        time.sleep(0.01)
+        return self.env.reset()[0], 0.0, False, False, {}
+
+    def render(self):
+        return np.zeros((64, 64, 3), np.uint8)
+
+gym.register("Endless-v0", lambda **given: Endless(gym.make("InvertedPendulum-v5", **given)))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number, jobs", [(signal.SIGTERM, 1), (signal.SIGHUP, 2)])
+def test_a_killed_video_leaves_no_hidden_folder(runs, tmp_path, number, jobs):
+    """A terminal that is closed tells all processes at once."""
+    register(tmp_path, "endless", ENDLESS)
+    other_environment(one(runs, "PPO"), "endless:Endless-v0")
+    videos = tmp_path / "videos"
+    options = command(one(runs, "PPO"), "--video", videos, "--jobs", jobs, MUJOCO_GL="egl")
+    process = subprocess.Popen(cwd=tmp_path, start_new_session=True, **options)
+    while not list(videos.glob(".*/video")):
+        assert process.poll() is None
+        time.sleep(0.1)
+    os.killpg(process.pid, number)
+    assert process.wait(timeout=60) == 128 + number
+    deadline = time.time() + 60  # the processes of --jobs end by themselves
+    while list(videos.iterdir()) and time.time() < deadline:
+        time.sleep(0.1)
+    assert list(videos.iterdir()) == []
 
 
 @pytest.mark.slow
 def test_without_an_opengl_library(runs, tmp_path):
-    """PyOpenGL is told to load a library that does not exist."""
     run_dir = one(runs, "PPO")
     result = run(run_dir, "--video", tmp_path / "videos", PYOPENGL_PLATFORM="none")
     assert result.returncode == 2 and not result.stdout
-    assert result.stderr.startswith("error: --video needs") and result.stderr.count("\n") == 1
-    assert "libegl1" in result.stderr and "libosmesa6" in result.stderr
-    assert not list(tmp_path.rglob("*.mp4"))
+    assert "apt install libegl1" in result.stderr and result.stderr.count("\n") == 1
+    assert not (tmp_path / "videos").exists()
 
 
 @pytest.mark.slow
 def test_a_window_needs_a_display(runs):
     result = run(one(runs, "PPO"), "--render")
     assert (result.returncode, result.stdout) == (2, "")
-    line = "error: --render needs a display; --video FOLDER makes videos without one\n"
-    assert result.stderr == line
+    assert result.stderr.startswith("error: --render needs a display")
 
 
 def test_a_window_shows_one_episode_of_each_condition(runs, monkeypatch, capsys):
@@ -618,12 +628,6 @@ BAD_RUNS = {
         run_dir / "policy.pt"
     ).write_bytes(b"x"),
     "delete that file": lambda run_dir: (run_dir / "robustness.csv").write_text("a,b\n1,2\n"),
-    "there is no environment 'Nothing-v0'": lambda run_dir: other_environment(
-        run_dir, "Nothing-v0"
-    ),
-    "needs Box actions of floats in one dimension; CartPole-v1": lambda run_dir: other_environment(
-        run_dir, "CartPole-v1"
-    ),
     "RuntimeError: not today .*broken.py, line 2": lambda run_dir: other_environment(
         run_dir, "broken:Mine-v0"
     ),
@@ -651,11 +655,8 @@ def test_one_reason_of_many_runs_is_one_line(runs, capsys):
 
 # A downloaded folder of runs, with its own modules: where they lie in it, and the id in config.json
 FOREIGN = {
-    "beside the runs": ("runs/dl/evil.py", "runs.dl.evil:Mine-v0", "."),
     "in the run": ("runs/dl/{run}/evil.py", "runs.dl.{run}.evil:Mine-v0", "."),
-    "above the runs": ("runs/evil.py", "runs.evil:Mine-v0", "."),
     "a package": ("runs/dl/__init__.py", "runs.dl:Mine-v0", "."),
-    "called from there": ("runs/dl/evil.py", "evil:Mine-v0", "runs/dl"),
     "called from the run": ("runs/dl/{run}/evil.py", "evil:Mine-v0", "runs/dl/{run}"),
     "through a link": ("runs/dl/evil.py", "link.evil:Mine-v0", "."),
     "not even a late import": ("runs/dl/my_physics.py", "InvertedPendulum-v5", "runs/dl"),
@@ -682,20 +683,16 @@ def test_no_module_is_imported_from_a_folder_of_runs(place, trained, tmp_path, m
 
 
 @pytest.mark.parametrize("options", [{"noises": ("evil:Sticky(0.1)",)}, {"env_id": "evil:Mine-v0"}])
-def test_no_noise_is_imported_from_a_folder_of_runs(
-    options, trained, tmp_path, monkeypatch, capsys
-):
+def test_no_noise_is_imported_from_a_folder_of_runs(options, runs, monkeypatch, capsys):
     """Nor another environment; a noise in config.json is not imported at all."""
-    run_dir = tmp_path / "runs/run"
-    shutil.copytree(one(trained, "PPO"), run_dir)
-    (tmp_path / "runs/evil.py").write_text("raise SystemExit('imported')")
+    run_dir = one(runs, "PPO")
+    (runs / "evil.py").write_text("raise SystemExit('imported')")
     args = json.loads((run_dir / "config.json").read_text())["args"]
     edit_config(run_dir, args=args | {"noise": ["evil:Sticky(0.1)"], "noise_rate": [0.5]})
-    monkeypatch.chdir(tmp_path / "runs")
+    monkeypatch.chdir(runs)
     monkeypatch.setattr(sys, "path", sys.path[:])
     refused(Args((run_dir,), **options), "in a folder of runs; if you trust", run_dir, capsys)
     assert main(Args((run_dir,), episodes=1)) == 0
-    assert "evil:Sticky(0.1)" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("runs_dir", [".", "runs"])
@@ -721,22 +718,16 @@ def test_a_module_of_ones_own_is_imported(runs_dir, trained, tmp_path, monkeypat
     ("options", "message"),
     [
         ({"noises": ("Nothing(1)",), "noise_rates": (1.0,)}, "unknown name"),
-        ({"noises": (ACTION,), "noise_rates": (1.5,)}, "1.5"),
-        ({"noises": (ACTION,), "noise_rates": ("x",)}, "'x'"),
         ({"noises": (ACTION,), "noise_rates": ("1:0",)}, "constant rates"),
         ({"noise_rates": (0.5,)}, "--noise-rates without --noises"),
         ({"env_id": "Nowhere-v0"}, "--env-id: there is no environment"),
         ({"noises": (f"{OBSERVATION[:-4]}(1, 2))",), "noise_rates": (1.0,)}, "has 2 numbers"),
         ({"episodes": 0}, "--episodes must be at least 1, not 0"),
-        ({"jobs": 0}, "--jobs"),
         ({"seed": -1}, "--seed"),
         ({"render": True, "video": Path("v")}, "exclude each other"),
         ({"video": Path(__file__, "v")}, "cannot write to"),
         ({"runs": ()}, "name the runs"),
-        ({"runs": (Path("nowhere"),)}, "nowhere is neither a run nor a folder of runs"),
-        ({"runs": (Path(__file__),)}, "is neither a run nor a folder of runs"),
         ({"runs": (ROOT / "docs",)}, "is neither a run nor a folder of runs"),
-        ({"runs": (ROOT / "docs", ROOT / "tests")}, "no finished run"),
     ],
 )
 def test_bad_arguments(runs, capsys, options, message):
@@ -764,10 +755,8 @@ def test_what_fails_under_a_noise_is_told_and_the_rest_is_kept(runs, tmp_path, j
     options = ["--noises", *noises, "--episodes", 2, "--jobs", jobs]
     result = run(first, second, *options, cwd=tmp_path)
     assert result.returncode == 1
-    cause = r"RuntimeError: too strong \(.*failing.py, line \d+\)"
-    where = f"{re.escape(str(first))}: p1.0_NormalNoisyAction_1000000000.0"
-    assert re.fullmatch(rf"error: {where}: {cause}\n", result.stderr)
-    assert result.stdout.count("InvertedPendulum-v5") == 2  # in two tables, one for each noise
+    told = rf"error: {re.escape(str(first))}: p1.0_Normal.*too strong \(.*failing.py, line \d+\)\n"
+    assert re.fullmatch(told, result.stderr)
     assert "Failing" not in result.stdout
     assert [len(stored(run_dir)) for run_dir in (first, second)] == [4, 6]
 
@@ -789,6 +778,11 @@ def test_another_environment(runs, capsys):
     table = capsys.readouterr().out.splitlines()[-1]
     assert f"{home}, tested in Heavy-v0" in table
     refused(Args((run_dir,), env_id="Pendulum-v1"), "its observation space is Box", runs, capsys)
+    args = json.loads((run_dir / "config.json").read_text())["args"]
+    edit_config(run_dir, args=args | {"env_kwargs": ["frame_skip:3"]})
+    main(Args((run_dir,), env_id="Heavy-v0", episodes=2))
+    told = "Heavy-v0 is made without the training's --env-kwargs: frame_skip:3\n"
+    assert capsys.readouterr().err == told
 
 
 def refused(args, message, runs, capsys):

@@ -61,16 +61,6 @@ def test_success_is_told_or_not(header, cells, rates, tmp_path):
     assert found is None if rates is None else found.tolist() == rates
 
 
-def test_a_run_that_ended_by_itself_or_was_tested_more_often_is_finished(tmp_path):
-    folder = write_run(tmp_path, [1.0, 2.0, 3.0])
-    change(folder, {"total_timesteps": 90_000})
-    text = (folder / "eval.csv").read_text().replace("\n20000,", "\n12345,")
-    (folder / "eval.csv").write_text(text)
-    run = read_run(folder)
-    assert run.finished and run.total_timesteps == 90_000
-    assert run.curve.steps.tolist() == [10_000, 12_345, 30_000]
-
-
 def test_of_a_damaged_run_is_known_what_can_be_read(tmp_path):
     folder = write_run(tmp_path, [1.0, 2.0], seed=7)
     (folder / "result.json").write_text("{")

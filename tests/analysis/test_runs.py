@@ -9,7 +9,7 @@ import pytest
 from sweeps import ENDING, SCALE, row, run, small_sweep, write_pairs, write_run
 
 from analysis.folders import SUCCESS
-from analysis.runs import STUDY, in_short, left_out, missing_runs, read_runs
+from analysis.runs import in_short, left_out, missing_runs, read_runs
 from analysis.studies import make_studies, version_notes
 from noisy_wrappers import BASELINE
 
@@ -22,26 +22,17 @@ def status_of(entries, status):
     return {entry.run.seed: entry.reason for entry in entries if entry.status == status}
 
 
-def notes_of(folder):
-    return make_studies(read_runs(folder))[1]
-
-
 # --------------------------------------------------------------------------------- what is damaged
 
 CORRUPTIONS = {
-    "half a line": lambda text: text[:-9],
     "no newline at the end": lambda text: text[:-1],
     "a short line": lambda text: text.replace(",1000\n", "\n", 1),
     "nan": lambda text: re.sub(r"(?m)^(10000,0,)[^,]*", r"\1nan", text),
     "a missing episode": lambda text: re.sub(r"(?m)^20000,1,.*\n", "", text),
-    "one episode twice": lambda text: text.replace("\n20000,1,", "\n20000,0,"),
     "a missing evaluation at the end": lambda text: re.sub(r"(?m)^50000,.*\n", "", text),
-    "an evaluation twice": lambda text: text + "".join(text.splitlines(keepends=True)[-2:]),
     "steps out of order": lambda text: text.replace("\n30000,", "\n10000,"),
-    "another final return": lambda text: re.sub(r"(?m)^(50000,1,)[^,]*", r"\g<1>7.5", text),
     "no header": lambda text: text.split("\n", 1)[1],
     "only a header": lambda text: text.split("\n", 1)[0] + "\n",
-    "binary": lambda text: text.replace("1000", "\x00"),
 }
 
 
@@ -53,11 +44,9 @@ def test_corrupt_evaluations_are_reported_and_left_out(name, tmp_path):
     assert CORRUPTIONS[name](text) != text
     (folder / "eval.csv").write_text(CORRUPTIONS[name](text))
     entries = read_runs(tmp_path)
-    [reason] = status_of(entries, "corrupt").values()
-    assert reason.startswith("eval.csv") and "\n" not in reason
+    assert list(status_of(entries, "corrupt")) == [3] and not missing_runs(entries)
     (study,), _ = make_studies(entries)
     assert study.finals[BASELINE].ravel().tolist() == [51, 52]  # one test is in their last 15 %
-    assert not missing_runs(entries)  # it is there, only broken
 
 
 def test_unfinished_missing_and_duplicate_runs_are_listed(tmp_path, capsys):
@@ -72,12 +61,11 @@ def test_unfinished_missing_and_duplicate_runs_are_listed(tmp_path, capsys):
     missing = tables["missing"].set_index("status")
     assert sorted(missing.index) == ["duplicate", "missing", "unfinished"]
     assert missing.loc["missing", "seed"] == 2 and missing.loc["missing", "noise"] == SCALE
-    assert missing.loc["unfinished", "reason"] == "no result.json"
     noisy = row(tables["summary_SAC"], environment="Pusher-v5", noise=SCALE, noise_rate="0.05")
     assert noisy["n"] == 2  # seeds 1 and 4
     printed = capsys.readouterr().out
     assert "WARNING: Runs left out: 3 (" in printed and "copy" in printed
-    assert "not complete (1 unfinished, 1 missing): more runs are due, and a verdict now" in printed
+    assert "not complete (1 unfinished, 1 missing)" in printed
 
 
 def test_every_run_left_out_has_its_own_reason(tmp_path):
@@ -119,30 +107,20 @@ def test_a_run_that_failed_before_it_had_a_folder_is_listed(tmp_path):
 
 
 def test_more_seeds_for_the_baseline_or_for_one_noise_are_nothing_missing(tmp_path):
+    """Nor is a noise where nobody tried it."""
     for seed in range(1, 6):
         write_run(tmp_path, [10], seed=seed)
+        write_run(tmp_path, [10], seed=seed, noise=ENDING, rate=0.5)
         if seed <= 3:
             write_run(tmp_path, [10], seed=seed, noise=SCALE, rate=0.5)
             write_run(tmp_path, [10], seed=seed, noise=SCALE, rate=0.2)
-        write_run(tmp_path, [10], seed=seed, noise=ENDING, rate=0.5)
     assert not missing_runs(read_runs(tmp_path))
     write_run(tmp_path, [10], seed=4, noise=SCALE, rate=0.2)  # now two of three noises have it
-    [missing] = missing_runs(read_runs(tmp_path))
-    assert (missing.run.configuration.noise_rate, missing.run.seed) == ("0.50", 4)
-
-
-def test_a_noise_is_not_missing_where_nobody_tried_it(tmp_path):
-    for seed in (1, 2):
-        write_run(tmp_path, [10], env="Hopper-v5", seed=seed)
-    write_run(tmp_path, [10], env="Hopper-v5", seed=1, noise=SCALE, rate=0.5)
     write_run(tmp_path, [10], env="Pusher-v5", seed=2, noise=ENDING, rate=0.1)
     missing = [entry.run for entry in missing_runs(read_runs(tmp_path))]
-    assert [(run.environment, run.configuration.noise, run.seed) for run in missing] == [
-        ("Hopper-v5", SCALE, 2),
-        ("Pusher-v5", "", 1),
-        ("Pusher-v5", "", 2),
-        ("Pusher-v5", ENDING, 1),
-    ]
+    hopper = [run for run in missing if run.environment == "Hopper-v5"]
+    assert [(run.configuration.noise_rate, run.seed) for run in hopper] == [("0.50", 4)]
+    assert {run.configuration.noise for run in missing if run not in hopper} == {"", ENDING}
 
 
 def test_a_missing_baseline_is_said(tmp_path, capsys):
@@ -156,14 +134,8 @@ def test_a_missing_baseline_is_said(tmp_path, capsys):
 # ------------------------------------------------------------------------------- what is one study
 
 
-@pytest.mark.parametrize(
-    ("change", "study"),
-    [
-        ({"exp_name": "other"}, ("SAC", "other", "", "")),
-        ({"algorithm": "MY_REDQ"}, ("MY_REDQ", "my_redq_continuous_noisy", "", "")),
-    ],
-)
-def test_studies_never_share_a_row(change, study, tmp_path):
+@pytest.mark.parametrize("change", [{"exp_name": "other"}, {"algorithm": "MY_REDQ"}])
+def test_studies_never_share_a_row(change, tmp_path):
     for seed in (1, 2):
         write_run(tmp_path / "runs", [10], seed=seed, folder=f"a{seed}")
         write_run(tmp_path / "runs", [99], seed=seed, folder=f"b{seed}", **change)
@@ -171,7 +143,8 @@ def test_studies_never_share_a_row(change, study, tmp_path):
     tables = run(tmp_path, drawn=True)
     summary = pd.concat([t for name, t in tables.items() if name.startswith("summary_")])
     assert list(summary["n"]) == [2, 2, 2] and sorted(summary["std"]) == [0, 0, 0]
-    other = row(summary, **dict(zip(STUDY, study, strict=True)))
+    [(name, value)] = change.items()
+    other = row(summary, **{name: value})
     assert other["mean"] == 99 and np.isnan(other["difference_percent"])
     assert row(summary, noise=SCALE)["baseline_mean"] == 10
 
@@ -186,7 +159,6 @@ def test_the_most_frequent_arguments_of_an_exp_name_are_its_study(tmp_path, caps
     entries = read_runs(tmp_path / "runs")
     [reason] = status_of(entries, "different").values()
     assert "gamma is 0.9, not 0.99" in reason and "total_timesteps is 10000, not 20000" in reason
-    assert "another --exp-name" in reason
     studies, _ = make_studies(entries)
     assert [study.name for study in studies] == ["SAC", "SAC [trial]"]
     assert reason in set(run(tmp_path)["missing"]["reason"])
@@ -233,11 +205,9 @@ def test_runs_of_two_releases_are_never_pooled(tmp_path, capsys):
     for seed in (1, 2, 3):
         write_run(tmp_path / "runs", [10], seed=seed, config=NEW)
     write_run(tmp_path / "runs", [99], seed=4)
-    [reason] = status_of(read_runs(tmp_path / "runs"), "different").values()
-    assert reason.startswith("of release 0.3, whose numbers differ from those of 0.4")
-    assert "finish a study with one release, or give its runs another --exp-name" in reason
+    assert list(status_of(read_runs(tmp_path / "runs"), "different")) == [4]
     assert run(tmp_path)["summary_SAC"]["mean"].tolist() == [10]
-    assert "of release 0.3" in capsys.readouterr().out
+    assert "of release 0.3, whose numbers differ from those of 0.4" in capsys.readouterr().out
 
 
 def test_where_runs_were_tested_is_said_and_tells_studies_apart(tmp_path, capsys):
@@ -247,7 +217,6 @@ def test_where_runs_were_tested_is_said_and_tells_studies_apart(tmp_path, capsys
     write_run(root, [1.0], seed=9, test_noise=[], test_noise_rate=[])
     tables = run(tmp_path)
     assert "SAC [tested under RandomActionDelay(1) at 1.0] on Hopper-v5" in capsys.readouterr().out
-    assert set(tables["noises"]["tested"]) == {"tested under RandomActionDelay(1) at 1.0"}
     assert tables["missing"]["status"].tolist().count("different") == 1
     assert "tested under RandomActionDelay(1)" in (tmp_path / "results/noises.md").read_text()
 
@@ -255,7 +224,7 @@ def test_where_runs_were_tested_is_said_and_tells_studies_apart(tmp_path, capsys
 def test_versions_of_an_environment_are_environments_and_a_note_says_so(tmp_path):
     for env in ("Hopper-v4", "Hopper-v5", "Walker2d-v4"):
         write_pairs(tmp_path, [100, 101], [110, 111], env=env)
-    [note] = notes_of(tmp_path)
+    [note] = make_studies(read_runs(tmp_path))[1]
     assert "Hopper-v4 and Hopper-v5 count as environments of their own" in note
 
 
@@ -289,16 +258,15 @@ def test_a_run_that_ended_by_itself_counts_with_its_own_last_tests(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("one", "other", "said"),
+    ("name", "one", "other", "said"),
     [
-        ({"git_commit": 40 * "1"}, {"git_commit": 40 * "1" + "-dirty"}, "1111111111-dirty (n = 1)"),
-        ({"script_sha256": 64 * "a"}, {"script_sha256": 64 * "b"}, "different texts of sac_cont"),
-        ({"script_sha256": 64 * "a"}, {"script_sha256": f"{64 * 'a'}, {64 * 'b'}"}, "bbbb (n = 1)"),
+        ("git_commit", 40 * "1", 40 * "1" + "-dirty", "1111111111-dirty (n = 1)"),
+        ("script_sha256", 64 * "a", f"{64 * 'a'}, {64 * 'b'}", "bbbb (n = 1)"),
     ],
 )
-def test_runs_of_different_code_are_noted(one, other, said, tmp_path):
-    for seed, config in enumerate((one, other)):
-        write_run(tmp_path, [1], seed=seed, config=config)
+def test_runs_of_different_code_are_noted(name, one, other, said, tmp_path):
+    for seed, value in enumerate((one, other)):
+        write_run(tmp_path, [1], seed=seed, config={name: value})
     entries = read_runs(tmp_path)
     [note] = version_notes(entries)
     assert said in note

@@ -13,6 +13,7 @@ from pathlib import Path
 import gymnasium as gym
 import pytest
 import stub_run
+import toy_envs
 from views import finish, view
 
 from analysis.words import duration
@@ -90,6 +91,17 @@ def test_an_episode_without_a_declared_limit_is_played_to_its_end(monkeypatch):
     assert environment.time_steps(env, 10_000, deadline)[1:3] == (environment.STEPS, 10_000)
 
 
+@pytest.mark.parametrize(
+    ("length", "truncated", "said"),
+    [(20, True, "an episode has at most 20 steps"), (20, False, ""), (60, True, "")],
+)
+def test_a_time_limit_inside_the_environment_counts(length, truncated, said):
+    """One that truncates: a policy may live longer than random actions, which terminate."""
+    kwargs = {"length": length, "truncated": truncated}
+    gym.register("Inside-v0", toy_envs.Endless, kwargs=kwargs)
+    assert ask("Inside-v0", [Configuration.read([LATE], [1.0])]).tried[LATE] == said
+
+
 def test_what_an_environment_that_records_its_episodes_cannot_have():
     recorder = gym.wrappers.RecordEpisodeStatistics
     gym.register("Recorded-v0", lambda **given: recorder(gym.make("Pendulum-v1", **given)))
@@ -103,6 +115,7 @@ def test_what_an_environment_that_records_its_episodes_cannot_have():
     [
         ("DiscreteAction", ["ppo"], "DiscreteAction-v0: needs Box actions of floats in one dim"),
         ("Unbounded", ["ppo", "sac"], "SAC needs bounded actions; some actions of toy_envs:Unb"),
+        ("FloatMax", ["sac"], "SAC needs bounded actions; some actions of toy_envs:FloatMax"),
         ("BuggyConstructor", ["ppo"], "BuggyConstructor-v0: KeyError: 'missing' ("),
         ("BuggyStep", ["ppo"], "/tests/toy_envs.py, line "),
         ("NanReward", ["ppo"], "NanReward-v0: "),

@@ -195,7 +195,7 @@ def test_an_env_state_has_only_pythons_own_types(make_generator):
 class Drawing(gym.Env):
     """Draws from all kinds of generators that are its attributes, and spawns at every reset."""
 
-    observation_space = gym.spaces.Box(-9, 9, (6,), np.float64)
+    observation_space = gym.spaces.Box(-9, 9, (7,), np.float64)
     action_space = gym.spaces.Dict(a=gym.spaces.Box(-1, 1, (1,)))
 
     def __init__(self):
@@ -207,10 +207,11 @@ class Drawing(gym.Env):
         super().reset(seed=seed)
         if seed is not None:
             self.rng, self.old = np.random.default_rng(seed), np.random.RandomState(seed)
-            self.python = random.Random(seed)
+            self.python, self.seeds = random.Random(seed), np.random.SeedSequence(seed)
             self.goals.seed(seed)
         drawn = [self.rng.normal(), self.old.normal(), self.python.random()]
         drawn += [self.np_random.spawn(1)[0].normal(), self.rng.spawn(2)[1].normal()]
+        drawn += [np.random.default_rng(self.seeds.spawn(1)[0]).normal()]
         return np.array([*drawn, self.goals.sample()[0]]), {}
 
 
