@@ -35,6 +35,7 @@ lint: $(BIN)/.dev
 # finished study were computed once, at the commit that results/tables/README.md names.
 results: $(BIN)/.dev
 	$(BIN)/python -m results.study
+	$(BIN)/python -m results.study.picture
 	$(BIN)/python -m cogapp -r -P -I . -p "from results.study.show import table" results/*.md results/*/README.md
 
 clean:

@@ -12,7 +12,7 @@ from scipy import stats
 from analysis import permutation
 from analysis.statistics import fieller
 from results import recompute
-from results.study import __main__, claims, compare, paper, returns
+from results.study import __main__, claims, compare, paper, picture, returns
 
 NOISE = "RandomNormalNoisyReward(1.0)"
 SCALE = "RandomUniformScaleReward(0.5, 1.5)"
@@ -336,3 +336,16 @@ def test_a_number_that_differs_is_found(monkeypatch):
 @pytest.mark.slow
 def test_the_tables_are_right_by_the_second_computation(capsys):
     assert recompute.main() == 0, capsys.readouterr().out
+
+
+def test_the_picture_of_the_first_page(tmp_path):
+    table = pd.read_csv(returns.RESULTS / "tables/claims.csv")
+    table.columns = ["claim", "paper", "ours", "covered", "verdict", "runs"]
+    best = picture.best_noises(table)
+    gains = {name: row.paper for name, row in best.items()}
+    paper = {"HalfCheetah": "+36 %", "Hopper": "+28 %", "Humanoid": "+3 %", "Pusher": "+20 %"}
+    assert gains == paper | {"Walker2d": "+90 %"}
+    assert best["Hopper"].claim.endswith(", fresh")
+    picture.draw().savefig(tmp_path / "drawn.svg", metadata={"Date": None})
+    committed = (returns.RESULTS / "figures/best_noises.svg").read_bytes()
+    assert (tmp_path / "drawn.svg").read_bytes() == committed
