@@ -9,9 +9,7 @@ from analysis import style
 from results.study.returns import RESULTS
 
 COLORS = {"confirmed": style.BETTER, "contradicted": style.WORSE}
-CLAIM = (
-    r"Best noise helps PPO on (?P<environment>\w+)(, fresh)?|Episodes of 50 steps.* (?P<also>\w+)"
-)
+CLAIM = r"(?:Best noise helps|Episodes of 50 steps help) PPO on (?P<environment>\w+)(?:, fresh)?"
 OURS = r"(?P<change>[+-]?\d+) % \[(?P<low>-?\d+), (?P<high>-?\d+)\]"
 
 
