@@ -2055,8 +2055,8 @@ def _check_numbers(args: Mapping[str, Any]) -> None:
 def canonical_arguments(args: Mapping[str, Any]) -> dict[str, Any]:
     """Check a script's arguments, {name: value}; return those that have one way to be written.
 
-    They are ``env_id``, with its version, and the noises and rates of training and of tests. The
-    module of "module:Env-v0" is imported.
+    They are ``env_id``, with its version, and the noises and rates of training and of tests, where
+    the rate is 1 if none is given. The module of "module:Env-v0" is imported.
 
     Raises:
         ValueError: a number out of its range, a bad ``exp_name``, noise or rate, or an environment
@@ -2067,7 +2067,8 @@ def canonical_arguments(args: Mapping[str, Any]) -> dict[str, Any]:
         raise ValueError(f"--exp-name must be a name, not {args['exp_name']!r}")
     parse_env_kwargs(args["env_kwargs"])
     noises, rates = Configuration.read(args["noise"], args["noise_rate"]).texts
-    tests = Configuration.read(args["test_noise"], args["test_noise_rate"]).for_tests()
+    test_rates = args["test_noise_rate"] or [1.0][: len(args["test_noise"])]
+    tests = Configuration.read(args["test_noise"], test_rates).for_tests()
     canonical = {"env_id": canonical_env_id(args["env_id"]), "noise": noises, "noise_rate": rates}
     return canonical | {"test_noise": tests.texts[0], "test_noise_rate": tests.texts[1]}
 

@@ -58,7 +58,7 @@ class Args:
     noise: tuple[str, ...] = ()  # NOISE: noises of the training environment; none: a baseline
     noise_rate: tuple[float | str, ...] = ()  # probability of each; 1.0:0.0 falls during training
     test_noise: tuple[str, ...] = ()  # TESTS: noises of the test environment; none by default
-    test_noise_rate: tuple[float, ...] = ()  # probability of each test noise
+    test_noise_rate: tuple[float, ...] = ()  # probability of each test noise; 1 by default
     eval_episodes: int = 10  # episodes in each test
     eval_frequency: int | None = None  # steps between tests; None: 50,000 or less; 0: only the last
     keep_policies: bool = False  # keep the policy of every test as policy_STEP.pt

@@ -165,7 +165,8 @@ def spelt_as_stored(given):
     if "test_noise" not in given:
         return {}
     try:
-        test = Configuration.read(given["test_noise"], map(rate, given.get("test_noise_rate", [])))
+        rates = given.get("test_noise_rate", ["1.0"])
+        test = Configuration.read(given["test_noise"], map(rate, rates))
     except ValueError as error:
         fail(f"--test-noise: {error}")
     return dict(zip(("test_noise", "test_noise_rate"), map(list, test.texts), strict=True))

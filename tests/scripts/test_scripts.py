@@ -205,7 +205,7 @@ def test_the_test_environment_is_clean_and_policies_play_without_an_environment(
 
 
 def test_noise_of_tests_and_arguments_of_the_environment(tmp_path):
-    test = {"test_noise": ("RandomEarlyTermination(3)",), "test_noise_rate": (1.0,)}
+    test = {"test_noise": ("RandomEarlyTermination(3)",)}  # at rate 1, if none is given
     run_dir = run("PPO", tmp_path, env_id="toy_envs:Endless-v0", env_kwargs=("length:5",), **test)
     name = "baseline_s1__toy_envs--Endless-v0_length=5__ppo_continuous_noisy"
     assert run_dir.name == f"{name}__tests_p1.0_EarlyTermination_3"
@@ -360,7 +360,7 @@ BAD = [  # arguments, what the line names
     ({"exp_name": ".."}, "--exp-name must be a name, not '..'"),
     ({"noise": NOISES, "noise_rate": (0.1, 1.1)}, "1.1"),
     ({"noise": NOISES}, "noise without a noise rate"),
-    ({"test_noise": NOISES}, "noise rate"),
+    ({"test_noise": ("RandomNormalNoisyReward(1.0)",), "test_noise_rate": (2.0,)}, "noise_rate"),
     ({"env_kwargs": ("length=5",)}, "env_kwargs: 'length=5' is not name:value"),
     (
         {

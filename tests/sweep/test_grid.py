@@ -429,6 +429,8 @@ def test_the_noise_of_tests_is_part_of_a_runs_name(tmp_path):
     stored = {"test_noise": ["RandomNormalNoisyAction(0.1)"], "test_noise_rate": [0.5]}
     finish(folder, 9, env_id="Pendulum-v1", exp_name="sac_continuous_noisy", **stored)
     assert "1 run, 0 to do" in view("list", *grid).err
+    [folder] = folders(*grid[:-2])  # the rate is 1 if none is given
+    assert folder.name.endswith("__tests_p1.0_NormalNoisyAction_0.1")
 
 
 def test_names_of_options_are_checked_where_nothing_is_to_do(one):
