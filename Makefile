@@ -21,9 +21,11 @@ demo: $(BIN)/.run
 test: $(BIN)/.dev
 	$(BIN)/python -m pytest --numprocesses 3 --dist worksteal
 
-# Every change of docs/changing.md through tools/check_script.py and a sweep; `make test` does two.
+# Every change of docs/changing.md through tools/check_script.py and a sweep (`make test` does two),
+# and a rehearsal of tools/gpu_check.sh.
 changes: $(BIN)/.dev
-	CHANGES=all $(BIN)/python -m pytest --numprocesses 3 --dist worksteal tests/scripts/test_changing.py
+	CHANGES=all $(BIN)/python -m pytest --numprocesses 3 --dist worksteal \
+	tests/scripts/test_changing.py tests/scripts/test_gpu_check.py
 
 lint: $(BIN)/.dev
 	$(BIN)/ruff check .

@@ -4,6 +4,8 @@ from pathlib import Path
 
 import check_script
 import pytest
+import torch
+import torch._inductor.config
 from check_script import BrokenError, Trial
 
 ROOT = Path(__file__).parents[2]
@@ -141,8 +143,8 @@ def test_a_loss_that_cannot_be_compiled(tmp_path):
 
 
 @pytest.mark.slow
+@torch._inductor.config.patch({"cpp.cxx": ("no-such-compiler",)})
 def test_no_compiler(tmp_path, monkeypatch):
-    monkeypatch.setattr("torch._inductor.config.cpp.cxx", ("no-such-compiler",))
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "cache"))
     assert "no C++ compiler" in check_script.compiles(broken(tmp_path, "td3"))
 

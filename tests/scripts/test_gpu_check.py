@@ -20,8 +20,11 @@ def rehearse(folder, **variables):
     return result
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("algorithm", ["sac"])  # five CPU minutes each: td3, ppo by hand
+all_changes = pytest.mark.skipif("CHANGES" not in os.environ, reason="`make changes` does it")
+
+
+@all_changes
+@pytest.mark.parametrize("algorithm", ["sac"])  # minutes each: td3, ppo by hand
 def test_a_rehearsal_passes(algorithm, tmp_path):
     result = rehearse(tmp_path, ALGORITHMS=algorithm, ENVIRONMENTS="Pendulum-v1")
     assert (result.returncode, result.stderr) == (0, "")
@@ -40,7 +43,7 @@ def test_a_rehearsal_passes(algorithm, tmp_path):
     assert "resumed at step 192" in log
 
 
-@pytest.mark.slow
+@all_changes
 def test_what_fails_is_told(tmp_path):
     result = rehearse(tmp_path, ALGORITHMS="td3", ENVIRONMENTS="NoSuch-v0")
     assert result.returncode == 1 and result.stdout.count("| FAILED: see ") == 3

@@ -505,12 +505,12 @@ def test_another_text_of_the_script_is_said_and_recorded(stopped, tmp_path, monk
 @pytest.mark.slow
 def test_a_second_process_is_refused_while_the_first_one_lives(tmp_path):
     long = {"total_timesteps": 10**9, "eval_frequency": 10**9, "checkpoint_frequency": 1}
-    first = start("SAC", tmp_path, **long | {"learning_starts": 10**9})
+    first = start("SAC", tmp_path, **long | {"learning_starts": 10**9 - 1})
     while not list(tmp_path.glob("*/checkpoint.pt")):
         assert first.is_alive()
         time.sleep(0.01)
     for overwrite in (False, True):
-        more = {"overwrite": overwrite, "learning_starts": 10**9}
+        more = {"overwrite": overwrite, "learning_starts": 10**9 - 1}
         second = command("SAC", tmp_path, (TRAINING_STEP, 30, die), **long | more)
         assert second.code == 2
         assert second.err.startswith(f"error: {folder(tmp_path)} is in use by another process")
@@ -519,7 +519,7 @@ def test_a_second_process_is_refused_while_the_first_one_lives(tmp_path):
     first.kill()
     assert commands.ended(first).code == -signal.SIGKILL
     moment = (TRAINING_STEP, 10, send(signal.SIGTERM))
-    third = command("SAC", tmp_path, moment, **long, learning_starts=10**9)
+    third = command("SAC", tmp_path, moment, **long, learning_starts=10**9 - 1)
     assert (third.code, third.err) == (143, "")
 
 

@@ -13,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+import torch._inductor.config
 import torch.nn as nn
 import torch.nn.functional as F
 from gymnasium import wrappers
@@ -639,11 +640,10 @@ def test_a_number_of_args_that_changes_too_often_says_what_to_do(graphs, capsys)
 
 
 @pytest.mark.slow
-def test_what_cannot_be_compiled_is_computed_without(monkeypatch, capsys):
+@torch._inductor.config.patch({"cpp.cxx": (None, "/no/compiler"), "force_disable_caches": True})
+def test_what_cannot_be_compiled_is_computed_without(capsys):
     network, other, x = two_networks()
     plain = copy.deepcopy(network)
-    monkeypatch.setattr(torch._inductor.config.cpp, "cxx", (None, "/no/compiler"))
-    monkeypatch.setattr(torch._inductor.config, "force_disable_caches", True)
     torch.compiler.reset()
     for learned in (network, plain):
         optimizer = torch.optim.SGD(learned.parameters(), lr=0.1)
