@@ -35,7 +35,7 @@ import threading
 import warnings
 import zlib
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from importlib.machinery import PathFinder
 from pathlib import Path
@@ -605,6 +605,9 @@ def main(args):
         elif args.drawing:
             [(drawn, steps, _)] = results
             print(f"{player.folder.name}, {name}: return {rounded(drawn)}, {steps} steps")
+    if args.video and failed:
+        with suppress(OSError):  # there are other videos in it
+            args.video.rmdir()
     if not args.drawing:
         tell(failed)
         if players := [player for player in players if player.folder not in failed]:

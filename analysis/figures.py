@@ -291,6 +291,7 @@ def robustness_heatmap(algorithm, environment, rows, clean, metric):
     grid = grid.pivot(index="trained with", columns="tested with").loc[trained.unique()]
     values, dots = (grid[name][tested.unique()] for name in ("value", "dot"))
     limit = style.color_limit(values, 100 if in_percent else np.inf)
+    limit = max(limit, 10) if in_percent else limit  # smaller differences are pale
     name = f"{algorithm} on {environment}"
     low, high = rows["n"].min(), rows["n"].max()
     seeds = f"{low:.0f}" if low == high else f"{low:.0f} to {high:.0f}"

@@ -68,8 +68,9 @@ TERMS = {
     "average improvement %": """Mean and standard deviation over environments of the difference in
         percent.""",
     "% of environments": "In how many environments the mean is at least that without noise.",
-    "score % (baseline)": """The mean return over the test conditions that count, in percent of the
-        clean return of policies that were trained without noise. In brackets: theirs.""",
+    "score % (baseline)": """How far the mean return over the test conditions that count is from the
+        clean return of policies that were trained without noise, in percent of that. In brackets:
+        the same of those policies.""",
 }
 TERMS = {name: " ".join(text.split()) for name, text in TERMS.items()}
 

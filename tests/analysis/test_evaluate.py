@@ -537,6 +537,8 @@ gym.register("Blind-v0", lambda **given: Blind(gym.make("InvertedPendulum-v5", *
     told = rf"error: cannot draw {re.escape(first.name)}.*nothing to see \(.*blind.py, line \d+\)\n"
     assert re.fullmatch(told, result.stderr)
     assert list(videos.iterdir()) == [videos / f"{second.name}__clean.mp4"]
+    none = tmp_path / "none"
+    assert run(first, "--video", none, cwd=tmp_path).returncode == 1 and not none.exists()
 
 
 ENDLESS = """
