@@ -133,12 +133,21 @@ def check_choice(case, said, capsys):
     assert "Pusher-v5, confirmation" in out and re.search(f"damaged .*{re.escape(said)}", out)
 
 
-@pytest.mark.parametrize("name", DAMAGE)
-def test_a_damaged_run_is_named_and_hides_no_other(name, case, capsys):
-    damage, said = DAMAGE[name]
+@pytest.mark.parametrize("name", [*DAMAGE, *DAMAGED_TESTS])
+def test_damage_is_named(name, case, capsys):
+    damage, said = (DAMAGE | DAMAGED_TESTS)[name]
     for folder in case.bad:
         damage(folder)
     check_analysis(case, said, capsys)
+
+
+# All programs read a run in one place, so one kind of damage to each of its files is enough.
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["half of a file", "an unknown noise", "an infinite result"])
+def test_a_damaged_run_hides_no_other_anywhere(name, case, capsys):
+    damage, said = DAMAGE[name]
+    for folder in case.bad:
+        damage(folder)
     check_choice(case, said, capsys)
 
     assert view("status", "--runs-dir", case.runs) == 1
@@ -150,15 +159,13 @@ def test_a_damaged_run_is_named_and_hides_no_other(name, case, capsys):
     out, err = capsys.readouterr()
     assert err.startswith(f"error: {case.bad[1]}: ") and said in err and err.count("\n") == 1
     assert len(list(case.runs.glob("*/robustness.csv"))) == 3
-    assert {path.name for path in case.runs.parent.iterdir()} == {"choice", "runs", "out"}
+    assert {path.name for path in case.runs.parent.iterdir()} == {"choice", "runs"}
 
 
-@pytest.mark.parametrize("name", DAMAGED_TESTS)
-def test_damaged_tests_of_a_run_hide_no_other(name, case, capsys):
-    damage, said = DAMAGED_TESTS[name]
-    for folder in case.bad:
-        damage(folder)
-    check_analysis(case, said, capsys)
+@pytest.mark.slow
+def test_damaged_tests_hide_no_other_run_from_a_choice(case, capsys):
+    damage, said = DAMAGED_TESTS["a huge number"]
+    damage(case.bad[0])
     check_choice(case, said, capsys)
 
 

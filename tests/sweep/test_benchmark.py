@@ -422,6 +422,7 @@ def no_slurm(tmp_path, stub):
     return stub | {"PATH": f"{tools}:{PATH}"}, asked
 
 
+@pytest.mark.slow
 def test_slurm_with_several_clusters(no_slurm, tmp_path):
     """Its programs are told which one; what a site prints beside an id is no part of it."""
     env, asked = no_slurm

@@ -495,6 +495,7 @@ def test_what_the_confirmation_can_show(tmp_path):
     assert lines(two) == [line]
 
 
+@pytest.mark.slow
 def test_what_was_fixed_beforehand_is_kept(tmp_path, capsys, monkeypatch):
     """The looks and the level, before the first run of the confirmation, whatever comes later."""
     one = f"--algos | ppo | --envs | Pendulum-v1 | --noises | {A}@1"
