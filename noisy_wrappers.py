@@ -1397,6 +1397,11 @@ class Configuration:
 BASELINE = Configuration()
 
 
+def read_test_noise(noises: Sequence[str], rates: Sequence[Rate]) -> Configuration:
+    """Read the noises of a run's tests, whose rate is 1 if none is given."""
+    return Configuration.read(noises, [1.0] if len(noises) and not len(rates) else rates)
+
+
 def rate_order(noise_rate: str) -> tuple[tuple[float, float], ...]:
     """Return the key that sorts rates of tables (:attr:`Configuration.noise_rate`) as numbers."""
     return Configuration.parse("any", noise_rate).rates
@@ -2067,8 +2072,7 @@ def canonical_arguments(args: Mapping[str, Any]) -> dict[str, Any]:
         raise ValueError(f"--exp-name must be a name, not {args['exp_name']!r}")
     parse_env_kwargs(args["env_kwargs"])
     noises, rates = Configuration.read(args["noise"], args["noise_rate"]).texts
-    test_rates = args["test_noise_rate"] or [1.0][: len(args["test_noise"])]
-    tests = Configuration.read(args["test_noise"], test_rates).for_tests()
+    tests = read_test_noise(args["test_noise"], args["test_noise_rate"]).for_tests()
     canonical = {"env_id": canonical_env_id(args["env_id"]), "noise": noises, "noise_rate": rates}
     return canonical | {"test_noise": tests.texts[0], "test_noise_rate": tests.texts[1]}
 

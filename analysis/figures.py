@@ -290,8 +290,9 @@ def robustness_heatmap(algorithm, environment, rows, clean, metric):
     grid["dot"] = rows["tested_on"] == "the same noise"
     grid = grid.pivot(index="trained with", columns="tested with").loc[trained.unique()]
     values, dots = (grid[name][tested.unique()] for name in ("value", "dot"))
-    limit = style.color_limit(values, 100 if in_percent else np.inf)
-    limit = max(limit, 10) if in_percent else limit  # smaller differences are pale
+    # of percent, small ones are pale
+    ends = {"most": 100, "least": 10} if in_percent else {}
+    limit = style.color_limit(values, **ends)
     name = f"{algorithm} on {environment}"
     low, high = rows["n"].min(), rows["n"].max()
     seeds = f"{low:.0f}" if low == high else f"{low:.0f} to {high:.0f}"

@@ -51,10 +51,10 @@ def hues(number):
     return list(matplotlib.colormaps["turbo"](np.linspace(0.05, 0.95, number)))
 
 
-def color_limit(values, most=np.inf):
-    """Return where the colours of a heatmap end: at its largest number, at most `most`."""
+def color_limit(values, most=np.inf, least=0.0):
+    """Return where the colours of a heatmap end: at its largest number, from `least` to `most`."""
     sizes = np.abs(np.asarray(values, float))
-    limit = min(most, sizes[np.isfinite(sizes)].max(initial=0)) or 1.0
+    limit = min(most, sizes[np.isfinite(sizes)].max(initial=least)) or 1.0
     return float(np.ceil(limit)) if most == 100 else limit
 
 

@@ -60,10 +60,11 @@ def ask(env_id, configurations=(), max_episode_steps=None, env_kwargs=()):
         declared = made.spec.max_episode_steps
         with noisy.make_flat(made, STEP_LIMIT) as env:
             limit = env.spec.max_episode_steps
-            timed = Ends(env)
-            seconds, steps, length, rewards = time_steps(timed, limit, deadline, declared is None)
+            seconds, steps, length, rewards, inside = time_steps(
+                env, limit, deadline, declared is None
+            )
             env.reset()  # a failure after this one is the noise's
-            limit = min(limit, timed.limit())
+            limit = min(limit, inside)
             tried = {}
             for n in configurations:  # at every rate: it may fail at one of them
                 tried[n.noise] = tried.get(n.noise) or why_unfit(env, n, limit, deadline)
@@ -78,44 +79,10 @@ def ask(env_id, configurations=(), max_episode_steps=None, env_kwargs=()):
             )
 
 
-class Ends(gym.Wrapper):
-    """Notes how the episodes of an environment end."""
-
-    def __init__(self, env):
-        """Begin with none."""
-        super().__init__(env)
-        self.steps = 0  # of the episode
-        self.ends = []  # of each episode, its steps and whether it was terminated
-
-    def reset(self, **kwargs):
-        """Begin an episode."""
-        self.steps = 0
-        return self.env.reset(**kwargs)
-
-    def step(self, action):
-        """Make a step, and note the end of an episode."""
-        result = self.env.step(action)
-        self.steps += 1
-        if result[2] or result[3]:
-            self.ends.append((self.steps, result[2]))
-        return result
-
-    def limit(self):
-        """Return a time limit that the environment has inside, as dm_control's do, or infinity.
-
-        That is the length of two or more episodes, if all were truncated there.
-        """
-        ends = set(self.ends)
-        if len(self.ends) < 2 or len(ends) > 1:
-            return math.inf
-        [(steps, terminated)] = ends
-        return math.inf if terminated else steps
-
-
 def time_steps(env, time_limit, deadline, whole=False):
-    """Return an environment's seconds a step, the steps timed, an episode's length, and rewards.
+    """Return an environment's seconds a step, the steps timed, an episode's length, and two more.
 
-    The last is how many different rewards there were, MANY if as many or more.
+    These are how many different rewards there were, MANY if as many or more, and limit_inside.
 
     Each step bears its share of a reset: an episode is as long as those that ended while it was
     timed, or as the time limit if none did. whole: an episode is played to its end, if that takes
@@ -128,11 +95,12 @@ def time_steps(env, time_limit, deadline, whole=False):
     begin, waited_before = time.perf_counter(), waited()
     now = begin
     half = (begin + deadline) / 2
-    steps, resets, ends = [], [], []  # the seconds of each, and after which steps episodes ended
-    rewards, ended = set(), True
+    steps, resets = [], []  # the seconds of each
+    episodes = []  # of each that ended, its steps and whether it was terminated
+    rewards, ended, last_end = set(), True, 0
     while not steps or (
         now < deadline
-        and (len(steps) < STEPS or now < begin + SECONDS or (whole and not ends and now < half))
+        and (len(steps) < STEPS or now < begin + SECONDS or (whole and not episodes and now < half))
     ):
         if ended:
             start = time.perf_counter()
@@ -146,11 +114,24 @@ def time_steps(env, time_limit, deadline, whole=False):
         if len(rewards) < MANY:
             rewards.add(float(reward))
         if ended := terminated or truncated:
-            ends.append(len(steps))
-    length = ends[-1] / len(ends) if ends else time_limit
+            episodes.append((len(steps) - last_end, terminated))
+            last_end = len(steps)
+    length = fmean(length for length, _ in episodes) if episodes else time_limit
     own_share = 1 - (waited() - waited_before) / (time.perf_counter() - begin)
     seconds = (fmean(steps) + fmean(resets) / length) * own_share
-    return seconds, len(steps), math.ceil(length), len(rewards)
+    return seconds, len(steps), math.ceil(length), len(rewards), limit_inside(episodes)
+
+
+def limit_inside(episodes):
+    """Return a time limit that the environment has inside, as dm_control's do, or infinity.
+
+    That is the length of two or more episodes, if all were truncated there. episodes: of each, its
+    steps and whether it was terminated.
+    """
+    if len(episodes) < 2 or len(set(episodes)) > 1:
+        return math.inf
+    steps, terminated = episodes[0]
+    return math.inf if terminated else steps
 
 
 def waited():

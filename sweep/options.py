@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 from analysis.errors import fail
-from noisy_wrappers import Configuration, canonical_env_id, safe_name, split_noises
+from noisy_wrappers import canonical_env_id, read_test_noise, safe_name, split_noises
 from sweep import scripts
 from sweep.grid import ENVS, PRESETS, SEEDS, rate
 
@@ -165,8 +165,8 @@ def spelt_as_stored(given):
     if "test_noise" not in given:
         return {}
     try:
-        rates = given.get("test_noise_rate", ["1.0"])
-        test = Configuration.read(given["test_noise"], map(rate, rates))
+        rates = list(map(rate, given.get("test_noise_rate", [])))
+        test = read_test_noise(given["test_noise"], rates)
     except ValueError as error:
         fail(f"--test-noise: {error}")
     return dict(zip(("test_noise", "test_noise_rate"), map(list, test.texts), strict=True))
