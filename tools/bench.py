@@ -26,6 +26,7 @@ C++, gets these sizes when it is compiled, and uses MKL if mkl and mkl-include a
 
 import argparse
 import contextlib
+import csv
 import itertools
 import json
 import os
@@ -251,6 +252,20 @@ def ours_and_others(algo, env_id, options):
         yield Program("RLtools", core, "_rltools", algo, env_id, python=options.against_rltools)
 
 
+def store_blocks(algo, env_id, programs, path):
+    """Add a row for each block to a csv file; blocks of one number were neighbours."""
+    columns = ["script", "env_id", "program", "block", "steps_per_second", "core_share"]
+    is_new = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        if is_new:
+            writer.writerow(columns)
+        for program in programs:
+            for block, speed in enumerate(program.speeds):
+                figures = f"{speed:.5g}", f"{program.shares[block]:.3f}"
+                writer.writerow([algo, env_id, program.name, block, *figures])
+
+
 def compare(algo, env_id, options):
     """Run ours and the others, if there are any, alternately."""
     from scipy.stats import quantile_test  # here, since the children's interpreters may not have it
@@ -261,6 +276,8 @@ def compare(algo, env_id, options):
             in_turn = programs if pair % 2 == 0 else programs[::-1]  # each is first as often
             for program in in_turn:
                 measure(options, program)
+    if options.blocks:
+        store_blocks(algo, env_id, programs, options.blocks)
     for program in programs:
         ratios = [a / b for a, b in zip(programs[0].speeds, program.speeds, strict=True)]
         low, high = quantile_test(ratios).confidence_interval()  # of the median
@@ -307,6 +324,7 @@ def parse(argv):
     add("--against-sbx", metavar="PYTHON", help="with sbx-rl")
     add("--against-rltools", metavar="PYTHON", help="with rltools, mkl and mkl-include; SAC, TD3")
     add("--against-checkout", type=Path, metavar="PATH", help="another version of this project")
+    add("--blocks", type=Path, metavar="FILE", help="a csv file for the speed of every block")
     add("--jobs", type=int, metavar="N", help="compare N runs side by side with one")
     end = argv.index("--") if "--" in argv else len(argv)
     options = parser.parse_args(argv[:end])
@@ -320,8 +338,8 @@ def parse(argv):
         parser.error(f"--jobs {options.jobs} needs as many cores, and there are {cores}")
     peers = ("cleanrl", "sbx", "rltools", "checkout")
     others = [getattr(options, f"against_{peer}") for peer in peers]
-    if options.jobs and any(others):
-        parser.error("--jobs compares runs of this version only: leave out --against-...")
+    if options.jobs and any([*others, options.blocks]):
+        parser.error("--jobs compares runs of this version only: leave out --against-..., --blocks")
     if bool(options.against_cleanrl) != bool(options.cleanrl_python):
         parser.error("--against-cleanrl and --cleanrl-python need each other")
     files = {"cleanrl": "cleanrl/sac_continuous_action.py", "checkout": "sac_continuous_noisy.py"}

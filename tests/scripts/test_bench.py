@@ -1,5 +1,6 @@
 """bench.py: what it counts, who runs when, what it prints. No timings."""
 
+import csv
 import io
 import itertools
 import json
@@ -109,7 +110,9 @@ def test_programs_run_in_turn(tmp_path, monkeypatch):
         speeds[program.name] = program.speeds
 
     monkeypatch.setattr(bench, "measure", watched)
+    blocks = tmp_path / "blocks.csv"
     words = ["--against-checkout", str(folders[1]), "--pairs", "3", "--seconds", "0.1"]
+    words += ["--blocks", str(blocks)]
     ours, theirs = bench.compare("sac", "Any-v5", bench.parse(words))
 
     ran = [(name, len(list(group))) for name, group in itertools.groupby(log.read_text().split())]
@@ -118,6 +121,9 @@ def test_programs_run_in_turn(tmp_path, monkeypatch):
     assert (ours["program"], theirs["program"]) == ("ours", "checkout")
     ratios = [a / b for a, b in zip(speeds["ours"], speeds["checkout"], strict=True)]
     assert len(ratios) == 3 and theirs["ours / its"] == median(ratios)
+    stored = [row for row in csv.DictReader(blocks.open()) if row["program"] == "checkout"]
+    stored_speeds = [float(row["steps_per_second"]) for row in stored]
+    assert stored_speeds == pytest.approx(speeds["checkout"], rel=1e-3)
 
 
 def test_side_by_side(tmp_path, monkeypatch, capsys):
