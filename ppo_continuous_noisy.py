@@ -44,7 +44,7 @@ EVAL_FREQUENCY = 50_000  # default of --eval-frequency, or a tenth of the run if
 
 @dataclass
 class Args:
-    """Command-line arguments; the algorithm's are CleanRL's, as in the paper on noise."""
+    """Command-line arguments, CleanRL's and those of noise; --help shows their comments."""
 
     # RUN
     # - Gymnasium environment, Name-v0, or module:Name-v0
@@ -57,10 +57,12 @@ class Args:
     runs_dir: str = "runs"  # folder in which the run's own folder is made
     overwrite: bool = False  # delete the files in the run's folder and start again
     checkpoint_frequency: int = 50_000  # environment steps between two checkpoints
+
     # NOISE
     # - noises of the training environment; none: a baseline
     noise: tuple[str, ...] = ()
     noise_rate: tuple[float | str, ...] = ()  # probability of each; 1.0:0.0 falls during training
+
     # TESTS
     # - noises of the test environment; none by default
     test_noise: tuple[str, ...] = ()
@@ -166,7 +168,7 @@ class Normalizer(Saved):
         return scaled.clip(-10, 10).astype(np.float32)
 
 
-class RewardScaler(Saved):
+class RewardScaler(Normalizer):
     """Running variance of the discounted return, as in Gymnasium's NormalizeReward."""
 
     def __init__(self):
@@ -175,10 +177,7 @@ class RewardScaler(Saved):
     def scale(self, reward, terminated, gamma):
         """Take a reward into account; return it in standard deviations, at most 10 of them."""
         self.discounted_return = self.discounted_return * gamma * (1 - terminated) + reward
-        delta, total = self.discounted_return - self.mean, self.count + 1
-        self.mean += delta / total
-        self.var += (delta * delta * (self.count / total) - self.var) / total
-        self.count = total
+        self.update(self.discounted_return)
         return max(-10.0, min(10.0, reward / math.sqrt(self.var + 1e-8)))
 
 
@@ -221,8 +220,9 @@ def ppo_loss(agent, minibatch, args):
     policy_loss = torch.maximum(-advantages * ratio, -advantages * clipped_ratio).mean()
     squared_error = (values - returns).square()
     if args.clip_vloss:
-        step = (values - old_values).clamp(-args.clip_coef, args.clip_coef)
-        squared_error = torch.maximum(squared_error, (old_values + step - returns).square())
+        clipped_change = (values - old_values).clamp(-args.clip_coef, args.clip_coef)
+        clipped_error = (old_values + clipped_change - returns).square()
+        squared_error = torch.maximum(squared_error, clipped_error)
     value_loss = 0.5 * squared_error.mean()
     curves = {"value_loss": value_loss, "policy_loss": policy_loss, "entropy": entropy}
     # http://joschu.net/blog/kl-approx.html
@@ -234,7 +234,7 @@ def ppo_loss(agent, minibatch, args):
 @torch.no_grad()  # only the functions that updater() returns compute gradients
 def learn(args, env, test_env, stop):
     """Train in the noisy `env` and test in `test_env`; return False if stop() ended it early."""
-    # of one step alone, the advantage has no standard deviation
+    # a minibatch needs two steps at least, for the standard deviation of its advantages
     least, most = 2 * args.num_minibatches, args.total_timesteps
     if not least <= args.num_steps <= most:
         limits = f"2 * --num-minibatches ({least}) to --total-timesteps ({most})"
@@ -266,7 +266,7 @@ def learn(args, env, test_env, stop):
         noisy.set_progress(env, start / total_steps)
         observation, _ = env.reset()
 
-    act, std = checked_acting(agent, env, device)
+    act, std = agent.acting()
     observation_stats.update(observation)
     # one loop over steps and not two, over rollouts and steps: a run may resume within a rollout
     for global_step in range(start + 1, total_steps + 1):
@@ -297,6 +297,7 @@ def learn(args, env, test_env, stop):
             observations = torch.from_numpy(rollout.observations).to(device)
             actions = torch.from_numpy(rollout.actions).to(device)
             log_probs, _, values = agent(observations[:-1], actions)
+            check_acting(log_probs, rollout, std)
             all_values = torch.cat([values, agent.critic(observations[-1])])
             advantages = compute_gae(
                 rollout.rewards, all_values, rollout.dones, args.gamma, args.gae_lambda
@@ -310,6 +311,7 @@ def learn(args, env, test_env, stop):
             batch = (observations[:-1], actions, log_probs, advantages, returns, values)
             clipfracs = []
             for _ in range(args.update_epochs):
+                # shuffle the whole rollout, which takes less time than picking each minibatch
                 order = torch.from_numpy(rng.permutation(args.num_steps)).to(device)
                 shuffled = [tensor[order].tensor_split(args.num_minibatches) for tensor in batch]
                 for minibatch in zip(*shuffled, strict=True):
@@ -317,7 +319,7 @@ def learn(args, env, test_env, stop):
                     clipfracs.append(curves["clipfrac"])
                 if args.target_kl is not None and curves["approx_kl"] > args.target_kl:
                     break
-            act, std = checked_acting(agent, env, device)
+            act, std = agent.acting()
 
             curves["clipfrac"] = torch.stack(clipfracs).mean()
             curves["explained_variance"] = 1 - (returns - values).var() / returns.var().clamp(1e-8)
@@ -326,10 +328,11 @@ def learn(args, env, test_env, stop):
 
             # TEST: if one fell due during the rollout; eval.csv has the step at which it fell due
             due = global_step - global_step % max(1, args.eval_frequency)
-            if is_last or (args.eval_frequency > 0 and due > global_step - args.num_steps):
+            is_due = args.eval_frequency > 0 and due > global_step - args.num_steps
+            if is_last or is_due:
                 policy = make_policy(agent, observation_stats, env)
                 results = noisy.play(test_env, policy, args.eval_episodes, TEST_SEED)
-                due = args.total_timesteps if is_last else due  # up to a rollout more than trained
+                due = args.total_timesteps if is_last else due  # whole rollouts may end before it
                 saved = {"agent": agent.state_dict()}
                 saved["observation_stats"] = observation_stats.state_dict()
                 run.log_test(global_step, results, saved, due)
@@ -352,19 +355,12 @@ def learn(args, env, test_env, stop):
     return True
 
 
-def checked_acting(agent, env, device):
-    """Return agent.acting(), in NumPy; exit if that is not the policy of forward(), in PyTorch."""
-    act, std = agent.acting()
-    generator = torch.Generator().manual_seed(0)
-    eps = torch.randn(8, *env.action_space.shape, generator=generator)
-    inputs = torch.randn(8, *env.observation_space.shape, generator=generator)
-    actions = np.stack([act(x) for x in inputs.numpy()]) + std * eps.numpy()
-    log_probs, _, _ = agent(inputs.to(device), torch.from_numpy(actions).to(device))
-    expected = (-0.5 * eps.square() - 0.5 * math.log(2 * math.pi)).sum(1) - np.log(std).sum()
-    rounding = 1e-3 * (1 + np.abs(actions / std).sum(1))
-    if ((log_probs.cpu() - expected).abs().numpy() > rounding).any():
+def check_acting(log_probs, rollout, std):
+    """Exit if the policy that acted, in NumPy, is not the one of forward(), in PyTorch."""
+    expected = (-0.5 * rollout.eps**2 - np.log(std) - 0.5 * math.log(2 * math.pi)).sum(1)
+    rounding = 1e-3 * (1 + np.abs(rollout.actions / std).sum(1))
+    if (np.abs(log_probs.cpu().numpy() - expected) > rounding).any():
         fail("the agent acts with one policy and learns another: see acting() and forward()", 1)
-    return act, std
 
 
 def make_policy(agent, observation_stats, env):
@@ -380,6 +376,7 @@ def load_policy(run_dir, env=None):
     agent, observation_stats = Agent(env), Normalizer(env.observation_space.shape)
     saved = read_state(Path(run_dir, "policy.pt"))
     agent.load_state_dict(saved["agent"])
+    # version 0.3 saved tensors
     stats = {name: np.asarray(value) for name, value in saved["observation_stats"].items()}
     observation_stats.load_state_dict(stats)
     return make_policy(agent, observation_stats, env)
@@ -420,7 +417,7 @@ def updater(loss, network, optimizer, args):
 
     def update(*inputs):
         # a compiled graph takes a Python number as a constant, and is compiled again for another
-        numbers = (int, float, np.float64)
+        numbers = (int, float, np.float32, np.float64, np.int32, np.int64)  # but no bool: a switch
         inputs = [torch.tensor(float(x)) if type(x) in numbers else x for x in inputs]
         gradient, curves = gradient_of(parameters, tuple(inputs))
         for name, parameter in parameters.items():
@@ -432,34 +429,38 @@ def updater(loss, network, optimizer, args):
     return update
 
 
-def relu(x):
-    """Return the positive part of an array."""
-    return np.maximum(x, 0)
-
-
 def in_numpy(network):
     """Return a network as a function of one observation, NumPy to NumPy.
 
     Linear, Tanh and ReLU are computed in NumPy, several times faster than in PyTorch. A network
     that has anything else is called as it is.
     """
-    layers = []
+    functions = []
     for layer in network if type(network) is nn.Sequential else [network]:
         has_hooks = layer._forward_hooks or layer._forward_pre_hooks
         if type(layer) is nn.Linear and layer.bias is not None and not has_hooks:
-            layers.append((layer.weight.numpy(force=True), layer.bias.numpy(force=True), None))
-        elif type(layer) in (nn.Tanh, nn.ReLU) and not has_hooks:
-            layers.append((None, None, np.tanh if type(layer) is nn.Tanh else relu))
+            weight, bias = layer.weight.numpy(force=True), layer.bias.numpy(force=True)
+            functions.append(functools.partial(linear, weight, bias))
+        elif type(layer) in IN_NUMPY and not has_hooks:
+            functions.append(IN_NUMPY[type(layer)])
         else:
             device = next(network.parameters()).device
             return lambda x: network(torch.from_numpy(x).to(device)).numpy(force=True)
 
     def call(x):
-        for weight, bias, function in layers:
-            x = weight @ x + bias if function is None else function(x)
+        for function in functions:
+            x = function(x)
         return x
 
     return call
+
+
+def linear(weight, bias, x):
+    """Return what nn.Linear returns."""
+    return weight @ x + bias
+
+
+IN_NUMPY = {nn.Tanh: np.tanh, nn.ReLU: lambda x: np.maximum(x, 0)}
 
 
 # THE RUN: environments, folder, signals. The three scripts have the same text, and you can change
@@ -478,7 +479,8 @@ def fail_on(errors, message, code=2):
     try:
         yield
     except errors as error:
-        fail(f"{message}: {' '.join(str(error).split()) or type(error).__name__}", code)
+        reason = " ".join(str(error).split()) or type(error).__name__
+        fail(f"{message}: {reason}", code)
 
 
 def say(text):
@@ -521,14 +523,14 @@ def train(args, stop=lambda: 0):
         args.eval_frequency = max(1, min(EVAL_FREQUENCY, args.total_timesteps // 10))
     torch.compiler.reset()  # forget what earlier runs of this process compiled
     torch.set_num_threads(args.torch_threads)
-    precision, processor = args.matmul_precision, torch.cpu.get_capabilities()
+    processor = torch.cpu.get_capabilities()
     has_bf16 = any(processor.get(name) for name in ("avx512_bf16", "amx_bf16", "bf16", "sve_bf16"))
-    if precision == "bf16" and not (has_bf16 or args.cuda):
+    if args.matmul_precision == "bf16" and not (has_bf16 or args.cuda):
         fail("--matmul-precision bf16: this processor has no bfloat16, so it would be slower")
-    # "medium" rounds to bfloat16 with AMX or on ARM, and to TF32 on a GPU
-    if precision == "bf16" or processor.get("amx_tile") or processor.get("bf16") or args.cuda:
-        precision = "highest"
-    torch.set_float32_matmul_precision(precision)
+    # "medium" would round to bfloat16 with AMX or on ARM, and to TF32 on a GPU
+    would_round = args.cuda or processor.get("amx_tile") or processor.get("bf16")
+    is_medium = args.matmul_precision == "medium" and not would_round
+    torch.set_float32_matmul_precision("medium" if is_medium else "highest")
     with fail_on((gym.error.Error, noisy.SpaceError), f"--env-id {args.env_id}"):
         env, test_env = noisy.make_environments(make_env, asdict(args), TEST_SEED)
     with env, test_env:  # they are closed at the end
@@ -538,6 +540,7 @@ def train(args, stop=lambda: 0):
 class Run:
     """The run's folder: what is written into it, and read again to resume."""
 
+    # in the order in which --overwrite deletes them: without result.json a run is not finished
     FILES = ["result.json", "checkpoint.pt", "policy.pt", "policy_*.pt", "eval.csv", "config.json"]
     FILES += ["robustness.csv", "events.out.tfevents.*"]
 
@@ -553,19 +556,20 @@ class Run:
             fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
         if args.overwrite:
             self._delete(*self.FILES, *(f"{name}.tmp" for name in self.FILES))
-        self.config = noisy.describe_run(__file__, asdict(args), asdict(Args()), env)
-        self.config["versions"]["torch"] = torch.__version__
-        self.config["matmul_precision"] = torch.get_float32_matmul_precision()
+        new = noisy.describe_run(__file__, asdict(args), asdict(Args()), env)
+        new["versions"]["torch"] = torch.__version__
+        new["matmul_precision"] = torch.get_float32_matmul_precision()
+        config = self.folder / "config.json"
+        with fail_on(ValueError, str(self.folder)):
+            old = json.loads(config.read_text()) if config.exists() else new
+            self.config = noisy.resumed_run(old, new)
+        if self.config["script_sha256"] != new["script_sha256"]:
+            say("the script has changed since the run began; if it matters, use --exp-name")
         self.is_finished = (self.folder / "result.json").exists()
         if self.is_finished:
             self._delete("checkpoint.pt")  # left by a process that was killed before it did so
-        config = self.folder / "config.json"
-        if config.exists():
-            with fail_on(ValueError, str(self.folder)):
-                self.config = noisy.resumed_run(json.loads(config.read_text()), self.config)
-        if "," in self.config["script_sha256"]:  # resumed_run() has appended another one
-            say("the script has changed since the run began; if it matters, use --exp-name")
-        noises = " + ".join(map("{} at {}".format, args.noise, args.noise_rate)) or "no noise"
+        pairs = zip(args.noise, args.noise_rate, strict=True)
+        noises = " + ".join(f"{noise} at {rate}" for noise, rate in pairs) or "no noise"
         begun = f"{self.config['algorithm']} on {args.env_id}, {noises}, seed {args.seed}"
         begun += " (compiles first, which takes a while)" if args.compile else ""
         say(f"{self.folder} is finished" if self.is_finished else f"{begun}: {self.folder}")
@@ -576,12 +580,15 @@ class Run:
         A state_dict may hold tensors, NumPy's arrays and numbers, and Python's own types.
         """
         self.state, self.eval_csv = state, "step,episode,episodic_return,episodic_length,success\n"
-        step, seconds, processor_seconds, path = 0, 0.0, 0.0, self.folder / "checkpoint.pt"
+        step, seconds, processor_seconds = 0, 0.0, 0.0
+        path = self.folder / "checkpoint.pt"
         if path.exists():
             with fail_on(Exception, f"cannot read {path} (--overwrite starts afresh)"):
                 if zipfile.ZipFile(path).testzip():  # torch.load checks no checksums
                     raise ValueError("it is damaged")
                 checkpoint = read_state(path)
+                if checkpoint["state"].keys() != state.keys():
+                    raise ValueError(f"it holds {[*checkpoint['state']]}, not {[*state]}")
                 for name, part in state.items():
                     part.load_state_dict(checkpoint["state"][name])
             torch.set_rng_state(checkpoint["torch"])
@@ -589,7 +596,7 @@ class Run:
             seconds, processor_seconds = checkpoint["seconds"], checkpoint["processor_seconds"]
             say(f"resumed at step {step}")
         else:
-            self._delete("events.out.tfevents.*")
+            self._delete("events.out.tfevents.*")  # of a process killed before its first checkpoint
             for name, part in state.items():  # fail now, and not when the run is resumed
                 with fail_on(Exception, f"the state of {name!r} cannot be saved and read back"):
                     file = io.BytesIO()
@@ -605,6 +612,7 @@ class Run:
         self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None, smoothing=0)
         self.saved_step, self.last_test, self.printed = step, "", time.monotonic()
         self.learning_since = None  # the step and the time of the first losses
+        self.speed = 0.0  # steps per second since then
         self.wall_begun = time.monotonic() - seconds
         self.processor_begun = time.process_time() - processor_seconds
         return step
@@ -616,8 +624,8 @@ class Run:
         self.writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + table)
         metrics = ["eval/episodic_return_mean", "charts/episodic_return", "eval/success_rate"]
         experiment, session_start, _ = hparams(args, dict.fromkeys(metrics, 0))
-        self.writer.file_writer.add_summary(experiment)
-        self.writer.file_writer.add_summary(session_start)
+        for summary in (experiment, session_start):
+            self.writer.file_writer.add_summary(summary)
 
     def save(self, step):
         """Write a checkpoint: all that resuming needs, between two episodes."""
@@ -640,7 +648,7 @@ class Run:
             tags |= {f"{group}/{name}": float(value) for name, value in values.items()}
         if "losses" in groups and self.learning_since:
             first_step, since = self.learning_since
-            tags["charts/SPS"] = (step - first_step) / (now - since)
+            self.speed = tags["charts/SPS"] = (step - first_step) / (now - since)
         elif "losses" in groups:  # the first ones: compiling does not count
             self.learning_since = step, now
         if not all(map(math.isfinite, tags.values())):
@@ -653,13 +661,11 @@ class Run:
     def _show_progress(self, step, now):
         """Move the bar of a terminal; elsewhere print a line after ten seconds, or after a test."""
         self.bar.update(step - self.bar.n)
-        self.bar.n = step  # update() does nothing where there is no terminal
         if self.bar.disable and now - self.printed > 10:
-            first_step, since = self.learning_since or (step, now)
-            speed = (step - first_step) / max(now - since, 1e-6)
-            left = tqdm.format_interval((self.bar.total - step) / speed) if speed else "?"
-            # analysis/folders.py reads this line
-            say(f"step={step}/{self.bar.total} sps={speed:.0f} {self.last_test}eta={left}")
+            left = (self.bar.total - step) / self.speed if self.speed else None
+            eta = tqdm.format_interval(left) if left is not None else "?"
+            # analysis/logs.py reads this line
+            say(f"step={step}/{self.bar.total} sps={self.speed:.0f} {self.last_test}eta={eta}")
             self.printed = now
 
     def log_episode(self, step, info):
@@ -670,7 +676,8 @@ class Run:
     def log_test(self, step, results, policy, due=None):
         """Log the (N, 3) returns, lengths and outcomes of a test, and save the policy.
 
-        `due` is the step for eval.csv if it is not `step`: PPO tests after whole rollouts.
+        `due` is the step in eval.csv and policy_STEP.pt, if it is not `step`: PPO tests after whole
+        rollouts.
         """
         due = due or step
         for episode, (episodic_return, length, outcome) in enumerate(results.tolist()):
@@ -735,19 +742,21 @@ class Run:
 
 def read_state(file):
     """Read a checkpoint that may hold arrays and numbers of NumPy, but never code."""
-    numpy, types = np._core.multiarray, {type(np.dtype(code)) for code in np.typecodes["All"]}
-    types |= {np.ndarray, np.dtype, numpy._reconstruct, numpy.scalar, bytes}
-    with torch.serialization.safe_globals(list(types)):
+    multiarray = np._core.multiarray
+    types = [np.ndarray, np.dtype, bytes, multiarray._reconstruct, multiarray.scalar]
+    types += {type(np.dtype(code)) for code in np.typecodes["All"]}
+    with torch.serialization.safe_globals(types):
         return torch.load(file, "cpu", weights_only=True)  # also what was saved on a GPU
 
 
 def stop_at_signals():
     """Answer signals at the end of an episode: return stop() -> the first one's number, or 0."""
-    received, script = [], os.getpid()
+    received, script_pid = [], os.getpid()
 
     def remember(number, frame):
         received.append(number)
-        is_worker = os.getpid() != script  # of the environment: it needs them after a first Ctrl-C
+        # a process that the environment forked: the episode that goes on needs it
+        is_worker = os.getpid() != script_pid
         is_second_ctrl_c = number == signal.SIGINT and len(received) > 1
         if is_second_ctrl_c or (is_worker and number != signal.SIGINT):
             os._exit(128 + number)
@@ -769,7 +778,6 @@ if __name__ == "__main__":
     noises = "\n  ".join(["Noises:", *noisy.signatures()])
     args = tyro.cli(Args, description=f"{__doc__}\n{noises}")
     with fail_on((noisy.NotFiniteError, noisy.SpaceError), "training stopped", code=1):
-        finished = train(args, stop)
-    if not finished:
-        say("stopped; run the same command again to resume")
-        raise SystemExit(128 + stop())
+        if not train(args, stop):
+            say("stopped; run the same command again to resume")
+            raise SystemExit(128 + stop())

@@ -44,7 +44,7 @@ EVAL_FREQUENCY = 10_000  # default of --eval-frequency, or a tenth of the run if
 
 @dataclass
 class Args:
-    """Command-line arguments; the algorithm's are CleanRL's, as in the paper on noise."""
+    """Command-line arguments, CleanRL's and those of noise; --help shows their comments."""
 
     # RUN
     # - Gymnasium environment, Name-v0, or module:Name-v0
@@ -57,10 +57,12 @@ class Args:
     runs_dir: str = "runs"  # folder in which the run's own folder is made
     overwrite: bool = False  # delete the files in the run's folder and start again
     checkpoint_frequency: int = 50_000  # environment steps between two checkpoints
+
     # NOISE
     # - noises of the training environment; none: a baseline
     noise: tuple[str, ...] = ()
     noise_rate: tuple[float | str, ...] = ()  # probability of each; 1.0:0.0 falls during training
+
     # TESTS
     # - noises of the test environment; none by default
     test_noise: tuple[str, ...] = ()
@@ -161,7 +163,7 @@ class ReplayBuffer:
         self.is_step = np.zeros(rows, bool)
 
     def add(self, observation, action, reward, next_observation, terminated, truncated):
-        """Store a step in place of the oldest one; the next step goes into the row after it."""
+        """Store a step in place of the oldest one; after an episode, skip its final observation."""
         row, next_row = self.position, (self.position + 1) % self.rows
         self.observations[row], self.observations[next_row] = observation, next_observation
         self.actions[row], self.rewards[row], self.terminated[row] = action, reward, terminated
@@ -172,11 +174,11 @@ class ReplayBuffer:
     def sample(self, batch_size, rng):
         """Draw (s, a, r, s', terminated) uniformly: float32 tensors with batch_size rows."""
         rows = rng.integers(self.size, size=batch_size)
-        while not self.is_step[rows].all():
+        while not self.is_step[rows].all():  # draw the others again
             rows = np.where(self.is_step[rows], rows, rng.integers(self.size, size=batch_size))
-        next_observations = self.observations[(rows + 1) % self.rows]
-        batch = self.observations[rows], self.actions[rows], self.rewards[rows], next_observations
-        return [torch.from_numpy(array) for array in (*batch, self.terminated[rows])]
+        batch = [self.observations[rows], self.actions[rows], self.rewards[rows]]
+        batch += [self.observations[(rows + 1) % self.rows], self.terminated[rows]]
+        return [torch.from_numpy(array) for array in batch]
 
     def state_dict(self):
         """Return the filled rows, as tensors that share the buffer's memory."""
@@ -318,7 +320,7 @@ def load_policy(run_dir, env=None):
     """Return the policy of a run's last test; version 0.3 saved no spaces, so it needs `env`."""
     config = json.loads(Path(run_dir, "config.json").read_text())
     actor = Actor(env or noisy.Spaces(config))
-    saved = torch.load(Path(run_dir, "policy.pt"), "cpu", weights_only=True)
+    saved = read_state(Path(run_dir, "policy.pt"))
     actor.load_state_dict(saved.get("actor", saved))  # version 0.3 saved the actor alone
     return actor.policy
 
@@ -353,7 +355,7 @@ def updater(loss, network, optimizer, args):
 
     def update(*inputs):
         # a compiled graph takes a Python number as a constant, and is compiled again for another
-        numbers = (int, float, np.float64)
+        numbers = (int, float, np.float32, np.float64, np.int32, np.int64)  # but no bool: a switch
         inputs = [torch.tensor(float(x)) if type(x) in numbers else x for x in inputs]
         with bf16:
             gradient, (_, curves) = gradient_of(parameters, tuple(inputs))
@@ -385,7 +387,8 @@ def fail_on(errors, message, code=2):
     try:
         yield
     except errors as error:
-        fail(f"{message}: {' '.join(str(error).split()) or type(error).__name__}", code)
+        reason = " ".join(str(error).split()) or type(error).__name__
+        fail(f"{message}: {reason}", code)
 
 
 def say(text):
@@ -428,14 +431,14 @@ def train(args, stop=lambda: 0):
         args.eval_frequency = max(1, min(EVAL_FREQUENCY, args.total_timesteps // 10))
     torch.compiler.reset()  # forget what earlier runs of this process compiled
     torch.set_num_threads(args.torch_threads)
-    precision, processor = args.matmul_precision, torch.cpu.get_capabilities()
+    processor = torch.cpu.get_capabilities()
     has_bf16 = any(processor.get(name) for name in ("avx512_bf16", "amx_bf16", "bf16", "sve_bf16"))
-    if precision == "bf16" and not (has_bf16 or args.cuda):
+    if args.matmul_precision == "bf16" and not (has_bf16 or args.cuda):
         fail("--matmul-precision bf16: this processor has no bfloat16, so it would be slower")
-    # "medium" rounds to bfloat16 with AMX or on ARM, and to TF32 on a GPU
-    if precision == "bf16" or processor.get("amx_tile") or processor.get("bf16") or args.cuda:
-        precision = "highest"
-    torch.set_float32_matmul_precision(precision)
+    # "medium" would round to bfloat16 with AMX or on ARM, and to TF32 on a GPU
+    would_round = args.cuda or processor.get("amx_tile") or processor.get("bf16")
+    is_medium = args.matmul_precision == "medium" and not would_round
+    torch.set_float32_matmul_precision("medium" if is_medium else "highest")
     with fail_on((gym.error.Error, noisy.SpaceError), f"--env-id {args.env_id}"):
         env, test_env = noisy.make_environments(make_env, asdict(args), TEST_SEED)
     with env, test_env:  # they are closed at the end
@@ -445,6 +448,7 @@ def train(args, stop=lambda: 0):
 class Run:
     """The run's folder: what is written into it, and read again to resume."""
 
+    # in the order in which --overwrite deletes them: without result.json a run is not finished
     FILES = ["result.json", "checkpoint.pt", "policy.pt", "policy_*.pt", "eval.csv", "config.json"]
     FILES += ["robustness.csv", "events.out.tfevents.*"]
 
@@ -460,19 +464,20 @@ class Run:
             fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
         if args.overwrite:
             self._delete(*self.FILES, *(f"{name}.tmp" for name in self.FILES))
-        self.config = noisy.describe_run(__file__, asdict(args), asdict(Args()), env)
-        self.config["versions"]["torch"] = torch.__version__
-        self.config["matmul_precision"] = torch.get_float32_matmul_precision()
+        new = noisy.describe_run(__file__, asdict(args), asdict(Args()), env)
+        new["versions"]["torch"] = torch.__version__
+        new["matmul_precision"] = torch.get_float32_matmul_precision()
+        config = self.folder / "config.json"
+        with fail_on(ValueError, str(self.folder)):
+            old = json.loads(config.read_text()) if config.exists() else new
+            self.config = noisy.resumed_run(old, new)
+        if self.config["script_sha256"] != new["script_sha256"]:
+            say("the script has changed since the run began; if it matters, use --exp-name")
         self.is_finished = (self.folder / "result.json").exists()
         if self.is_finished:
             self._delete("checkpoint.pt")  # left by a process that was killed before it did so
-        config = self.folder / "config.json"
-        if config.exists():
-            with fail_on(ValueError, str(self.folder)):
-                self.config = noisy.resumed_run(json.loads(config.read_text()), self.config)
-        if "," in self.config["script_sha256"]:  # resumed_run() has appended another one
-            say("the script has changed since the run began; if it matters, use --exp-name")
-        noises = " + ".join(map("{} at {}".format, args.noise, args.noise_rate)) or "no noise"
+        pairs = zip(args.noise, args.noise_rate, strict=True)
+        noises = " + ".join(f"{noise} at {rate}" for noise, rate in pairs) or "no noise"
         begun = f"{self.config['algorithm']} on {args.env_id}, {noises}, seed {args.seed}"
         begun += " (compiles first, which takes a while)" if args.compile else ""
         say(f"{self.folder} is finished" if self.is_finished else f"{begun}: {self.folder}")
@@ -483,12 +488,15 @@ class Run:
         A state_dict may hold tensors, NumPy's arrays and numbers, and Python's own types.
         """
         self.state, self.eval_csv = state, "step,episode,episodic_return,episodic_length,success\n"
-        step, seconds, processor_seconds, path = 0, 0.0, 0.0, self.folder / "checkpoint.pt"
+        step, seconds, processor_seconds = 0, 0.0, 0.0
+        path = self.folder / "checkpoint.pt"
         if path.exists():
             with fail_on(Exception, f"cannot read {path} (--overwrite starts afresh)"):
                 if zipfile.ZipFile(path).testzip():  # torch.load checks no checksums
                     raise ValueError("it is damaged")
                 checkpoint = read_state(path)
+                if checkpoint["state"].keys() != state.keys():
+                    raise ValueError(f"it holds {[*checkpoint['state']]}, not {[*state]}")
                 for name, part in state.items():
                     part.load_state_dict(checkpoint["state"][name])
             torch.set_rng_state(checkpoint["torch"])
@@ -496,7 +504,7 @@ class Run:
             seconds, processor_seconds = checkpoint["seconds"], checkpoint["processor_seconds"]
             say(f"resumed at step {step}")
         else:
-            self._delete("events.out.tfevents.*")
+            self._delete("events.out.tfevents.*")  # of a process killed before its first checkpoint
             for name, part in state.items():  # fail now, and not when the run is resumed
                 with fail_on(Exception, f"the state of {name!r} cannot be saved and read back"):
                     file = io.BytesIO()
@@ -512,6 +520,7 @@ class Run:
         self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None, smoothing=0)
         self.saved_step, self.last_test, self.printed = step, "", time.monotonic()
         self.learning_since = None  # the step and the time of the first losses
+        self.speed = 0.0  # steps per second since then
         self.wall_begun = time.monotonic() - seconds
         self.processor_begun = time.process_time() - processor_seconds
         return step
@@ -523,8 +532,8 @@ class Run:
         self.writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + table)
         metrics = ["eval/episodic_return_mean", "charts/episodic_return", "eval/success_rate"]
         experiment, session_start, _ = hparams(args, dict.fromkeys(metrics, 0))
-        self.writer.file_writer.add_summary(experiment)
-        self.writer.file_writer.add_summary(session_start)
+        for summary in (experiment, session_start):
+            self.writer.file_writer.add_summary(summary)
 
     def save(self, step):
         """Write a checkpoint: all that resuming needs, between two episodes."""
@@ -547,7 +556,7 @@ class Run:
             tags |= {f"{group}/{name}": float(value) for name, value in values.items()}
         if "losses" in groups and self.learning_since:
             first_step, since = self.learning_since
-            tags["charts/SPS"] = (step - first_step) / (now - since)
+            self.speed = tags["charts/SPS"] = (step - first_step) / (now - since)
         elif "losses" in groups:  # the first ones: compiling does not count
             self.learning_since = step, now
         if not all(map(math.isfinite, tags.values())):
@@ -560,13 +569,11 @@ class Run:
     def _show_progress(self, step, now):
         """Move the bar of a terminal; elsewhere print a line after ten seconds, or after a test."""
         self.bar.update(step - self.bar.n)
-        self.bar.n = step  # update() does nothing where there is no terminal
         if self.bar.disable and now - self.printed > 10:
-            first_step, since = self.learning_since or (step, now)
-            speed = (step - first_step) / max(now - since, 1e-6)
-            left = tqdm.format_interval((self.bar.total - step) / speed) if speed else "?"
-            # analysis/folders.py reads this line
-            say(f"step={step}/{self.bar.total} sps={speed:.0f} {self.last_test}eta={left}")
+            left = (self.bar.total - step) / self.speed if self.speed else None
+            eta = tqdm.format_interval(left) if left is not None else "?"
+            # analysis/logs.py reads this line
+            say(f"step={step}/{self.bar.total} sps={self.speed:.0f} {self.last_test}eta={eta}")
             self.printed = now
 
     def log_episode(self, step, info):
@@ -577,7 +584,8 @@ class Run:
     def log_test(self, step, results, policy, due=None):
         """Log the (N, 3) returns, lengths and outcomes of a test, and save the policy.
 
-        `due` is the step for eval.csv if it is not `step`: PPO tests after whole rollouts.
+        `due` is the step in eval.csv and policy_STEP.pt, if it is not `step`: PPO tests after whole
+        rollouts.
         """
         due = due or step
         for episode, (episodic_return, length, outcome) in enumerate(results.tolist()):
@@ -642,19 +650,21 @@ class Run:
 
 def read_state(file):
     """Read a checkpoint that may hold arrays and numbers of NumPy, but never code."""
-    numpy, types = np._core.multiarray, {type(np.dtype(code)) for code in np.typecodes["All"]}
-    types |= {np.ndarray, np.dtype, numpy._reconstruct, numpy.scalar, bytes}
-    with torch.serialization.safe_globals(list(types)):
+    multiarray = np._core.multiarray
+    types = [np.ndarray, np.dtype, bytes, multiarray._reconstruct, multiarray.scalar]
+    types += {type(np.dtype(code)) for code in np.typecodes["All"]}
+    with torch.serialization.safe_globals(types):
         return torch.load(file, "cpu", weights_only=True)  # also what was saved on a GPU
 
 
 def stop_at_signals():
     """Answer signals at the end of an episode: return stop() -> the first one's number, or 0."""
-    received, script = [], os.getpid()
+    received, script_pid = [], os.getpid()
 
     def remember(number, frame):
         received.append(number)
-        is_worker = os.getpid() != script  # of the environment: it needs them after a first Ctrl-C
+        # a process that the environment forked: the episode that goes on needs it
+        is_worker = os.getpid() != script_pid
         is_second_ctrl_c = number == signal.SIGINT and len(received) > 1
         if is_second_ctrl_c or (is_worker and number != signal.SIGINT):
             os._exit(128 + number)
@@ -676,7 +686,6 @@ if __name__ == "__main__":
     noises = "\n  ".join(["Noises:", *noisy.signatures()])
     args = tyro.cli(Args, description=f"{__doc__}\n{noises}")
     with fail_on((noisy.NotFiniteError, noisy.SpaceError), "training stopped", code=1):
-        finished = train(args, stop)
-    if not finished:
-        say("stopped; run the same command again to resume")
-        raise SystemExit(128 + stop())
+        if not train(args, stop):
+            say("stopped; run the same command again to resume")
+            raise SystemExit(128 + stop())

@@ -173,7 +173,7 @@ def test_a_compiled_loss_reads_the_statistics_as_they_are(tmp_path):
     args = watched_run.SimpleNamespace(compile=True, matmul_precision="highest")
 
     def loss(actor, observations):
-        actions = actor(observations, 0.0)
+        actions, _, _ = actor(observations, 0.0)
         return actions.sum(), {"actions": actions}
 
     update = script.updater(loss, actor, torch.optim.SGD(actor.parameters(), lr=0.0), args)

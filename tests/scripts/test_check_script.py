@@ -35,8 +35,8 @@ def test_a_script_that_never_learns(tmp_path):
 
 
 def test_a_formula_of_acting_alone(tmp_path):
-    old = "squashed, _ = self.squash(observations, eps)\n        return self.to_bounds(squashed)"
-    trial = broken(tmp_path, "sac", (old, old.replace("(squashed)", "(squashed.clamp(0.3, 0.4))")))
+    old = "actions, _, _ = self(observations, eps)"
+    trial = broken(tmp_path, "sac", (old, old.replace("eps)", "eps)[0].clamp(0.3, 0.4), 0, 0")))
     assert "actor_loss() learns actions" in reason(check_script.acts, trial)
 
 
@@ -156,8 +156,8 @@ def test_an_option_whose_default_changes(tmp_path):
 
 
 def test_options_that_are_not_compared(tmp_path):
-    old = "self.config = noisy.resumed_run(json.loads(config.read_text()), self.config)"
-    trial = broken(tmp_path, "ppo", (old, "pass"))
+    old = "self.config = noisy.resumed_run(old, new)"
+    trial = broken(tmp_path, "ppo", (old, "self.config = new"))
     assert "leave resumed_run() in Run" in reason(check_script.options, trial)
 
 
