@@ -30,11 +30,10 @@ class Option(NamedTuple):
 class Script(NamedTuple):
     """A training script."""
 
-    algorithm: str  # in lower case, as on a command line
     path: str  # as a command names it: relative in the project's folder
     options: dict[str, Option]
     sha256: str  # of its text
-    constants: dict[str, int]  # whole numbers that it defines
+    eval_frequency: int | None  # steps between tests where a run names none, if it tells
 
     @property
     def file(self):
@@ -74,15 +73,8 @@ def find(algorithm, caller):
 @functools.cache
 def scripts_in(folder):
     """Return the training scripts of a folder: {algorithm: path}."""
-    found = {}
-    try:
-        for path in sorted(folder.glob(f"*{ENDING}")):
-            name = path.name.removesuffix(ENDING)
-            if re.fullmatch(r"\w+", name):
-                found.setdefault(name.lower(), path)
-    except OSError:  # a folder that may not be listed
-        pass
-    return found
+    paths = sorted(folder.glob(f"*{ENDING}"))
+    return {path.name.removesuffix(ENDING).lower(): path for path in paths}
 
 
 @functools.cache
@@ -96,27 +88,21 @@ def read(path):
     classes = {node.name: node for node in nodes if isinstance(node, ast.ClassDef)}
     if "Args" not in classes:
         fail(f"{path} has no class Args, whose fields are a script's options")
-    inside = path.is_relative_to(PROJECT)
-    return Script(
-        algorithm=path.name.removesuffix(ENDING).lower(),
-        path=str(path.relative_to(PROJECT) if inside else path),
-        options=fields(classes, "Args"),
-        sha256=hashlib.sha256(content).hexdigest(),
-        constants=dict(constants(nodes)),
-    )
-
-
-def fields(classes, name):
-    """Return the fields of a dataclass {name: Option}, those of its bases in this file first."""
-    found = {}
-    for base in classes[name].bases:
-        if isinstance(base, ast.Name) and base.id in classes and base.id != name:
-            found |= fields(classes, base.id)
-    for node in classes[name].body:
+    options, frequency = {}, None
+    for node in classes["Args"].body:
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
             kind = ast.unparse(node.annotation).strip("'\"")
-            found[node.target.id] = Option(kind, *literal(node.value))
-    return found
+            options[node.target.id] = Option(kind, *literal(node.value))
+    for node in nodes:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "EVAL_FREQUENCY":
+            frequency, _ = literal(node.value)
+    inside = path.is_relative_to(PROJECT)
+    return Script(
+        path=str(path.relative_to(PROJECT) if inside else path),
+        options=options,
+        sha256=hashlib.sha256(content).hexdigest(),
+        eval_frequency=frequency if type(frequency) is int else None,
+    )
 
 
 def literal(node):
@@ -125,15 +111,6 @@ def literal(node):
         return ast.literal_eval(node), True
     except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
         return None, False
-
-
-def constants(nodes):
-    """Yield (name, number) of the whole numbers that a module defines."""
-    for node in nodes:
-        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-            value, is_known = literal(node.value)
-            if is_known and type(value) is int:
-                yield node.targets[0].id, value
 
 
 # ------------------------------------------------------------------------- words of a command line
