@@ -13,8 +13,7 @@ Presets
   choose     finds a noise that helps: for each algorithm and environment, tries the noises, gives
              the better half of them more seeds in each round, compares the winner with no noise on
              fresh seeds, and prints a verdict; the runs are stored in runs/choose
-  demo       PPO on InvertedPendulum-v5, without and with one noise, 5 seeds, 20,480 steps, set to
-             learn fast, into runs/demo
+  demo       PPO on InvertedPendulum-v5, with one noise, in a minute or two, into runs/demo
   baseline   no noise: 3 algorithms, 5 environments, the paper's seeds
   best       the paper's best noise for each algorithm and environment
   paper      15 noises at 6 rates, 9,100 runs
@@ -75,7 +74,6 @@ Put options of the training scripts, such as --eval-episodes 20, at the end, aft
 
 Examples
   ./benchmark.sh choose --algos ppo --envs Pusher-v5 --noise-rates 1.0
-  ./benchmark.sh demo
   ./benchmark.sh best --envs Hopper-v5 --seeds 1 --total-timesteps 2e5 --runs-dir runs/short
   ./benchmark.sh custom --algos td3 --noises "RandomUniformScaleReward(0.5, 1.5)" --noise-rates 0.05
   ./benchmark.sh paper --executor parallel --sshlogin hostA,hostB
@@ -136,16 +134,8 @@ done
 case ${PYTHON:-} in '' | /*) ;; */*) PYTHON=$caller/$PYTHON ;; esac
 [ -n "${PYTHON:-}" ] || [ ! -x .venv/bin/python ] || PYTHON=.venv/bin/python
 export PYTHON=${PYTHON:-python}
-path=''
-while IFS= read -rd : folder; do
-  case $folder in '' | /*) ;; *) folder=$caller/$folder ;; esac
-  path+=${path:+:}$folder
-done < <(printf %s "${PYTHONPATH:+$PYTHONPATH:}") # a here-string would need room in /tmp
-# A module of the user's lies there, too. It is not looked for where none is named: a file of this
-# folder, such as types.py, may have the name of a module of Python's.
-own='(^| )[^ ]*[A-Za-z_][A-Za-z0-9_.]*:'
-[[ ! "${grid[*]}" =~ $own ]] || [ "$caller" = "$(pwd -P)" ] || path+=${path:+:}$caller
-[ -z "$path" ] || export PYTHONPATH=$path
+# A module of the user's lies there, too
+[ "$caller" = "$PWD" ] || export PYTHONPATH=${PYTHONPATH:+$PYTHONPATH:}$caller
 lacking=$("$PYTHON" -c "import sys, importlib.util as u
 print(*[name for name in sys.argv[1:] if not u.find_spec(name)], sep=', ')" \
   gymnasium mujoco torch tyro tensorboard 2>/dev/null) ||
@@ -159,15 +149,13 @@ show() {
 }
 [ $view != status ] || { show status; exit; }
 
-# sets `todo`: the runs to do, but for those that were tried, a line each: folder, command.
-# LC_ALL=C: folders may have names that are not UTF-8
+# sets `todo`: the runs to do, but for those that were tried, a line each: folder, command
 list_todo() {
   local status=0
   todo=$(show "${dry_run:-list}") || status=$?
   [ "$status" -lt 131 ] || fail "Python was ended by signal $((status - 128)), as by an environment"
   [ "$status" -eq 0 ] || exit "$status"
-  todo=$(printf '%s\n' "$todo" | LC_ALL=C grep -vxFf <(printf '%s\n' "$tried")) ||
-    [ $? -eq 1 ] || fail "cannot take the runs that were tried from the list"
+  todo=$(printf '%s\n' "$todo" | grep -vxFf <(printf '%s\n' "$tried")) || [ $? -eq 1 ]
 }
 tried=''
 list_todo
@@ -195,7 +183,6 @@ case $executor in
     [ -z "$words" ] || mapfile -t slurm_options < <(printf '%s\n' "$words") ;;
 esac
 command -v flock >/dev/null || fail "benchmark.sh needs flock (Debian: apt-get install util-linux)"
-command -v ps >/dev/null || fail "benchmark.sh needs ps (Debian: apt-get install procps)"
 
 sweep=$HOSTNAME-$$-$(date +%Y%m%d%H%M%S)
 logs=${first%/*}/logs list=${first%/*}/logs/lines-$sweep.tsv
@@ -209,7 +196,7 @@ forget_refusals() { # of scripts that were refused: the same command may try the
 # Were this command killed, the executor would start run after run: the guard stops it then
 guard() { # a killed command may stay as a zombie: it is dead when the guard has another parent
   local me=$BASHPID
-  while [ "$(ps -o ppid= -p "$me")" -eq $$ ]; do sleep 1; done
+  while [ "$(cut -d ' ' -f 4 "/proc/$me/stat")" -eq $$ ]; do sleep 1; done
   "stop_$executor"
 }
 
@@ -230,11 +217,12 @@ stop() { # EXIT_STATUS
 # reaches every run once.
 run_todo() {
   local reason guard watch
-  [ "$executor" != slurm ] || ask_slurm
-  mapfile -t folders < <(printf '%s\n' "$todo" | cut -f1 | LC_ALL=C sed 's,/[^/]*$,/logs,' | LC_ALL=C sort -u)
+  [ "$executor" != slurm ] || array_limit
+  mapfile -t folders < <(printf '%s\n' "$todo" | cut -f1 | sed 's,/[^/]*$,/logs,' | sort -u)
   reason=$( (mkdir -p "${folders[@]}" && printf '%s\n' "$todo" >"$list") 2>&1) ||
     fail "--runs-dir: cannot write to $logs: ${reason##*: }"
-  locks_work "$list" || fail "--runs-dir: $(no_locks "$logs")"
+  flock "$list" true 2>/dev/null ||
+    fail "--runs-dir: the file system of $logs has no locks, so two processes could write into one run"
   if [ "$executor" = slurm ]; then
     submit
     [ -n "$wait" ] || exit "$stopped"

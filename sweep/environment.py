@@ -49,33 +49,28 @@ class Environment(NamedTuple):
 
 
 def ask(env_id, configurations=(), max_episode_steps=None, env_kwargs=()):
-    """Make an environment as the scripts do, time it, and try configurations of noise on it.
+    """Make an environment as the scripts do, time it, and wrap configurations of noise around it.
 
     What it raises if it cannot be made or played passes through.
     """
-    deadline = time.perf_counter() + PATIENCE
     with contextlib.redirect_stdout(sys.stderr):
         options = noisy.parse_env_kwargs(env_kwargs) | {"max_episode_steps": max_episode_steps}
         made = gym.make(env_id, disable_env_checker=True, **options)
         declared = made.spec.max_episode_steps
         with noisy.make_flat(made, STEP_LIMIT) as env:
-            seconds, steps, length, rewards = time_steps(env, deadline)
-            env.reset()  # a failure after this one is the noise's
-            tried = {}
-            for n in configurations:  # at every rate: it may fail at one of them
-                tried[n.noise] = tried.get(n.noise) or why_unfit(env, n, deadline)
+            seconds, steps, length, rewards = time_steps(env)
             return Environment(
                 step_seconds=seconds,
                 timed_steps=steps,
                 episode_steps=declared or length,
                 observed=math.prod(env.observation_space.shape),
                 bounded=noisy.is_bounded(env.action_space),
-                tried=tried,
+                tried={one.noise: why_unfit(env, one) for one in configurations},
                 rewards=rewards if steps >= STEPS else MANY,
             )
 
 
-def time_steps(env, deadline):
+def time_steps(env):
     """Return seconds a step, the steps timed, an episode's length and how many rewards there were.
 
     Each step bears its share of a reset: an episode is as long as those that ended while it was
@@ -87,7 +82,7 @@ def time_steps(env, deadline):
     begin = now = time.perf_counter()
     steps, resets, rewards = [], [], set()  # of the first two, the seconds
     ended, episodes, last_end = True, 0, 0
-    while not steps or (now < deadline and (len(steps) < STEPS or now < begin + SECONDS)):
+    while now < begin + SECONDS or (len(steps) < STEPS and now < begin + PATIENCE):
         if ended:
             start = time.perf_counter()
             env.reset()
@@ -105,27 +100,18 @@ def time_steps(env, deadline):
     return fmean(steps) + fmean(resets) / length, len(steps), math.ceil(length), len(rewards)
 
 
-def why_unfit(env, configuration, deadline):
-    """Return why noises cannot act in an environment, or ""; after the deadline none is played."""
+def why_unfit(env, configuration):
+    """Return why noises cannot act in an environment, or ""."""
     try:
         with warnings.catch_warnings(action="ignore"):  # of what is said below
             noisy_env = configuration.wrap(env)
-    except ValueError as error:
+    except Exception as error:
         return with_place(error, ValueError)
+    limit = env.spec.max_episode_steps
     for wrapper in noisy.noise_wrappers(noisy_env).values():
         ends = isinstance(wrapper, noisy.RandomEarlyTermination) and not wrapper.each_step
-        limit = env.spec.max_episode_steps
         if ends and wrapper.low >= limit:  # its last step ends the episode anyway
             return f"an episode has at most {limit} steps"
-    try:
-        if time.perf_counter() < deadline:
-            noisy_env.reset()
-            for _ in range(3):
-                _, _, terminated, truncated, _ = noisy_env.step(env.action_space.sample())
-                if terminated or truncated:
-                    break
-    except Exception as error:  # the environment's own, where noise has led it
-        return with_place(error, (gym.error.Error, noisy.NotFiniteError, noisy.SpaceError))
     return ""
 
 
@@ -193,7 +179,7 @@ def cost(args, done, todo):
     for kind in new:
         seconds[kind] = run_seconds(kinds[kind], answers[kind[1]])
     known = [seconds[run.kind] for run in todo if seconds[run.kind] is not None]
-    told = [time_left([known], args.jobs, args.elsewhere and new)] if known else []
+    told = [time_left([known], args.jobs)] if known else []
     unknown = sorted({algorithm for algorithm, env_id in kinds if not seconds[algorithm, env_id]})
     if unknown:
         told.append(f"what runs of {', '.join(unknown)} take is known once one is finished")
@@ -207,7 +193,7 @@ def mean_seconds(runs):
     return fmean(known) if known else None
 
 
-def time_left(batches, jobs, elsewhere=False):
+def time_left(batches, jobs):
     """Say what batches of runs take, one batch after the other.
 
     batches: the seconds of each run, batch by batch. jobs: runs at a time, None if unknown.
@@ -221,8 +207,6 @@ def time_left(batches, jobs, elsewhere=False):
                 heapq.heapreplace(ends, ends[0] + seconds)  # where the next place is free
             clock += max(ends, default=0)
         text += f", {duration(clock)} on the clock with {counted(jobs, 'run')} at a time"
-    if elsewhere:
-        text += "; timed on this machine, others may be faster or slower"
     return text
 
 

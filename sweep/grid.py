@@ -58,6 +58,10 @@ ABLATION += [
 # Times as many seeds without noise as with it, at most: with more, a test of few seeds claims too
 # much where noise widens the spread, and the analysis gives no verdict (analysis/verdicts.py)
 MOST_BASELINES = 2.6
+DEMO_OPTIONS = [
+    "--no-compile"
+]  # compiling would take longer than learning, and these make that fast:
+DEMO_OPTIONS += ["--learning-rate=2e-3", "--num-minibatches=16", "--eval-episodes=5"]
 PRESETS = {  # what a preset sets: its noises with their rates, grid options, the scripts' options
     "demo": {
         "pairs": [("RandomNormalNoisyObservation(1.0)", 1.0)],  # harms with any five seeds
@@ -65,13 +69,7 @@ PRESETS = {  # what a preset sets: its noises with their rates, grid options, th
         "envs": ["InvertedPendulum-v5"],
         "seeds": [range(1, 6)],
         "total_timesteps": 20_480,
-        # compiling would take longer than learning; the others make that fast
-        "options": [
-            "--no-compile",
-            "--learning-rate=2e-3",
-            "--num-minibatches=16",
-            "--eval-episodes=5",
-        ],
+        "options": DEMO_OPTIONS,
         "runs_dir": "runs/demo",  # never into a sweep's folders: these runs are shorter
     },
     "baseline": {},

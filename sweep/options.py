@@ -23,22 +23,61 @@ GIVEN_BY_THE_GRID = {  # options of the scripts, and those of the sweep that set
 }
 OF_ANY_CHOICE = {"--algos", "--envs", "--runs-dir"}  # what a status needs to find a choice
 MOST_SEEDS = 100_000  # of one option
-DEFAULTS = {
-    "algos": list(SEEDS),
-    "envs": ENVS,
-    "noises": [],
-    "noise_rates": [],
-    "seeds": None,
-    "baseline_seeds": None,
-    "total_timesteps": 1_000_000,
-    "runs_dir": "runs",
-    "exclude": [],
-    "budget": None,
-    "confirm": 25,
-    "looks": None,
-    "metric": "return",
-    "pairs": [],
-    "options": [],
+
+
+def whole_number(text):
+    """Read "1000000" or "1e6"."""
+    try:
+        number = float(text) if "e" in text.lower() else int(text)
+        if number == int(number):
+            return int(number)
+    except (ValueError, OverflowError):
+        pass
+    raise argparse.ArgumentTypeError(f"{text!r} is not a whole number, such as 1000000 or 1e6")
+
+
+def seeds(text):
+    """Read a seed, "3", or a range of seeds, "1-5"."""
+    match = re.fullmatch(r"(\d{1,18})(?:-(\d{1,18}))?", text)
+    first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
+    if last < first:
+        reason = f"takes numbers and ranges, separated by spaces: 1 2 3 or 1-3, not {text!r}"
+        raise argparse.ArgumentTypeError(reason)
+    if last - first >= MOST_SEEDS:
+        raise argparse.ArgumentTypeError(f"{text!r} is more than {MOST_SEEDS:,} seeds")
+    return range(first, last + 1)
+
+
+def entry(text):
+    """Read an entry of --noises, "A(..)", "A(..)+B(..)" or "A(..)@0.1+B(..)@0.2".
+
+    Returns a list of (noise, rate); the rate is None where --noise-rates will give it.
+    """
+    pairs = []
+    for part in split_noises(text):
+        found = re.fullmatch(r"(.*\))\s*@(.*)", part)  # there may be an @ in the brackets, too
+        pairs.append((found[1], rate(found[2])) if found else (part, None))
+    if len({own is None for _, own in pairs}) > 1:
+        reason = f"{text!r}: give each of these noises a rate with @, or none of them"
+        raise argparse.ArgumentTypeError(reason)
+    return pairs
+
+
+SEVERAL = {"nargs": "+", "action": "extend"}
+OPTIONS = {  # their defaults, and how argparse reads them
+    "algos": (list(SEEDS), SEVERAL | {"type": str.lower}),
+    "envs": (ENVS, SEVERAL),
+    "noises": ([], SEVERAL | {"type": entry}),
+    "noise_rates": ([], SEVERAL | {"type": rate}),
+    "seeds": (None, SEVERAL | {"type": seeds}),
+    "baseline_seeds": (None, SEVERAL | {"type": seeds}),
+    "total_timesteps": (1_000_000, {"type": whole_number}),
+    "runs_dir": ("runs", {}),
+    "exclude": ([], SEVERAL | {"type": entry}),
+    "budget": (None, {"type": whole_number}),
+    "confirm": (25, {"type": whole_number}),
+    "looks": (None, {"type": whole_number}),
+    "metric": ("return", {"choices": ("return", "success_rate")}),
 }
 
 
@@ -50,24 +89,11 @@ def parse_args(view, caller, argv):
 
     Exits with one line about the first argument that no run could be started with.
     """
-    parser = argparse.ArgumentParser(
-        add_help=False, allow_abbrev=False, argument_default=argparse.SUPPRESS
-    )
+    none = argparse.SUPPRESS  # so the result holds the options that were given
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, argument_default=none)
     parser.error = lambda message: fail(message.removeprefix("argument "))
-    several = {"nargs": "+", "action": "extend"}
-    parser.add_argument("--algos", type=str.lower, **several)
-    parser.add_argument("--envs", **several)
-    parser.add_argument("--noises", type=entry, **several)
-    parser.add_argument("--noise-rates", type=rate, **several)
-    parser.add_argument("--seeds", type=seeds, **several)
-    parser.add_argument("--baseline-seeds", type=seeds, **several)
-    parser.add_argument("--total-timesteps", type=whole_number)
-    parser.add_argument("--runs-dir")
-    parser.add_argument("--exclude", type=entry, **several)
-    parser.add_argument("--budget", type=whole_number)
-    parser.add_argument("--confirm", type=whole_number)
-    parser.add_argument("--looks", type=whole_number)
-    parser.add_argument("--metric", choices=("return", "success_rate"))
+    for name, (_, how) in OPTIONS.items():
+        parser.add_argument(scripts.spelt(name), **how)
     split = argv.index("--") if "--" in argv else len(argv)
     words, extra = argv[:split], argv[split + 1 :]
     preset = words[0] if words and not words[0].startswith("--") else None
@@ -78,7 +104,8 @@ def parse_args(view, caller, argv):
     for name in unknown:
         fail(unknown_option(name.partition("=")[0]))
     given = {scripts.spelt(name) for name in vars(found)}
-    args = argparse.Namespace(**DEFAULTS | PRESETS.get(preset, {}) | vars(found))
+    defaults = {"pairs": [], "options": []} | {name: value for name, (value, _) in OPTIONS.items()}
+    args = argparse.Namespace(**defaults | PRESETS.get(preset, {}) | vars(found))
     args.preset, args.view, args.caller, args.given = preset, view, caller, given
     args.runs_dir = from_project(caller, args.runs_dir)
     if view == "status" and preset == "choose" and given <= OF_ANY_CHOICE and not extra:
@@ -86,7 +113,7 @@ def parse_args(view, caller, argv):
         if kept and kept != words:
             return parse_args(view, caller, kept)
     args.words, args.extra_words = words, [*args.options, *extra]
-    args.jobs, args.elsewhere = machines()
+    args.jobs = runs_at_a_time()
     args.metric = args.metric.replace("_", " ")
     args.default_noises = "--noises" not in given
     if args.noises == [[("paper", None)]]:
@@ -168,16 +195,16 @@ def spelt_as_stored(given):
     return {"test_noise": list(noises), "test_noise_rate": list(rates)}
 
 
-def machines():
-    """Return how many runs go on at a time, None if unknown, and whether on other machines.
+def runs_at_a_time():
+    """Return how many runs go on at a time, None if unknown.
 
     benchmark.sh, which reads the executor's options, tells it by environment variables.
     """
     jobs, hosts = os.environ.get("SWEEP_JOBS"), os.environ.get("SWEEP_HOSTS")
-    elsewhere = bool(hosts) or os.environ.get("SWEEP_EXECUTOR") == "slurm"
     if jobs:
-        return int(jobs) * (hosts.count(",") + 1 if hosts else 1), elsewhere
-    return None if elsewhere else len(os.sched_getaffinity(0)), elsewhere
+        return int(jobs) * (hosts.count(",") + 1 if hosts else 1)
+    elsewhere = hosts or os.environ.get("SWEEP_EXECUTOR") == "slurm"
+    return None if elsewhere else len(os.sched_getaffinity(0))
 
 
 def unknown_option(name):
@@ -186,7 +213,7 @@ def unknown_option(name):
     of_scripts = {scripts.spelt(option) for script in ours for option in script.options}
     if name in of_scripts - GIVEN_BY_THE_GRID.keys():
         return f"{name} is an option of the scripts: put it at the end, after --"
-    known = [*map(scripts.spelt, DEFAULTS.keys() - {"pairs", "options"}), *EXECUTOR_OPTIONS]
+    known = [*map(scripts.spelt, OPTIONS), *EXECUTOR_OPTIONS]
     hint = scripts.did_you_mean(name, known) or "; ./benchmark.sh --help lists them"
     return f"unknown option {name}{hint}"
 
@@ -207,41 +234,3 @@ def from_project(caller, text):
 def from_caller(args, path):
     """Return a path that counts from the project's folder as the caller can paste it."""
     return str(path) if args.caller == os.getcwd() else os.path.abspath(path)
-
-
-def whole_number(text):
-    """Read "1000000" or "1e6"."""
-    try:
-        number = float(text) if "e" in text.lower() else int(text)
-        if number == int(number):
-            return int(number)
-    except (ValueError, OverflowError):
-        pass
-    raise argparse.ArgumentTypeError(f"{text!r} is not a whole number, such as 1000000 or 1e6")
-
-
-def seeds(text):
-    """Read a seed, "3", or a range of seeds, "1-5"."""
-    match = re.fullmatch(r"(\d{1,18})(?:-(\d{1,18}))?", text)
-    first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
-    if last < first:
-        reason = f"takes numbers and ranges, separated by spaces: 1 2 3 or 1-3, not {text!r}"
-        raise argparse.ArgumentTypeError(reason)
-    if last - first >= MOST_SEEDS:
-        raise argparse.ArgumentTypeError(f"{text!r} is more than {MOST_SEEDS:,} seeds")
-    return range(first, last + 1)
-
-
-def entry(text):
-    """Read an entry of --noises, "A(..)", "A(..)+B(..)" or "A(..)@0.1+B(..)@0.2".
-
-    Returns a list of (noise, rate); the rate is None where --noise-rates will give it.
-    """
-    pairs = []
-    for part in split_noises(text):
-        found = re.fullmatch(r"(.*\))\s*@(.*)", part)  # there may be an @ in the brackets, too
-        pairs.append((found[1], rate(found[2])) if found else (part, None))
-    if len({own is None for _, own in pairs}) > 1:
-        reason = f"{text!r}: give each of these noises a rate with @, or none of them"
-        raise argparse.ArgumentTypeError(reason)
-    return pairs

@@ -27,14 +27,14 @@ UNITS = {"return": "", SUCCESS: POINTS}  # of a difference, by the metric
 def before_a_batch(found, args):
     """Return lines that say, before a batch starts, what is due and what all of it will take.
 
-    They also say what gain can be confirmed; before any run only in standard deviations.
+    Before any run, they also say what gain can be confirmed.
     """
     if not any(choice.state.due for choice in found):
         return []
     lines = [*map(describe, found), total(found, args)]
-    lines += filter(None, (detectable_gain(choice, args) for choice in found))
-    place = from_caller(args, args.runs_dir)
-    return [*dict.fromkeys(lines), f"runs, logs and the verdict are stored in {place}"]
+    if not any(choice.returns for choice in found):
+        lines += dict.fromkeys(detectable_gain(choice.plan) for choice in found)
+    return [*lines, f"runs, logs and the verdict are stored in {from_caller(args, args.runs_dir)}"]
 
 
 def total(found, args):
@@ -55,25 +55,17 @@ def total(found, args):
             runs = [len(choice.state.due), *choice.batches[done:]]
             left.append([number * [choice.run_seconds] for number in runs])
     batches = [sum(batch, []) for batch in itertools.zip_longest(*left, fillvalue=[])]
-    return f"{text}, {time_left(batches, args.jobs, args.elsewhere and not finished)}"
+    return f"{text}, {time_left(batches, args.jobs)}"
 
 
-def detectable_gain(choice, args):
-    """Say what gain the confirmation can show, or nothing once runs are done without a spread."""
-    seeds = choice.plan.looks[-1]
-    gain = detectable_shift(seeds, seeds, nominal_levels(choice.plan)[-1])
-    said = f"{seeds} fresh seeds confirm a true gain of"
-    power = "with 80 % power"
-    if verdicts := shared_level(choice.plan):
-        power += f", where {verdicts} verdicts share the level"
-    if not choice.returns:
-        return f"{said} {gain:.1f} standard deviations over seeds {power}"
-    spread = halving.spread(choice.returns)
-    if not spread > 0:
-        return ""
-    shift = rounded(gain * spread, gain * spread) + UNITS[args.metric]
-    deviations = f"{gain:.1f} standard deviations over seeds in the search"
-    return f"{choice.name}: {said} about {shift} ({deviations}) {power}"
+def detectable_gain(plan):
+    """Say what gain a confirmation can show."""
+    seeds = plan.looks[-1]
+    gain = detectable_shift(seeds, seeds, nominal_levels(plan)[-1])
+    text = f"{seeds} fresh seeds confirm a true gain of {gain:.1f} standard deviations over seeds"
+    verdicts = shared_level(plan)
+    shared = f", where {verdicts} verdicts share the level" if verdicts else ""
+    return f"{text} with 80 % power{shared}"
 
 
 def shared_level(plan):
