@@ -76,10 +76,8 @@ def read(path):
     if "Args" not in classes:
         fail(f"{path} has no class Args, whose fields are a script's options")
     fields = [node for node in classes["Args"].body if isinstance(node, ast.AnnAssign)]
-    constants = known(
-        {node.targets[0]: node.value for node in nodes if isinstance(node, ast.Assign)}
-    )
-    frequency = constants.get("EVAL_FREQUENCY")
+    constants = [node for node in nodes if isinstance(node, ast.Assign)]
+    frequency = known({node.targets[0]: node.value for node in constants}).get("EVAL_FREQUENCY")
     inside = path.is_relative_to(PROJECT)
     return Script(
         path=str(path.relative_to(PROJECT) if inside else path),
