@@ -55,7 +55,7 @@ def choices(args):
     """
     pairs = list(itertools.product(args.algos, args.envs))
     plans = {pair: plan_for(args, *pair, len(pairs)) for pair in pairs}
-    known = {env_id: remembered(args.runs_dir, env_id) for env_id in args.envs}
+    known = {env_id: remembered(args, env_id) for env_id in args.envs}
     listed = args.view in ("list", "dry-run")
     if listed:
         refuse_other_baselines(args, plans)
@@ -68,7 +68,7 @@ def choices(args):
             print(f"{env_id}: left out: {left_out}", file=sys.stderr)
     found = [follow(args, *pair, known[pair[1]], plan) for pair, plan in plans.items()]
     for env_id in noises if args.view == "list" else ():
-        remember(args.runs_dir, env_id, known[env_id])
+        remember(args, env_id, known[env_id])
     problems = [f"{choice.name}: {choice.problem}" for choice in found if choice.problem]
     if len(problems) == len(found):
         fail("\nerror: ".join(problems), code=1)

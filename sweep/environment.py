@@ -6,6 +6,7 @@ takes until finished runs tell. `remember` keeps the answer, because `status` ma
 
 import contextlib
 import heapq
+import itertools
 import json
 import math
 import sys
@@ -121,8 +122,8 @@ def ask_all(args, configurations):
     configurations: {env_id: [Configuration]}. Exits with a line for each environment that cannot
     be trained in, and for each algorithm that cannot act there.
     """
-    given = args.given_words[args.algos[0]]
-    steps, env_kwargs = number(given.get("max_episode_steps")), given.get("env_kwargs", [])
+    max_episode_steps, env_kwargs = options_of_environments(args)
+    steps = number(max_episode_steps)
     answers, reasons = {}, []
     for env_id, noises in configurations.items():
         try:
@@ -144,6 +145,12 @@ def ask_all(args, configurations):
     if reasons:
         fail("\nerror: ".join(reasons))
     return answers
+
+
+def options_of_environments(args):
+    """Return the words of the scripts' options about environments, the same for all algorithms."""
+    given = args.given_words[args.algos[0]]
+    return given.get("max_episode_steps", []), given.get("env_kwargs", [])
 
 
 # ------------------------------------------------------------------------------------ what it costs
@@ -213,21 +220,22 @@ def time_left(batches, jobs):
 # --------------------------------------------------------------------------------------- the memory
 
 
-def remember(runs_dir, env_id, environment):
+def remember(args, env_id, environment):
     """Keep what was found, for a status."""
-    path = file_of(runs_dir, env_id)
+    path = file_of(args, env_id)
     with contextlib.suppress(OSError):  # benchmark.sh will say so
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(environment))
 
 
-def remembered(runs_dir, env_id):
+def remembered(args, env_id):
     """Return what was found when an environment was asked last, or one without timed steps."""
     with contextlib.suppress(OSError, ValueError, TypeError):  # there is no file, or half of one
-        return Environment(*json.loads(file_of(runs_dir, env_id).read_text()))
+        return Environment(*json.loads(file_of(args, env_id).read_text()))
     return Environment(math.nan, 0, 0, 0, False, {})
 
 
-def file_of(runs_dir, env_id):
-    """Return the file of an environment, beside the logs of its runs."""
-    return Path(runs_dir, "logs", noisy.safe_name(env_id) + ".json")
+def file_of(args, env_id):
+    """Return the file of an environment with its options, beside the logs of its runs."""
+    name = "_".join([env_id, *itertools.chain(*options_of_environments(args))])
+    return Path(args.runs_dir, "logs", noisy.safe_name(name) + ".json")

@@ -415,7 +415,7 @@ def test_the_readme_says_what_it_takes_by_default(tmp_path):
         words = ["choose", "--algos", algorithm, "--envs", "Hopper", "--runs-dir", str(tmp_path)]
         args = parse_args("status", "/", words)
         known = Environment(0.05e-3, 200, 1000, 11, True, {})
-        remember(args.runs_dir, "Hopper-v5", known)
+        remember(args, "Hopper-v5", known)
         choices = choose.choices(args)
         assert telling.total(choices, args).startswith(f"at most {runs} runs, ")
         assert runs * choices[0].run_seconds / 3600 == pytest.approx(announced, rel=0.1)
