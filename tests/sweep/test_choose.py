@@ -61,27 +61,14 @@ def draw(rng, effects):
 
 
 def test_schedule():
-    assert halving.sizes_of_rounds(1, 3) == []
-    assert halving.sizes_of_rounds(2, 6) == [(2, 3)]
+    rounds = halving.sizes_of_rounds
+    assert rounds(1, 3) == [] and rounds(2, 6) == [(2, 3)]
     # The shares of two rounds are 12 * 2 / (2 + 1.41) = 7.03 runs and 4.97: 1.8 and 2.5 a noise.
-    assert halving.sizes_of_rounds(4, 12) == [(4, 2), (2, 2)]
-    assert halving.sizes_of_rounds(5, 15) == [(5, 1), (3, 2), (2, 2)]
-    assert halving.sizes_of_rounds(90, 270) == [
-        (90, 1),
-        (45, 1),
-        (23, 2),
-        (12, 3),
-        (6, 4),
-        (3, 5),
-        (2, 6),
-    ]
-    assert halving.sizes_of_rounds(16, 16) == [
-        (16, 1),
-        (8, 1),
-        (4, 1),
-        (2, 1),
-    ]  # never less than one seed
-    assert len(halving.sizes_of_rounds(64, 640)) == 6 and len(halving.sizes_of_rounds(65, 640)) == 7
+    assert rounds(4, 12) == [(4, 2), (2, 2)]
+    assert rounds(5, 15) == [(5, 1), (3, 2), (2, 2)]
+    assert rounds(90, 270) == [(90, 1), (45, 1), (23, 2), (12, 3), (6, 4), (3, 5), (2, 6)]
+    assert rounds(16, 16) == [(16, 1), (8, 1), (4, 1), (2, 1)]  # never less than one seed
+    assert len(rounds(64, 640)) == 6 and len(rounds(65, 640)) == 7
 
 
 def test_advance_by_hand():
@@ -358,10 +345,8 @@ def test_a_noise_is_chosen_by_the_rate_of_success(tmp_path):
         rates[noise] = 100 * np.mean(np.array(runs)[:, -2:] > 100)
         assert float(line["score"]) == pytest.approx(rates[noise])
     gain = rates.pop(noise) - rates.pop(BASELINE)
-    found = re.search(
-        r"5 fresh seeds, ([-+][\d.]+) \[.*\] percentage points of success, p", verdict
-    )
-    assert float(found[1]) == pytest.approx(gain, abs=0.5) and abs(gain) > 5
+    pattern = r"5 fresh seeds, ([-+][\d.]+) \[.*\] percentage points of success, p"
+    assert float(re.search(pattern, verdict)[1]) == pytest.approx(gain, abs=0.5) and abs(gain) > 5
     assert "(80 %" in verdict or " %" not in verdict  # never percent of a rate
     returns = arguments(f"--algos | ppo | --envs | {env_id} | {THREE}", tmp_path)
     assert "percentage points" not in conclude(returns)[0]
@@ -376,10 +361,9 @@ def test_choose_by_success_needs_an_environment_that_tells_it(tmp_path, capsys):
     assert choice.kind[1] == "toy_envs:Success-v0" and not choice.state.due
     told = "PPO on Pendulum-v1: it tells no `is_success` or `success`, as --metric success_rate"
     assert f"warning: {told}" in capsys.readouterr().err
+    alone = text.replace(" | toy_envs:Success-v0", "")
     with pytest.raises(SystemExit):
-        choose.choices(
-            arguments(f"{text} | {THREE}".replace("| toy_envs:Success-v0 ", ""), tmp_path)
-        )
+        choose.choices(arguments(f"{alone} | {THREE}", tmp_path))
     assert f"error: {told}" in capsys.readouterr().err
 
 
