@@ -9,7 +9,6 @@ import pytest
 import sweeps
 from scipy import stats
 
-from analysis import permutation
 from analysis.statistics import fieller
 from results import recompute
 from results.study import __main__, claims, compare, paper, picture, returns
@@ -263,31 +262,6 @@ def test_sets_f_and_g_are_compared_as_analyze_does(data):
     for planned in ((3, 6, 6), (2, 8, 6), (2, 6, 9)):
         table = compare.by_the_tool("set", *planned)
         assert set(table["verdict"].dropna()) == {"under way"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("environments", "n", "m", "shift", "test"),
-    [
-        (3, 5, 5, 1.1, "joint"),  # set B
-        (3, 4, 4, 1.3, "joint"),  # set C
-        (4, 10, 10, 0.64, "joint"),  # set D
-        (3, 8, 8, 0.85, "tool"),  # set F
-        (4, 6, 9, 0.76, "tool"),  # set G, uncorrected
-    ],
-)
-def test_the_plans_and_physics_say_the_power(environments, n, m, shift, test, monkeypatch):
-    """A shift of so many standard deviations in every environment is found in 80 % of cases."""
-    monkeypatch.setattr(compare, "SHUFFLES", 499)
-    monkeypatch.setattr(permutation, "RANDOM_PARTITIONS", 999)
-    rng, found, trials = np.random.default_rng(0), 0, 300
-    for _ in range(trials):
-        x, y = rng.normal(shift, 1, (n, environments)), rng.normal(0, 1, (m, environments))
-        if test == "joint":
-            found += compare.joint_p(list(zip(x.T, y.T, strict=True))) <= 0.05
-        else:
-            found += permutation.permutation_t(x, y)[1] <= 0.05
-    assert found / trials == pytest.approx(0.8, abs=0.07)
 
 
 def test_the_second_computation_has_its_own_statistics():

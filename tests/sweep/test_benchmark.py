@@ -251,10 +251,8 @@ def test_a_failing_and_a_killed_run(engine, tmp_path):
     out, err = sweep.communicate(timeout=PATIENCE)
     assert sweep.returncode == 1, err
     assert "3 runs: 1 done, 0 running, 2 failed, 0 to do" in out
-    rows = {line.split("  ")[1]: line for line in out.splitlines() if ".log" in line}
-    assert set(rows) == {"exit 1", "signal 9"}
-    assert str(log_of(fails)) in rows["exit 1"] and "FileExistsError" in rows["exit 1"]
-    assert str(log_of(killed)) in rows["signal 9"] and "step=" in rows["signal 9"]
+    assert re.search(rf"exit 1 +{log_of(fails)} .*FileExistsError", out)
+    assert re.search(rf"signal 9 +{log_of(killed)} +step=", out)
     assert (good / "result.json").exists() and not (killed / "result.json").exists()
 
     fails.unlink()
@@ -265,10 +263,6 @@ def test_a_failing_and_a_killed_run(engine, tmp_path):
     assert [len(attempts(f)) for f in (fails, killed, good)] == [2, 2, 1]
     assert (good / "result.json").stat().st_mtime_ns == finished
     assert attempts(killed)[1][0].startswith("resumed at step "), "not resumed"
-
-    logs = {folder: log_of(folder).read_text() for folder in (fails, killed, good)}
-    assert run(*grid, *executor, env=env).code == 0
-    assert logs == {folder: log_of(folder).read_text() for folder in logs}
 
 
 @pytest.mark.slow
@@ -592,18 +586,6 @@ def test_a_failing_run_stops_its_choice_and_no_other(tmp_path, monkeypatch):
     assert "Dropout" not in re.sub("SAC.*", "", (tmp_path / "choice.csv").read_text())
 
 
-def test_a_choice_never_mixes_runs_with_other_options(tmp_path):
-    command = [*CHOOSE, "--runs-dir", str(tmp_path)]
-    play(*command)
-    first = view("report", *command)
-    assert first.code == 0 and "13 done" in first.out
-    other = view("list", *command, "--", "--gamma", "0.5")
-    assert other.code == 2 and not other.out
-    assert "with other arguments: --gamma 0.99, not 0.5" in other.err
-    same = view("report", *command, "--", "--no-compile", "--gamma", "0.990")
-    assert (same.code, same.out) == (0, first.out)
-
-
 # REPORTS AND ERRORS
 
 
@@ -756,12 +738,9 @@ def test_a_second_sweep_waits_for_the_runs_of_the_first(tmp_path, stub):
 )
 def test_bad_input(args, message, tmp_path):
     """What the grid refuses is tested in test_grid.py."""
-    first, *words = args.split()
-    result = run(first, "--runs-dir", tmp_path / "runs", *words)
-    assert result.code == 2, result.out + result.err
-    [line] = [line for line in result.err.splitlines() if not line.endswith("to do")]
-    assert line.startswith("error: ") and message in line
-    assert not result.out and not list(tmp_path.iterdir())
+    result = run(*args.split(), "--runs-dir", tmp_path / "runs")
+    assert (result.code, result.out) == (2, "") and f"error: {message}" in result.err
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_an_interpreter_lacks_is_named(tmp_path):

@@ -21,7 +21,7 @@ from analysis.statistics import compare, contrast
 from noisy_wrappers import BASELINE, Configuration
 from sweep import choose, halving, telling
 from sweep.environment import Environment, remember
-from sweep.halving import FIRST_CONFIRMATION_SEED, State, Verdict, advance, judge, records
+from sweep.halving import FIRST_CONFIRMATION_SEED, State, Verdict, advance, judge
 from sweep.looks import Plan, bounds, futility_limits, looks_after, nominal_levels
 from sweep.options import parse_args
 
@@ -239,21 +239,6 @@ def test_verdicts_in_words():
     assert not Verdict(bad, 10, 10, 0.05).helps and not Verdict(GOOD, 10, 10, 0.01).helps
 
 
-def test_records_of_choice_csv():
-    table = np.arange(4.0)[:, None] + np.zeros(SEARCH_SEEDS + CONFIRM)
-    state, returns = play(named(3), 3, table)
-    lines = records("PPO", "X", state, returns, helped=False)
-    assert [" ".join(map(str, line)) for line in lines] == [
-        "PPO X search 1 noise 0.0 1 0.0 no",
-        "PPO X search 1 noise 1.0 1 1.0 yes",
-        "PPO X search 1 noise 2.0 1 2.0 yes",
-        "PPO X search 2 noise 1.0 2 1.0 no",
-        "PPO X search 2 noise 2.0 2 2.0 yes",
-        "PPO X confirmation   0.0 10 3.0 ",
-        "PPO X confirmation  noise 2.0 10 2.0 no",
-    ]
-
-
 # THE RUN FOLDERS
 
 
@@ -319,6 +304,9 @@ def test_two_algorithms_and_environments_at_once(tmp_path):
     assert all("(level shared by 4 verdicts)" in sentence for sentence in sentences)
     lines = read(tmp_path / "choice.csv")
     assert len(lines) == 4 * (3 + 2 + 2)
+    survivors = [line["survives"] for line in lines[:5]]  # of three noises two, of these one
+    assert (survivors[:3].count("yes"), survivors[3:].count("yes")) == (2, 1)
+    assert [line["seeds"] for line in lines[:7]] == ["1", "1", "1", "2", "2", "5", "5"]
     assert {line["noise_rate"] for line in lines} == {"0.0", "1.0", "0.3 + 1.0:0.0"}
     for line in lines:  # a run counts with its last two tests of ten
         noise = Configuration.parse(line["noise"], line["noise_rate"])
@@ -417,22 +405,16 @@ def test_the_default_noises_and_those_of_the_paper(tmp_path):
     assert len(tried("--noises", "paper", "--noise-rates", "0.2")) == 15
 
 
-def test_what_a_report_advises(tmp_path, capsys):
+def test_what_a_report_advises(tmp_path):
     args = arguments(f"--algos | ppo | --envs | Pendulum-v1 | {THREE}", tmp_path)
-
-    def said():
-        capsys.readouterr()
-        telling.report(choose.choices(args), args)
-        return capsys.readouterr().out
-
-    out = said()  # where nothing finishes, it is not the noise
+    out = "\n".join(conclude(args))  # where nothing finishes, it is not the noise
     assert "leave PPO on Pendulum-v1 out: see --algos and --envs" in out and "--exclude" not in out
-    train_due(args, 1)
-    assert said().count("--exclude") == 3
-    choice = train_due(args)  # where one is damaged, it is not to be retried
+    choice = train_due(args, 1)
     path = choice.runs[choice.state.due[0]].folder / "eval.csv"
-    path.write_text(path.read_text()[:-1])
-    assert said().endswith("runs to do: 1.\n")
+    assert "\n".join(conclude(args)).count("--exclude") == 3
+    train_due(args)
+    path.write_text(path.read_text()[:-1])  # what is damaged is not to be retried
+    assert conclude(args)[-1].endswith("runs to do: 1.")
 
 
 def test_what_the_confirmation_can_show(tmp_path):
