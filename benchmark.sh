@@ -29,8 +29,7 @@ Grid options replace a preset's values
              your own environment, from my_envs.py in the current folder
   --seeds 1-5 7
   --baseline-seeds 1-13
-             seeds without noise. By default those of --seeds; in custom n sqrt(k) for n seeds of
-             each of k noises and rates, at most 2.6 n
+             seeds without noise; default: those of --seeds, in custom more (docs/sweeps.md)
   --noises "RandomNormalNoisyReward(1.0)" "RandomEarlyTermination(50)+RandomMixupObservation(0.5)"
              noises joined by + are combined
   --noise-rates 0.05 1.0 1.0:0.0
@@ -43,9 +42,8 @@ Grid options replace a preset's values
              runs/demo)
 
 Options of choose
-  --noises paper           the paper's 15 noises at 6 rates: 318 runs at most. The default is 11 noises
-                           at rates 0.05 and 1.0, 110 runs at most if all can act (docs/sweeps.md). Both
-                           confirm a true gain of 1.5 standard deviations in nearly 9 of 10 cases
+  --noises paper           the paper's 15 noises at 6 rates, 318 runs at most. The default is 11 noises
+                           at rates 0.05 and 1.0, 110 runs at most (docs/sweeps.md)
   --exclude "NOISE@RATE"   noises to leave out, for example because they always fail
   --budget N               about how many runs the search may take (default: 3 for each noise and
                            rate, at least 1); even with the least it takes about two for each
@@ -56,8 +54,7 @@ Options of choose
                            episode's last step has is_success or success
 
 Executor options
-  --dry-run             print the commands of the remaining runs, and what they cost: for that, the
-                        environments are timed; start nothing
+  --dry-run             print the commands of the remaining runs, and what they cost; start nothing
   --executor local      (default) runs side by side on this machine
   --executor parallel   GNU parallel, on this machine or over ssh
   --executor slurm      job arrays; submits and returns
@@ -84,8 +81,8 @@ Examples
 Run the same command again to resume: finished runs are skipped. Ctrl-C saves a checkpoint of every
 run and exits. `status` without a preset counts all runs in RUNS_DIR. Logs are in logs/ beside the
 runs. The interpreter is $PYTHON, else .venv/bin/python, else python. Exit status: 0 all runs are
-done (slurm without --wait: submitted), 1 some are not, 2 bad arguments, 130 stopped by Ctrl-C, 143
-by SIGTERM; of --dry-run 0, of status 0, or 1 if a run's files are damaged. See docs/sweeps.md.
+done (slurm without --wait: submitted), 1 some are not, 2 bad arguments, 130 or 143 stopped. See
+docs/sweeps.md.
 END
 }
 
