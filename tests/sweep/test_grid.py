@@ -139,7 +139,7 @@ def test_a_command_takes_the_path_of_a_users_modules_along(monkeypatch):
 
 def test_spellings_and_rate_zero_are_one_run():
     noises = ["RandomUniformScaleReward(.5, 1.5)", "RandomUniformScaleReward(0.50, high=1.5)"]
-    grid = ["--algos=SAC", "--envs", "Hopper-v5", "Hopper-v5", "--seeds", "3", "--seeds", "3-4"]
+    grid = ["--algos=SAC", "--envs", "Hopper-v5", "Hopper-v5", "--seeds", "3", "3", "--seeds", "4"]
     lines = dry_run("custom", *grid, "--noises", *noises, "--noise-rates", "0.10", "0", ".1")
     assert [(line.seed, line.noise) for line in lines] == [
         (seed, noise) for seed in (3, 4) for noise in ([], [SCALE])
