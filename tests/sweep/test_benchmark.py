@@ -285,25 +285,31 @@ def test_a_run_that_is_refused_is_not_started_with_other_seeds(stub, tmp_path):
 def test_ctrl_c(engine, tmp_path):
     """A sweep of three runs, two at a time, is stopped when both are training."""
     executor, env = engine
-    grid = [*GRID, *FOREVER, "--runs-dir", tmp_path]
-    runs = folders(*grid)
-    sweep = start(*grid, *executor, env=env)
-    wait_for(lambda: sum(map(is_training, runs)) == 2, what="two runs at a time")
+    sweep, runs = training(tmp_path, *executor, env=env)
     sweep.send_signal(signal.SIGINT)
     out, err = sweep.communicate(timeout=PATIENCE)
     assert sweep.returncode == 130, err
-    check_stopped(runs, out)
+    assert check_stopped(runs, out) == 2
 
 
-def check_stopped(runs, shown):
-    """Two of three runs were under way: they, and only they, have a checkpoint."""
-    assert f"{runs[0].parent}: 3 runs: 0 done, 0 running, 0 failed, 3 to do" in shown
+def training(tmp_path, *executor, env, number=2):
+    """Start a sweep of three runs that do not end by themselves; return when some are training."""
+    grid = [*GRID, *FOREVER, "--runs-dir", tmp_path]
+    runs = folders(*grid)
+    sweep = start(*grid, *executor, env=env)
+    wait_for(lambda: sum(map(is_training, runs)) == number, what=f"{number} at a time")
+    return sweep, runs
+
+
+def check_stopped(runs, shown=""):
+    """Those runs that were under way, and only they, have a checkpoint."""
+    assert not shown or f"{runs[0].parent}: 3 runs: 0 done, 0 running, 0 failed, 3 to do" in shown
     assert not processes(runs[0].parent)
     stopped = [folder for folder in runs if log_of(folder).exists()]
-    assert len(stopped) == 2, "another run was started"
     for folder in stopped:
         assert (folder / "checkpoint.pt").exists()
         assert attempts(folder)[0][-1].endswith("exit=143")
+    return len(stopped)
 
 
 def copy_project(folder):
@@ -688,32 +694,24 @@ def test_a_crash_of_an_environment_is_told(tmp_path):
 
 @pytest.mark.slow
 def test_a_sweep_whose_reader_has_left_still_stops_its_runs(tmp_path, stub):
-    grid = [*GRID, *FOREVER, "--runs-dir", tmp_path]
-    runs = folders(*grid)
-    sweep = start(*grid, "--jobs", "2", env=stub)
-    wait_for(lambda: is_training(runs[0]) and is_training(runs[1]))
+    sweep, runs = training(tmp_path, "--jobs", "2", env=stub)
     sweep.stdout.close()
     sweep.stderr.close()  # as a closed terminal
     sweep.send_signal(signal.SIGHUP)
     sweep.wait(timeout=PATIENCE)
-    assert not processes(tmp_path)
-    assert all((folder / "checkpoint.pt").exists() for folder in runs[:2])
-    assert not runs[2].exists()
+    assert check_stopped(runs) == 2
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["local", "parallel"], indirect=True)
 def test_a_killed_sweep_stops_its_runs(engine, tmp_path):
     executor, env = engine
-    grid = [*GRID, *FOREVER, "--runs-dir", tmp_path]
-    runs = folders(*grid)
-    sweep = start(*grid, *executor, "--jobs", "1", env=env)
-    wait_for(lambda: is_training(runs[0]))
+    sweep, runs = training(tmp_path, *executor, "--jobs", "1", env=env, number=1)
     sweep.kill()
     sweep.wait()
     wait_for(lambda: not processes(tmp_path), what="the run's end")
     wait_for(lambda: attempts(runs[0])[0][-1].endswith("exit=143"), what="the log's end")
-    assert (runs[0] / "checkpoint.pt").exists() and not runs[1].exists()
+    assert check_stopped(runs) == 1
 
 
 @pytest.mark.slow
@@ -790,7 +788,7 @@ def test_ctrl_c_on_a_terminal_and_the_progress_line(tmp_path, stub):
     read()
     assert sweep.returncode == 130
     assert "\r3 runs: 0 done, 2 running, 0 failed, 1 to do" in shown
-    check_stopped(runs, shown)
+    assert check_stopped(runs, shown) == 2
 
 
 @pytest.mark.slow

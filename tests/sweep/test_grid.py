@@ -19,7 +19,7 @@ from views import ROOT, finish, folders, locked, log_of, view
 
 import noisy_wrappers
 from analysis import logs
-from sweep import options, scripts
+from sweep import scripts
 
 ALGORITHMS = {"sac": 5, "td3": 5, "ppo": 10}  # seeds
 SCALE = "RandomUniformScaleReward(0.5, 1.5)"
@@ -198,12 +198,6 @@ def test_states_and_what_is_left(tmp_path, monkeypatch):
     assert not (lost / ".lock").exists()
 
 
-def test_an_at_in_a_noises_argument_is_no_rate():
-    keyed = "my_noises:Keyed(1, keys='a@b')"
-    assert options.entry(keyed) == [(keyed, None)]
-    assert options.entry(f"{keyed}@0.5+{A}@1:0") == [(keyed, 0.5), (A, "1:0")]
-
-
 @pytest.fixture
 def one(tmp_path):
     """A grid of one run, and its folder."""
@@ -220,7 +214,6 @@ def one(tmp_path):
         ({"gamma": 0.99}, "--gamma 0.5", "--gamma 0.99, not 0.5"),
         ({"learning_starts": 10}, "", "--learning-starts 10, not 5000"),  # an option of today's
         ({}, "--tau 0.1", "--tau 0.005, not 0.1"),  # an option that the run did not have
-        ({"noise_rates": [0.5]}, "--gamma 0.9", "--gamma 0.99, not 0.9"),
         ({"max_episode_steps": 50}, "--max-episode-steps None", "--max-episode-steps 50, not None"),
     ],
 )
