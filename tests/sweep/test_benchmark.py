@@ -23,10 +23,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-import stub_run
-from views import ROOT, attempts, finish, folders, log_of, view
+from views import ROOT, attempts, batches, finish, folders, log_of, view
 
-from sweep import choose
 from sweep.options import parse_args
 
 PATH = f"{os.environ['PATH']}:/usr/sbin:/sbin"
@@ -517,17 +515,7 @@ def verdicts(out):
 
 
 def play(*command):
-    """Make a choice's runs in this process, until none is due but those that fail."""
-    args = parse_args("status", "/", command)
-    failed = []
-    while due := [choice.runs[run] for choice in choose.choices(args) for run in choice.state.due]:
-        for one in due:
-            try:
-                stub_run.train(one.command)
-            except SystemExit:
-                failed.append(one.folder)
-        if all(one.folder in failed for one in due):
-            break
+    return batches(parse_args("status", "/", command))
 
 
 def undisturbed(folder, *command):

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import simulate_choose
 import stub_run
-from views import view
+from views import batches, view
 
 from analysis.formatting import rounded
 from analysis.statistics import compare, contrast
@@ -252,19 +252,6 @@ def conclude(args):
     with contextlib.redirect_stdout(io.StringIO()) as out:
         telling.report(choose.choices(args), args)
     return out.getvalue().splitlines()
-
-
-def batches(args):
-    """Run a choice to its end in this process; returns the names of its folders, batch by batch."""
-    found = []
-    while True:
-        choices = choose.choices(args)
-        due = [choice.runs[run] for choice in choices for run in choice.state.due]
-        if not due:
-            return found
-        found.append({run.folder.name for run in due})
-        for run in due:
-            stub_run.train(run.command)
 
 
 def train_due(args, number=None):
