@@ -46,17 +46,21 @@ class Push(gym.Env):
 
 
 class Count(gym.Env):
-    """Observes the step; 1.0 is every reward, and NaN from step `break_at` of the run on."""
+    """Observes the step; 1.0 is every reward. `breaks` gives NaN from step 70 of the run on."""
 
     observation_space = Box(-np.inf, np.inf, (1,), np.float32)
     action_space = Box(-1.0, 1.0, (1,), np.float32)
 
-    def __init__(self, shape=(1,), break_at=np.inf):
+    def __init__(self, shape=(1,), breaks=""):
         self.observation_space = Box(-np.inf, np.inf, shape, np.float32)
-        self.break_at, self.total = break_at, 0
+        self.breaks, self.total = breaks, 0
+
+    def value(self, name, whole):
+        return np.nan if self.breaks == name and self.total >= 70 else whole
 
     def observe(self):
-        return np.full(self.observation_space.shape, self.steps, np.float32)
+        value = self.value("observation", self.steps)
+        return np.full(self.observation_space.shape, value, np.float32)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -65,8 +69,7 @@ class Count(gym.Env):
 
     def step(self, action):
         self.steps, self.total = self.steps + 1, self.total + 1
-        reward = np.nan if self.total >= self.break_at else 1.0
-        return self.observe(), reward, False, False, {}
+        return self.observe(), self.value("reward", 1.0), False, False, {}
 
 
 class Other(Count):
@@ -180,7 +183,8 @@ register("Tiny", Tiny, 8)
 register("Push", Push, 20)
 register("Count", Count, 8)
 register("Square", Count, 8, shape=(2, 2))
-register("NanReward", Count, 8, break_at=70)
+register("NanReward", Count, 8, breaks="reward")
+register("NanObservation", Count, 8, breaks="observation")
 register("DictObservation", Parts, 8)
 register("OneHotObservation", Parts, 8, categories=True)
 register("CategoryObservation", Category, 8, observation_space=gym.spaces.Discrete(3))
