@@ -116,8 +116,8 @@ def runs_in(folder, caller):
     folders = {*runs_of(Path(folder)), *logged(Path(folder))}
     if not folders:
         fail(f"no runs in {folder}; name their folder with --runs-dir")
-    known = {**scripts_in(Path(caller)), **scripts_in(PROJECT)}
-    paths = {path.name: path for path in known.values()}
+    places = (Path(caller), PROJECT)
+    paths = {path.name: path for place in places for path in scripts_in(place).values()}
     runs = []
     for path in sorted(folders):
         planned = PlannedRun(path, ("", ""), 0, 0, [])  # unknown: it has failed before it began

@@ -58,8 +58,9 @@ ABLATION += [
 # Times as many seeds without noise as with it, at most: with more, a test of few seeds claims too
 # much where noise widens the spread, and the analysis gives no verdict (analysis/verdicts.py)
 MOST_BASELINES = 2.6
-DEMO_OPTIONS = ["--no-compile"]  # that would take longer than learning, which these make fast
-DEMO_OPTIONS += ["--learning-rate=2e-3", "--num-minibatches=16", "--eval-episodes=5"]
+# Compiling would take longer than learning, which the other options make fast
+DEMO_OPTIONS = ["--no-compile", "--learning-rate=2e-3"]
+DEMO_OPTIONS += ["--num-minibatches=16", "--eval-episodes=5"]
 PRESETS = {  # what a preset sets: its noises with their rates, grid options, the scripts' options
     "demo": {
         "pairs": [("RandomNormalNoisyObservation(1.0)", 1.0)],  # harms with any five seeds

@@ -89,8 +89,8 @@ def parse_args(view, caller, argv):
 
     Exits with one line about the first argument that no run could be started with.
     """
-    none = argparse.SUPPRESS  # so the result holds the options that were given
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, argument_default=none)
+    given_only = {"argument_default": argparse.SUPPRESS}
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, **given_only)
     parser.error = lambda message: fail(message.removeprefix("argument "))
     for name, (_, how) in OPTIONS.items():
         parser.add_argument(scripts.spelt(name), **how)
@@ -101,8 +101,8 @@ def parse_args(view, caller, argv):
         named = words[0] if words else ""
         fail(f"unknown preset {named!r}; choose one of {', '.join(PRESETS)}")
     found, unknown = parser.parse_known_args(words[preset is not None :])
-    for name in unknown:
-        fail(unknown_option(name.partition("=")[0]))
+    if unknown:
+        fail(unknown_option(unknown[0].partition("=")[0]))
     given = {scripts.spelt(name) for name in vars(found)}
     defaults = {"pairs": [], "options": []} | {name: value for name, (value, _) in OPTIONS.items()}
     args = argparse.Namespace(**defaults | PRESETS.get(preset, {}) | vars(found))
