@@ -13,8 +13,7 @@ Presets
   choose     finds a noise that helps: for each algorithm and environment, tries the noises, gives
              the better half of them more seeds in each round, compares the winner with no noise on
              fresh seeds, and prints a verdict; the runs are stored in runs/choose
-  demo       PPO on InvertedPendulum-v5, without and with one noise, 5 seeds, 20,480 steps, set to
-             learn fast, into runs/demo
+  demo       PPO on InvertedPendulum-v5, with one noise, in a minute or two, into runs/demo
   baseline   no noise: 3 algorithms, 5 environments, the paper's seeds
   best       the paper's best noise for each algorithm and environment
   paper      15 noises at 6 rates, 9,100 runs
@@ -30,8 +29,7 @@ Grid options replace a preset's values
              your own environment, from my_envs.py in the current folder
   --seeds 1-5 7
   --baseline-seeds 1-13
-             seeds without noise. By default those of --seeds; in custom n sqrt(k) for n seeds of
-             each of k noises and rates, at most 2.6 n
+             seeds without noise; default: those of --seeds, in custom more (docs/sweeps.md)
   --noises "RandomNormalNoisyReward(1.0)" "RandomEarlyTermination(50)+RandomMixupObservation(0.5)"
              noises joined by + are combined
   --noise-rates 0.05 1.0 1.0:0.0
@@ -44,9 +42,8 @@ Grid options replace a preset's values
              runs/demo)
 
 Options of choose
-  --noises paper           the paper's 15 noises at 6 rates: 318 runs at most. The default is 11 noises
-                           at rates 0.05 and 1.0, 110 runs at most if all can act (docs/sweeps.md). Both
-                           confirm a true gain of 1.5 standard deviations in nearly 9 of 10 cases
+  --noises paper           the paper's 15 noises at 6 rates, 318 runs at most. The default is 11 noises
+                           at rates 0.05 and 1.0, 110 runs at most (docs/sweeps.md)
   --exclude "NOISE@RATE"   noises to leave out, for example because they always fail
   --budget N               about how many runs the search may take (default: 3 for each noise and
                            rate, at least 1); even with the least it takes about two for each
@@ -57,8 +54,7 @@ Options of choose
                            episode's last step has is_success or success
 
 Executor options
-  --dry-run             print the commands of the remaining runs, and what they cost: for that, the
-                        environments are timed; start nothing
+  --dry-run             print the commands of the remaining runs, and what they cost; start nothing
   --executor local      (default) runs side by side on this machine
   --executor parallel   GNU parallel, on this machine or over ssh
   --executor slurm      job arrays; submits and returns
@@ -75,7 +71,6 @@ Put options of the training scripts, such as --eval-episodes 20, at the end, aft
 
 Examples
   ./benchmark.sh choose --algos ppo --envs Pusher-v5 --noise-rates 1.0
-  ./benchmark.sh demo
   ./benchmark.sh best --envs Hopper-v5 --seeds 1 --total-timesteps 2e5 --runs-dir runs/short
   ./benchmark.sh custom --algos td3 --noises "RandomUniformScaleReward(0.5, 1.5)" --noise-rates 0.05
   ./benchmark.sh paper --executor parallel --sshlogin hostA,hostB
@@ -86,8 +81,8 @@ Examples
 Run the same command again to resume: finished runs are skipped. Ctrl-C saves a checkpoint of every
 run and exits. `status` without a preset counts all runs in RUNS_DIR. Logs are in logs/ beside the
 runs. The interpreter is $PYTHON, else .venv/bin/python, else python. Exit status: 0 all runs are
-done (slurm without --wait: submitted), 1 some are not, 2 bad arguments, 130 stopped by Ctrl-C, 143
-by SIGTERM; of --dry-run 0, of status 0, or 1 if a run's files are damaged. See docs/sweeps.md.
+done (slurm without --wait: submitted), 1 some are not, 2 bad arguments, 130 or 143 stopped. See
+docs/sweeps.md.
 END
 }
 
@@ -136,16 +131,10 @@ done
 case ${PYTHON:-} in '' | /*) ;; */*) PYTHON=$caller/$PYTHON ;; esac
 [ -n "${PYTHON:-}" ] || [ ! -x .venv/bin/python ] || PYTHON=.venv/bin/python
 export PYTHON=${PYTHON:-python}
-path=''
-while IFS= read -rd : folder; do
-  case $folder in '' | /*) ;; *) folder=$caller/$folder ;; esac
-  path+=${path:+:}$folder
-done < <(printf %s "${PYTHONPATH:+$PYTHONPATH:}") # a here-string would need room in /tmp
-# A module of the user's lies there, too. It is not looked for where none is named: a file of this
-# folder, such as types.py, may have the name of a module of Python's.
+# A module of the user's lies there, too. Without one the folder stays off the path: a file of it
+# could have the name of one of Python's own modules.
 own='(^| )[^ ]*[A-Za-z_][A-Za-z0-9_.]*:'
-[[ ! "${grid[*]}" =~ $own ]] || [ "$caller" = "$(pwd -P)" ] || path+=${path:+:}$caller
-[ -z "$path" ] || export PYTHONPATH=$path
+[[ ! "${grid[*]}" =~ $own ]] || [ "$caller" = "$PWD" ] || export PYTHONPATH=${PYTHONPATH:+$PYTHONPATH:}$caller
 lacking=$("$PYTHON" -c "import sys, importlib.util as u
 print(*[name for name in sys.argv[1:] if not u.find_spec(name)], sep=', ')" \
   gymnasium mujoco torch tyro tensorboard 2>/dev/null) ||
@@ -159,15 +148,13 @@ show() {
 }
 [ $view != status ] || { show status; exit; }
 
-# sets `todo`: the runs to do, but for those that were tried, a line each: folder, command.
-# LC_ALL=C: folders may have names that are not UTF-8
+# sets `todo`: the runs to do, but for those that were tried, a line each: folder, command
 list_todo() {
   local status=0
   todo=$(show "${dry_run:-list}") || status=$?
   [ "$status" -lt 131 ] || fail "Python was ended by signal $((status - 128)), as by an environment"
   [ "$status" -eq 0 ] || exit "$status"
-  todo=$(printf '%s\n' "$todo" | LC_ALL=C grep -vxFf <(printf '%s\n' "$tried")) ||
-    [ $? -eq 1 ] || fail "cannot take the runs that were tried from the list"
+  todo=$(printf '%s\n' "$todo" | grep -vxFf <(printf '%s\n' "$tried")) || [ $? -eq 1 ]
 }
 tried=''
 list_todo
@@ -195,7 +182,6 @@ case $executor in
     [ -z "$words" ] || mapfile -t slurm_options < <(printf '%s\n' "$words") ;;
 esac
 command -v flock >/dev/null || fail "benchmark.sh needs flock (Debian: apt-get install util-linux)"
-command -v ps >/dev/null || fail "benchmark.sh needs ps (Debian: apt-get install procps)"
 
 sweep=$HOSTNAME-$$-$(date +%Y%m%d%H%M%S)
 logs=${first%/*}/logs list=${first%/*}/logs/lines-$sweep.tsv
@@ -209,7 +195,7 @@ forget_refusals() { # of scripts that were refused: the same command may try the
 # Were this command killed, the executor would start run after run: the guard stops it then
 guard() { # a killed command may stay as a zombie: it is dead when the guard has another parent
   local me=$BASHPID
-  while [ "$(ps -o ppid= -p "$me")" -eq $$ ]; do sleep 1; done
+  while [ "$(cut -d ' ' -f 4 "/proc/$me/stat")" -eq $$ ]; do sleep 1; done
   "stop_$executor"
 }
 
@@ -230,11 +216,12 @@ stop() { # EXIT_STATUS
 # reaches every run once.
 run_todo() {
   local reason guard watch
-  [ "$executor" != slurm ] || ask_slurm
-  mapfile -t folders < <(printf '%s\n' "$todo" | cut -f1 | LC_ALL=C sed 's,/[^/]*$,/logs,' | LC_ALL=C sort -u)
+  [ "$executor" != slurm ] || array_limit
+  mapfile -t folders < <(printf '%s\n' "$todo" | cut -f1 | sed 's,/[^/]*$,/logs,' | sort -u)
   reason=$( (mkdir -p "${folders[@]}" && printf '%s\n' "$todo" >"$list") 2>&1) ||
     fail "--runs-dir: cannot write to $logs: ${reason##*: }"
-  locks_work "$list" || fail "--runs-dir: $(no_locks "$logs")"
+  flock "$list" true 2>/dev/null ||
+    fail "--runs-dir: the file system of $logs has no locks, so two processes could write into one run"
   if [ "$executor" = slurm ]; then
     submit
     [ -n "$wait" ] || exit "$stopped"

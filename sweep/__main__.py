@@ -77,31 +77,25 @@ def progress_of(run, over):
 def summary(progresses):
     """Return one line: how many runs are in which state, how fast it goes, how long it takes."""
     count = Counter(progress.state for progress in progresses)
-    states = [state for state in STATES if state != PROBABLY or count[state]]
-    text = f"{counted(len(progresses), 'run')}: " + ", ".join(
-        f"{count[state]:,} {state}" for state in states
-    )
-    steps_left = [
-        0 if p.state == "done" else max(0, p.run.total_timesteps - p.log.step) for p in progresses
-    ]
+    states = [f"{count[state]:,} {state}" for state in STATES if state != PROBABLY or count[state]]
+    text = f"{counted(len(progresses), 'run')}: {', '.join(states)}"
+    unfinished = [p for p in progresses if p.state != "done"]
+    left = {p.run.folder: max(0, p.run.total_timesteps - p.log.step) for p in unfinished}
     steps = sum(p.run.total_timesteps for p in progresses)
-    if any(steps_left):
-        text += f"; {steps - sum(steps_left):,} of {steps:,} steps"
-    speeds = {}
-    for progress in progresses:
-        if progress.log.steps_per_second:
-            for key in (progress.run.kind, None):
-                speeds.setdefault(key, []).append(progress.log.steps_per_second)
-    speed = {key: harmonic_mean(values) for key, values in speeds.items()}
+    if any(left.values()):
+        text += f"; {steps - sum(left.values()):,} of {steps:,} steps"
+    speeds = {}  # of each kind of runs, and of all
+    for p in progresses:
+        if p.log.steps_per_second:
+            for kind in (p.run.kind, None):
+                speeds.setdefault(kind, []).append(p.log.steps_per_second)
     on_their_way = [p for p in progresses if p.state in (RUNNING, PROBABLY)]
-    if on_their_way and speed:
-        seconds = sum(
-            number / speed.get(progress.run.kind, speed[None])
-            for number, progress in zip(steps_left, progresses, strict=True)
-        )
-        now = sum(progress.log.steps_per_second for progress in on_their_way)
+    if on_their_way and speeds:
+        mean = {kind: harmonic_mean(values) for kind, values in speeds.items()}
+        seconds = sum(left[p.run.folder] / mean.get(p.run.kind, mean[None]) for p in unfinished)
+        now = sum(p.log.steps_per_second for p in on_their_way)
         text += f"; about {duration(seconds / len(on_their_way))} left"
-        text += f", {now:,.0f} steps/s" * bool(now)  # a narrow terminal cuts the end off
+        text += f", {now:,.0f} steps/s" if now else ""
     return text
 
 
@@ -132,14 +126,14 @@ def show_list(args, runs, choices):
     for run in todo:
         folder = f"{run.folder.parent}/{run.folder.name}"  # with a slash, for --runs-dir . too
         print(folder, command_line(run), sep="\t")
-    lines = [f"{counted(len(runs), 'run')}{with_baselines(runs)}, {len(todo):,} to do"]
+    line = f"{counted(len(runs), 'run')}{with_baselines(runs)}, {len(todo):,} to do"
     if choices:
         from sweep import telling
 
-        lines = telling.before_a_batch(choices, args)
+        line = "\n".join(telling.before_a_batch(choices, args))
     elif args.view == "dry-run" and todo:
-        lines[0] += "; " + cost(args, done, todo)
-    for line in lines:
+        line += "; " + cost(args, done, todo)
+    if line:
         print(line, file=sys.stderr)
 
 
@@ -191,8 +185,8 @@ def show_stopped(args, runs, choices):
 def show_report(args, runs, choices):
     """Print what came out of a sweep; the exit status is 1 unless all runs are done."""
     progresses = show_progress(args, runs, over=True, everything=True)
-    unfinished = [p.log.path for p in progresses if p.state != "done"]
-    check_disk(unfinished)
+    unfinished = [p.log.path.parent for p in progresses if p.state != "done"]
+    check_disk(dict.fromkeys(unfinished))
     refused = {p.run.script.file: p.log.last_line for p in progresses if p.reason == "exit 2"}
     for script, reason in refused.items():
         print(f"{script} refused arguments, so no other seeds of these were started: {reason}")
@@ -229,23 +223,14 @@ def with_baselines(runs):
     return f" ({number} of them without noise)" if kinds[True] not in (set(), kinds[False]) else ""
 
 
-def check_disk(logs):
+def check_disk(folders):
     """Say so if logs cannot be written: then nothing else tells why their runs were not started."""
-    for folder in dict.fromkeys(log.parent for log in logs):
+    for folder in filter(os.path.exists, folders):
         try:
             with tempfile.TemporaryFile(dir=folder) as file:
                 file.write(bytes(100_000))
-                file.flush()
-                os.fsync(file.fileno())
-        except FileNotFoundError:
-            pass  # nothing was started from here
         except OSError as error:
             print(f"error: cannot write to {folder}: {error.strerror}", file=sys.stderr)
-    for log in filter(os.path.lexists, logs):  # it may be somebody else's
-        try:
-            open(log, "ab").close()
-        except OSError as error:
-            print(f"error: cannot write to {log}: {error.strerror}", file=sys.stderr)
 
 
 VIEWS = {
@@ -287,29 +272,24 @@ def are_seen(runs):
     A network's file system may show them seconds after the log says exit=0. Returns whether there
     were any to wait for.
     """
-    deadline, waited = time.monotonic() + PATIENCE, False
-    while late := [run for run in runs if is_late(run)]:
-        if time.monotonic() > deadline:
-            break
-        waited = True
+    deadline, late = time.monotonic() + PATIENCE, list(filter(is_late, runs))
+    waited = bool(late)
+    while late and time.monotonic() < deadline:
         time.sleep(1)
         for folder in {run.folder.parent for run in late}:
             os.listdir(folder)  # makes the file system look again
+        late = list(filter(is_late, late))
     return waited
 
 
 def is_late(run):
-    """Tell whether a run has ended well, and its result is not to be seen.
-
-    When it ended does not matter: the other machine's clock may be wrong.
-    """
+    """Tell whether a run has ended well, and its result is not to be seen."""
     return not os.path.exists(run.folder / "result.json") and read_log(run.folder).exit_status == 0
 
 
 if __name__ == "__main__":
-    names = {"encoding": sys.getfilesystemencoding(), "errors": sys.getfilesystemencodeerrors()}
-    if sys.argv[1] in ("list", "dry-run"):  # folders as they are: bash starts their runs
-        sys.stdout = open(os.dup(1), "w", **names)  # noqa: SIM115
+    if sys.argv[1] in ("list", "dry-run"):
+        sys.stdout = open(os.dup(1), "w")  # noqa: SIM115
         os.dup2(2, 1)  # what native code of a user's module prints is no run, either
     else:
         take_over_terminal()

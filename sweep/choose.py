@@ -8,7 +8,6 @@ each choice stands.
 import itertools
 import math
 import sys
-from itertools import count
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +16,7 @@ from analysis.errors import fail
 from analysis.folders import CONFIRMATION, SEARCH, SUCCESS
 from analysis.statistics import LEVEL, final_value
 from analysis.verdicts import what_all_runs_do
+from analysis.words import counted
 from noisy_wrappers import BASELINE, Configuration, parse_noise
 from sweep import halving
 from sweep.environment import MANY, ask_all, mean_seconds, remember, remembered, run_seconds
@@ -55,22 +55,23 @@ def choices(args):
     """
     pairs = list(itertools.product(args.algos, args.envs))
     plans = {pair: plan_for(args, *pair, len(pairs)) for pair in pairs}
-    known = {env_id: remembered(args.runs_dir, env_id) for env_id in args.envs}
+    known = {env_id: remembered(args, env_id) for env_id in args.envs}
     listed = args.view in ("list", "dry-run")
     if listed:
         refuse_other_baselines(args, plans)
-    noises = {env_id: untried(args, env_id, known[env_id], plans) for env_id in args.envs if listed}
+    noises = {env_id: untried(args, env_id, known[env_id].tried) for env_id in args.envs if listed}
     noises = {env_id: new for env_id, new in noises.items() if new}
     for env_id, answer in ask_all(args, noises).items():
         known[env_id] = answer._replace(tried=known[env_id].tried | answer.tried)
-        tell_what_is_left_out(args, env_id, answer)
+        left_out = in_words(reasons_against(args, answer))
+        if left_out and not args.noises:
+            print(f"{env_id}: left out: {left_out}", file=sys.stderr)
     found = [follow(args, *pair, known[pair[1]], plan) for pair, plan in plans.items()]
     for env_id in noises if args.view == "list" else ():
-        remember(args.runs_dir, env_id, known[env_id])
+        remember(args, env_id, known[env_id])
     problems = [f"{choice.name}: {choice.problem}" for choice in found if choice.problem]
     if len(problems) == len(found):
-        is_argument = all(choice.problem == NO_SUCCESS for choice in found)
-        fail("\nerror: ".join(problems), code=2 if is_argument else 1)
+        fail("\nerror: ".join(problems), code=1)
     for problem in problems:  # the others go on
         print(f"warning: {problem}", file=sys.stderr)
     if args.view == "list":
@@ -88,8 +89,7 @@ def plan_for(args, algorithm, env_id, verdicts):
     kept = plan_of(args, algorithm, env_id)
     asked = Plan(looks_after(args.confirm, args.looks), LEVEL / verdicts)
     if kept:
-        differs = args.given & {"--confirm", "--looks"} and kept.looks != asked.looks
-        if differs:
+        if args.given & {"--confirm", "--looks"} and kept.looks != asked.looks:
             fail(
                 f"{algorithm.upper()} on {env_id}: its confirmation has begun, with "
                 f"{kept.looks[-1]} seeds and {len(kept.looks)} looks, and keeps them: leave out "
@@ -98,7 +98,7 @@ def plan_for(args, algorithm, env_id, verdicts):
         return kept
     if args.looks and args.looks > max(1, args.confirm // 2):
         fail(f"--looks must be from 1 to half of --confirm, not {args.looks}")
-    fewest = next(n for n in count(4) if is_enough(n, args.looks, asked.level))
+    fewest = next(n for n in itertools.count(4) if is_enough(n, args.looks, asked.level))
     if args.confirm < fewest:
         fail(
             f"--confirm must be at least {fewest}, not {args.confirm}: with fewer seeds no "
@@ -128,62 +128,40 @@ def refuse_other_baselines(args, plans):
 # --------------------------------------------------------------------------- which noises can act
 
 
-def untried(args, env_id, environment, plans):
-    """Return the noises to try in an environment.
+def untried(args, env_id, tried):
+    """Return the configurations whose noises were never tried in an environment.
 
-    All of them until the first run of a choice there is finished. From then on a choice keeps its
-    noises: only such as were never tried, or were refused and are named all the same.
+    A noise that was refused is tried again if it is named all the same.
     """
     whole = candidates(args, args.algos[0], env_id)
-    tried = environment.tried
-    kept = candidates(args, args.algos[0], env_id, None if args.noises else environment)
-    begun = (
-        walk(args, algorithm, env_id, kept, len(kept), plans[algorithm, env_id])[2]
-        for algorithm in args.algos
-    )
-    if not any(begun):
-        return whole
     return [n for n in whole if n.noise not in tried or (args.noises and tried[n.noise])]
 
 
-def tell_what_is_left_out(args, env_id, environment):
-    """Say which noises of a list that the user has not written cannot act in an environment."""
-    if args.noises:
-        return
-    for why, left_out in (
-        ("they cannot act there", unfit_noises(environment.tried)),
-        (few_rewards(environment), ", ".join(on_few_rewards(args, environment))),
-    ):
-        if left_out:
-            print(f"{env_id}: left out, because {why}: {left_out}", file=sys.stderr)
+def reasons_against(args, environment):
+    """Return why noises are left out in an environment: {noise: reason}.
 
-
-def unfit_noises(tried):
-    """Return the noises that cannot act in an environment, those with one reason together."""
-    noises_of = {}
-    for noise, reason in tried.items():
-        if reason:
-            reason = reason.removeprefix(noise.partition("(")[0]).strip()  # of several, often
-            noises_of.setdefault(reason, []).append(noise)
-    return "; ".join(f"{', '.join(noises)} ({reason})" for reason, noises in noises_of.items())
-
-
-def few_rewards(environment):
-    """Say how few different rewards an environment gave while it was timed."""
-    number = environment.rewards
-    return f"rewards take only {number} value{'s' * (number != 1)} there"
-
-
-def on_few_rewards(args, environment):
-    """Return the default noises on rewards, where rewards take few values: they would drown."""
-    if environment.rewards >= MANY or not args.default_noises:
-        return []
-    return [noise for noise in environment.tried if is_on_rewards(noise)]
+    Where rewards take few values, noise on them would drown what they tell: of the default noises,
+    those on rewards are left out.
+    """
+    reasons = {noise: reason for noise, reason in environment.tried.items() if reason}
+    if args.default_noises and environment.rewards < MANY:
+        few = f"rewards take only {counted(environment.rewards, 'value')} there"
+        reasons |= {noise: few for noise in environment.tried if is_on_rewards(noise)}
+    return reasons
 
 
 def is_on_rewards(noise):
     """Tell whether one of the noises of an entry perturbs rewards."""
     return any(parse_noise(part).wrapper.kind == "reward" for part in noise.split(" + "))
+
+
+def in_words(reasons):
+    """Name noises with the reasons against them, those with one reason together."""
+    noises_of = {}
+    for noise, reason in reasons.items():
+        reason = reason.removeprefix(noise.partition("(")[0]).strip()  # of several, often
+        noises_of.setdefault(reason, []).append(noise)
+    return "; ".join(f"{', '.join(noises)} ({reason})" for reason, noises in noises_of.items())
 
 
 def candidates(args, algorithm, env_id, environment=None):
@@ -199,16 +177,14 @@ def candidates(args, algorithm, env_id, environment=None):
         if excluded not in found:
             fail(f"--exclude: {excluded} is not among the noises")
         del found[excluded]
-    if environment:
-        tried = environment.tried
-        reasons = {noise.noise: tried[noise.noise] for noise in found if noise.noise in tried}
-        if args.noises and any(reasons.values()):
-            fail(f"--noises: these cannot act in {env_id}: {unfit_noises(reasons)}")
-        few = on_few_rewards(args, environment)
-        found = [n for n in found if not reasons.get(n.noise) and n.noise not in few]
+    against = reasons_against(args, environment) if environment else {}
+    left_out = {noise.noise: against[noise.noise] for noise in found if noise.noise in against}
+    if args.noises and left_out:
+        fail(f"--noises: these cannot act in {env_id}: {in_words(left_out)}")
+    found = [noise for noise in found if noise.noise not in left_out]
     if not found:
         fail("there is no noise to choose from")
-    return list(found)
+    return found
 
 
 # --------------------------------------------------------------------------------- how far they are

@@ -6,6 +6,7 @@ takes until finished runs tell. `remember` keeps the answer, because `status` ma
 
 import contextlib
 import heapq
+import itertools
 import json
 import math
 import sys
@@ -19,7 +20,7 @@ import gymnasium as gym
 
 import noisy_wrappers as noisy
 from analysis.errors import fail, with_place
-from analysis.folders import DamageError, read_json
+from analysis.folders import read_json
 from analysis.words import counted, duration
 from sweep.scripts import number
 
@@ -49,59 +50,40 @@ class Environment(NamedTuple):
 
 
 def ask(env_id, configurations=(), max_episode_steps=None, env_kwargs=()):
-    """Make an environment as the scripts do, time it, and try configurations of noise on it.
+    """Make an environment as the scripts do, time it, and wrap configurations of noise around it.
 
     What it raises if it cannot be made or played passes through.
     """
-    deadline = time.perf_counter() + PATIENCE
     with contextlib.redirect_stdout(sys.stderr):
         options = noisy.parse_env_kwargs(env_kwargs) | {"max_episode_steps": max_episode_steps}
         made = gym.make(env_id, disable_env_checker=True, **options)
         declared = made.spec.max_episode_steps
         with noisy.make_flat(made, STEP_LIMIT) as env:
-            limit = env.spec.max_episode_steps
-            seconds, steps, length, rewards, inside = time_steps(
-                env, limit, deadline, declared is None
-            )
-            env.reset()  # a failure after this one is the noise's
-            limit = min(limit, inside)
-            tried = {}
-            for n in configurations:  # at every rate: it may fail at one of them
-                tried[n.noise] = tried.get(n.noise) or why_unfit(env, n, limit, deadline)
+            seconds, steps, length, rewards = time_steps(env)
             return Environment(
                 step_seconds=seconds,
                 timed_steps=steps,
                 episode_steps=declared or length,
                 observed=math.prod(env.observation_space.shape),
                 bounded=noisy.is_bounded(env.action_space),
-                tried=tried,
+                tried={one.noise: why_unfit(env, one) for one in configurations},
                 rewards=rewards if steps >= STEPS else MANY,
             )
 
 
-def time_steps(env, time_limit, deadline, whole=False):
-    """Return an environment's seconds a step, the steps timed, an episode's length, and two more.
-
-    These are how many different rewards there were, MANY if as many or more, and limit_inside.
+def time_steps(env):
+    """Return seconds a step, the steps timed, an episode's length and how many rewards there were.
 
     Each step bears its share of a reset: an episode is as long as those that ended while it was
-    timed, or as the time limit if none did. whole: an episode is played to its end, if that takes
-    no more than half of the time until the deadline. Time in which this process waited for a core
-    does not count.
+    timed, or as the time limit if none did. Different rewards are counted up to MANY.
     """
     env.action_space.seed(1)
     env.reset(seed=1)
     env.step(env.action_space.sample())  # not timed: the first calls may load or compile something
-    begin, waited_before = time.perf_counter(), waited()
-    now = begin
-    half = (begin + deadline) / 2
-    steps, resets = [], []  # the seconds of each
-    episodes = []  # of each that ended, its steps and whether it was terminated
-    rewards, ended, last_end = set(), True, 0
-    while not steps or (
-        now < deadline
-        and (len(steps) < STEPS or now < begin + SECONDS or (whole and not episodes and now < half))
-    ):
+    begin = now = time.perf_counter()
+    steps, resets, rewards = [], [], set()  # of the first two, the seconds
+    ended, episodes, last_end = True, 0, 0
+    while now < begin + SECONDS or (len(steps) < STEPS and now < begin + PATIENCE):
         if ended:
             start = time.perf_counter()
             env.reset()
@@ -114,54 +96,23 @@ def time_steps(env, time_limit, deadline, whole=False):
         if len(rewards) < MANY:
             rewards.add(float(reward))
         if ended := terminated or truncated:
-            episodes.append((len(steps) - last_end, terminated))
-            last_end = len(steps)
-    length = fmean(length for length, _ in episodes) if episodes else time_limit
-    own_share = 1 - (waited() - waited_before) / (time.perf_counter() - begin)
-    seconds = (fmean(steps) + fmean(resets) / length) * own_share
-    return seconds, len(steps), math.ceil(length), len(rewards), limit_inside(episodes)
+            episodes, last_end = episodes + 1, len(steps)
+    length = last_end / episodes if episodes else env.spec.max_episode_steps
+    return fmean(steps) + fmean(resets) / length, len(steps), math.ceil(length), len(rewards)
 
 
-def limit_inside(episodes):
-    """Return a time limit that the environment has inside, as dm_control's do, or infinity.
-
-    That is the length of two or more episodes, if all were truncated there. episodes: of each, its
-    steps and whether it was terminated.
-    """
-    if len(episodes) < 2 or len(set(episodes)) > 1:
-        return math.inf
-    steps, terminated = episodes[0]
-    return math.inf if terminated else steps
-
-
-def waited():
-    """Return how many seconds the main thread has waited for a core; 0 if that is not known."""
-    try:
-        return int(Path("/proc/self/schedstat").read_text().split()[1]) / 1e9
-    except (OSError, IndexError, ValueError):
-        return 0
-
-
-def why_unfit(env, configuration, time_limit, deadline):
-    """Return why noises cannot act in an environment, or ""; after the deadline none is played."""
+def why_unfit(env, configuration):
+    """Return why noises cannot act in an environment, or ""."""
     try:
         with warnings.catch_warnings(action="ignore"):  # of what is said below
             noisy_env = configuration.wrap(env)
-    except ValueError as error:
+    except Exception as error:
         return with_place(error, ValueError)
+    limit = env.spec.max_episode_steps
     for wrapper in noisy.noise_wrappers(noisy_env).values():
         ends = isinstance(wrapper, noisy.RandomEarlyTermination) and not wrapper.each_step
-        if ends and wrapper.low >= time_limit:  # its last step ends the episode anyway
-            return f"an episode has at most {time_limit} steps"
-    try:
-        if time.perf_counter() < deadline:
-            noisy_env.reset()
-            for _ in range(3):
-                _, _, terminated, truncated, _ = noisy_env.step(env.action_space.sample())
-                if terminated or truncated:
-                    break
-    except Exception as error:  # the environment's own, where noise has led it
-        return with_place(error, (gym.error.Error, noisy.NotFiniteError, noisy.SpaceError))
+        if ends and wrapper.low >= limit:  # its last step ends the episode anyway
+            return f"an episode has at most {limit} steps"
     return ""
 
 
@@ -171,8 +122,8 @@ def ask_all(args, configurations):
     configurations: {env_id: [Configuration]}. Exits with a line for each environment that cannot
     be trained in, and for each algorithm that cannot act there.
     """
-    given = args.given_words[args.algos[0]]
-    steps, env_kwargs = number(given.get("max_episode_steps")), given.get("env_kwargs", [])
+    max_episode_steps, env_kwargs = options_of_environments(args)
+    steps = number(max_episode_steps)
     answers, reasons = {}, []
     for env_id, noises in configurations.items():
         try:
@@ -196,6 +147,12 @@ def ask_all(args, configurations):
     return answers
 
 
+def options_of_environments(args):
+    """Return the words of the scripts' options about environments, the same for all algorithms."""
+    given = args.given_words[args.algos[0]]
+    return given.get("max_episode_steps", []), given.get("env_kwargs", [])
+
+
 # ------------------------------------------------------------------------------------ what it costs
 
 
@@ -208,7 +165,7 @@ def run_seconds(run, environment):
         return None
     steps, frequency = run.total_timesteps, run.number("eval_frequency")
     if frequency is None:
-        frequency = max(1, min(run.script.constants.get("EVAL_FREQUENCY", steps), steps // 10))
+        frequency = max(1, min(run.script.eval_frequency or steps, steps // 10))
     tests = math.ceil(steps / frequency) if frequency else 1
     test_steps = tests * run.number("eval_episodes", 10) * environment.episode_steps
     learned = max(0, steps - run.number("learning_starts", 0))
@@ -229,34 +186,21 @@ def cost(args, done, todo):
     for kind in new:
         seconds[kind] = run_seconds(kinds[kind], answers[kind[1]])
     known = [seconds[run.kind] for run in todo if seconds[run.kind] is not None]
-    text = time_left([known], args.jobs, args.elsewhere and new) if known else ""
-    unknown = sorted(
-        {algorithm for algorithm, env_id in kinds if seconds[algorithm, env_id] is None}
-    )
+    told = [time_left([known], args.jobs)] if known else []
+    unknown = sorted({algorithm for algorithm, env_id in kinds if not seconds[algorithm, env_id]})
     if unknown:
-        told = f"what runs of {', '.join(unknown)} take is known once one is finished"
-        text = f"{text}; {told}" if text else told
-    return text
+        told.append(f"what runs of {', '.join(unknown)} take is known once one is finished")
+    return "; ".join(told)
 
 
 def mean_seconds(runs):
-    """Return how many seconds of a processor finished runs took on average, None if none tells.
-
-    Those of older versions tell only the time on the clock.
-    """
-    taken = []
-    for run in runs:
-        try:
-            result = read_json(run.folder / "result.json")
-        except DamageError:
-            continue
-        seconds = result.get("processor_seconds", result.get("wall_time_seconds"))
-        if isinstance(seconds, int | float) and seconds > 0:
-            taken.append(seconds)
-    return fmean(taken) if taken else None
+    """Return how many seconds of a processor finished runs took on average, None if none tells."""
+    taken = [read_json(run.folder / "result.json").get("processor_seconds") for run in runs]
+    known = [seconds for seconds in taken if isinstance(seconds, int | float)]
+    return fmean(known) if known else None
 
 
-def time_left(batches, jobs, elsewhere=False):
+def time_left(batches, jobs):
     """Say what batches of runs take, one batch after the other.
 
     batches: the seconds of each run, batch by batch. jobs: runs at a time, None if unknown.
@@ -270,31 +214,28 @@ def time_left(batches, jobs, elsewhere=False):
                 heapq.heapreplace(ends, ends[0] + seconds)  # where the next place is free
             clock += max(ends, default=0)
         text += f", {duration(clock)} on the clock with {counted(jobs, 'run')} at a time"
-    if elsewhere:
-        text += "; timed on this machine, others may be faster or slower"
     return text
 
 
 # --------------------------------------------------------------------------------------- the memory
 
 
-def remember(runs_dir, env_id, environment):
+def remember(args, env_id, environment):
     """Keep what was found, for a status."""
-    path = file_of(runs_dir, env_id)
+    path = file_of(args, env_id)
     with contextlib.suppress(OSError):  # benchmark.sh will say so
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(environment))
 
 
-def remembered(runs_dir, env_id):
+def remembered(args, env_id):
     """Return what was found when an environment was asked last, or one without timed steps."""
     with contextlib.suppress(OSError, ValueError, TypeError):  # there is no file, or half of one
-        known = Environment(*json.loads(file_of(runs_dir, env_id).read_text()))
-        if isinstance(known.rewards, int):  # version 0.3 had a remark there
-            return known
+        return Environment(*json.loads(file_of(args, env_id).read_text()))
     return Environment(math.nan, 0, 0, 0, False, {})
 
 
-def file_of(runs_dir, env_id):
-    """Return the file of an environment, beside the logs of its runs."""
-    return Path(runs_dir, "logs", noisy.safe_name(env_id) + ".json")
+def file_of(args, env_id):
+    """Return the file of an environment with its options, beside the logs of its runs."""
+    name = "_".join([env_id, *itertools.chain(*options_of_environments(args))])
+    return Path(args.runs_dir, "logs", noisy.safe_name(name) + ".json")

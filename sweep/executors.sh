@@ -12,28 +12,17 @@ quoted() { # TEXT: as one word of any sh, which does not know all that printf %q
   printf "'%s'" "${1//\'/\'\\\'\'}"
 }
 
-locks_work() { # FILE: flock's status is 1 for a lock that another process holds, more for no locks
-  flock --nonblock "$1" true 2>/dev/null || [ $? -eq 1 ]
-}
-
-no_locks() { # FOLDER
-  local name
-  name=$(df -P "$1" | awk 'NR == 2 {print $1 " on " $NF}') || name='the file system'
-  echo "$name has no locks, without which two processes could write into one run's folder:" \
-    "choose a --runs-dir on another file system, or have its locks turned on"
-}
-
-# A script that refuses its arguments refuses them with every seed: the first run leaves this file,
-# and the sweep starts no run of another seed (on this machine, if machines share no folder). Other
-# environments and noises are tried: it may be one of these that the script refuses.
-refusal_of() { # SWEEP FOLDER
+# SWEEP FOLDER: a script that refuses its arguments refuses them with every seed. The first run
+# leaves this file, and the sweep starts no run of another seed (on this machine, if machines share
+# no folder). Other environments and noises are tried: it may be one of these that is refused.
+refusal_of() {
   local name=${2##*/} configuration
   configuration=${name%%__*}
   echo "${2%/*}/logs/.refused-$1-${configuration%_s*}__${name#*__}"
 }
-is_refused() { [ -e "$(refusal_of "$@")" ]; }
 
-# SWEEP FOLDER COMMAND: one run, its output framed by two lines that begin with "#"; returns its status.
+# SWEEP FOLDER COMMAND: one run, its output framed by two lines that begin with "#"; returns its
+# status. The output goes into the log if `logged` is set.
 # TERM and INT reach all processes of a run, from whoever sends them. USR1 reaches this shell
 # only, and means: have the run write its checkpoint and end. It sets `asked`.
 # The log is locked while the run lives, even if only the run itself survives: whoever else wants
@@ -45,15 +34,14 @@ run_one() {
   asked=
   [ ! -e "$refusal" ] || return 2
   mkdir -p "${1%/*}/logs" # on a machine that does not share the folder, too
-  exec 9>>"$(log_of "$1")"
-  if ! flock --nonblock 9 2>/dev/null; then
-    locks_work "$(log_of "$1")" || { echo "error: $(no_locks "${1%/*}")"; return 2; }
+  exec 9>>"$(log_of "$1")" || return
+  if ! flock --nonblock 9; then
     echo "$1 is running already: waiting for it" >&2
-    flock 9 >/dev/null 2>&1 || return
+    flock 9 || return
   fi
   [ ! -e "$1/result.json" ] || return 0
+  [ -z "${logged:-}" ] || exec >&9
   export OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 PYTHONUNBUFFERED=1
-  export PYTHONIOENCODING=utf-8:surrogateescape # whatever the locale, and the folder's name
   echo "# $(date '+%F %T') $HOSTNAME: $2" 2>/dev/null || return # the report says that the disk is full
   bash -c "exec $2" 2>&1 &
   local child=$! status=0
@@ -71,13 +59,11 @@ run_one() {
 # LINES OFFSET: one task of a job array, requeued if it was stopped by USR1. The SLURM_JOB_ID of the
 # array's last task is the id of the whole array, which would be requeued by it.
 slurm_task() {
-  local folder command sweep status=0 job=$SLURM_JOB_ID
+  local folder command sweep status=0 job=$SLURM_JOB_ID logged=1
   [ -z "${SLURM_ARRAY_JOB_ID:-}" ] || job=${SLURM_ARRAY_JOB_ID}_$SLURM_ARRAY_TASK_ID
-  sweep=${1##*/lines-} # its id stands in the name of the list
   IFS=$'\t' read -r folder command < <(sed -n "$(($2 + SLURM_ARRAY_TASK_ID + 1))p" "$1")
-  sweep=${sweep%.tsv}
-  ! is_refused "$sweep" "$folder" || exit 2
-  run_one "$sweep" "$folder" "$command" >>"$(log_of "$folder")" || status=$?
+  sweep=${1##*/lines-} # its id stands in the name of the list
+  run_one "${sweep%.tsv}" "$folder" "$command" || status=$?
   # SLURM_CLUSTERS came along from where it was submitted: the task is one of this cluster
   if [ -n "$asked" ] && [ "$status" -eq 143 ]; then env -u SLURM_CLUSTERS scontrol requeue "$job"; fi
   exit "$status"
@@ -86,13 +72,11 @@ slurm_task() {
 # -------------------------------------------------------------------------------------------- local
 
 run_local() { # nproc obeys OMP_NUM_THREADS, which is about the threads of one process
-  local cores folder command
+  local cores folder command logged=1
   cores=$(env -u OMP_NUM_THREADS -u OMP_THREAD_LIMIT nproc)
   while IFS=$'\t' read -r folder command; do
     while [ "$(jobs -pr | wc -l)" -ge "${jobs:-$cores}" ]; do wait -n || true; done
-    ! is_refused "$sweep" "$folder" || continue
-    : 2>/dev/null >>"$(log_of "$folder")" || continue # the report says why
-    run_one "$sweep" "$folder" "$command" >>"$(log_of "$folder")" &
+    run_one "$sweep" "$folder" "$command" &
   done <"$list"
   wait
 }
@@ -123,41 +107,15 @@ stop_parallel() { # HUP: parallel starts no more runs, and waits for those that 
 
 # -------------------------------------------------------------------------------------------- slurm
 
-clusters_of() { # the clusters that sbatch will choose from, "" for this one: as its options say
-  local clusters=${SBATCH_CLUSTERS:-${SLURM_CLUSTERS:-}} option previous=''
-  for option in ${slurm_options[@]+"${slurm_options[@]}"}; do
-    case $previous in --clusters | --cluster | -M) clusters=$option ;; esac
-    case $option in
-      --clusters=* | --cluster=*) clusters=${option#*=} ;;
-      -M?*) clusters=${option#-M} ;;
-    esac
-    previous=$option
-  done
-  echo "$clusters"
-}
-
-ask_slurm() { # before anything is written; sets array_size, the least of all clusters
-  local clusters
-  unset "${!SQUEUE_@}" "${!SCANCEL_@}" # a user's own, such as SQUEUE_STATES, would hide jobs
-  clusters=$(clusters_of)
-  array_size=$(scontrol ${clusters:+"--clusters=$clusters"} show config 2>/dev/null |
-    awk '$1 == "MaxArraySize" && (!least || $3 < least) {least = $3} END {print least}') || true
+array_limit() { # sets array_size, before anything is written
+  array_size=$(scontrol show config 2>/dev/null | awk '$1 == "MaxArraySize" {print $3; exit}') ||
+    true
   [ "${array_size:-0}" -gt 0 ] || [ "$stopped" -ne 0 ] ||
     fail "Slurm does not answer: scontrol show config has no MaxArraySize"
 }
 
-# Sets id from what sbatch --parsable prints, ID or ID;CLUSTER; a site's sbatch may print more lines
-read_id() { # TEXT
-  local line
-  id=''
-  while IFS= read -r line; do
-    [[ ! $line =~ ^[0-9]+(;[A-Za-z0-9_.-]+)?$ ]] || id=$line
-  done < <(printf '%s\n' "$1")
-  [ -n "$id" ]
-}
-
 submit() { # the array's indices are line numbers, counted from the offset of its part
-  local count offset n said
+  local count offset n said id
   count=$(wc -l <"$list")
   for ((offset = 0; offset < count && stopped == 0; offset += array_size)); do
     n=$((count - offset < array_size ? count - offset : array_size))
@@ -166,7 +124,8 @@ submit() { # the array's indices are line numbers, counted from the offset of it
       --open-mode=append --output="${logs//%/%%}/slurm-%A.out" \
       ${slurm_options[@]+"${slurm_options[@]}"} \
       --wrap "exec ./benchmark.sh slurm-task $(quoted "$list") $offset") || said=''
-    if ! read_id "$said"; then
+    # ID or ID;CLUSTER; a site's sbatch may print more lines
+    if ! id=$(printf '%s\n' "$said" | grep -xE '[0-9]+(;[A-Za-z0-9_.-]+)?'); then
       [ "$stopped" -eq 0 ] || break # Ctrl-C ends sbatch, too
       fail "sbatch refused runs $((offset + 1)) to $((offset + n)); submitted before: ${ids[*]:-none};" \
         "run the same command again when they are over"
@@ -174,34 +133,27 @@ submit() { # the array's indices are line numbers, counted from the offset of it
     trap - EXIT # of benchmark.sh, which removes the list: the tasks read it later
     ids+=("$id")
   done
-  if [ "$stopped" -eq 0 ]; then
-    echo "submitted; to stop: $(cancels | paste -sd';' | sed 's/;/ \&\& /g')" >&2
-  elif [ "${#ids[@]}" -gt 0 ]; then
+  if [ "$stopped" -ne 0 ]; then
     stop_slurm
+  else
+    echo "submitted; to stop: $(cancels | paste -sd';' | sed 's/;/; /g')" >&2
   fi
 }
 
-# Slurm's programs take the ids of one cluster at a time; ids are ID or ID;CLUSTER
-cluster_names() { printf '%s\n' "${ids[@]}" | sed 's/^[0-9]*;*//' | sort -u; }
-ids_of() { # CLUSTER
-  local one
-  for one in "${ids[@]}"; do
-    case $one in *";$1") echo "${one%%;*}" ;; *";"*) ;; *) [ -n "$1" ] || echo "$one" ;; esac
-  done
-}
+cluster_of() { case $1 in *";"*) echo "--clusters=${1#*;}" ;; esac; } # ID or ID;CLUSTER
 cancels() { # the commands that cancel all arrays
-  local cluster
-  cluster_names | while IFS= read -r cluster; do
-    echo "scancel ${cluster:+--clusters=$cluster }$(ids_of "$cluster" | paste -sd' ')"
+  local id
+  for id in ${ids[@]+"${ids[@]}"}; do
+    echo "scancel $(cluster_of "$id") ${id%;*}" | tr -s ' '
   done
 }
-run_slurm() { # the arrays are over when squeue answers and does not name them
-  local cluster queue
-  while IFS= read -r cluster <&3; do
-    until queue=$(squeue ${cluster:+"--clusters=$cluster"} --noheader --user="$(id -un)" \
-      --format=%F 2>/dev/null) &&
-      ! printf '%s\n' "$queue" | grep -qxF -f <(ids_of "$cluster"); do sleep 5; done
-  done 3< <(cluster_names)
+run_slurm() { # an array is over when squeue answers and does not name it
+  local id queue
+  for id in "${ids[@]}"; do
+    # shellcheck disable=SC2046  # no cluster, no word
+    until queue=$(squeue $(cluster_of "$id") --noheader --user="$(id -un)" --format=%F 2>/dev/null) &&
+      ! printf '%s\n' "$queue" | grep -qx "${id%;*}"; do sleep 5; done
+  done
 }
 stop_slurm() {
   local command

@@ -76,16 +76,15 @@ def remarks(found, place):
         first = others[0].run.folder.name
         what = f"{runs_were(len(others))} made in {place} with other arguments: {said}"
         hindrances.append(f"{what} (as {first}); {ADVICE}")
-    for old in sorted({one.other_release for one in found if one.other_release}):
-        number = sum(one.other_release == old for one in found)
+    releases = Counter(one.other_release for one in found if one.other_release)
+    for old, number in sorted(releases.items()):
         text = (
             f"{runs_were(number)} made in {place} by release {old}, and this is {NOW}: runs of "
             f"two releases are two studies. Finish them with {old}, or {ADVICE}"
         )
-        whole = all(one.finished and one.other_release == old for one in found)
+        whole = number == len(found) and all(one.finished for one in found)
         (notes if whole else hindrances).append(text)
-    changed = [one.run.script for one in found if one.other_text]
-    for script, number in Counter(changed).items():
+    for script, number in Counter(one.run.script for one in found if one.other_text).items():
         notes.append(
             f"{runs_were(number)} made in {place} by another text of {script} than today's; "
             f"if the change matters, {ADVICE}"
@@ -117,8 +116,8 @@ def runs_in(folder, caller):
     folders = {*runs_of(Path(folder)), *logged(Path(folder))}
     if not folders:
         fail(f"no runs in {folder}; name their folder with --runs-dir")
-    known = {**scripts_in(Path(caller)), **scripts_in(PROJECT)}
-    paths = {path.name: path for path in known.values()}
+    places = (Path(caller), PROJECT)
+    paths = {path.name: path for place in places for path in scripts_in(place).values()}
     runs = []
     for path in sorted(folders):
         planned = PlannedRun(path, ("", ""), 0, 0, [])  # unknown: it has failed before it began

@@ -7,7 +7,6 @@ import csv
 import itertools
 import math
 import os
-import re
 import shlex
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -59,6 +58,9 @@ ABLATION += [
 # Times as many seeds without noise as with it, at most: with more, a test of few seeds claims too
 # much where noise widens the spread, and the analysis gives no verdict (analysis/verdicts.py)
 MOST_BASELINES = 2.6
+# Compiling would take longer than learning, which the other options make fast
+DEMO_OPTIONS = ["--no-compile", "--learning-rate=2e-3"]
+DEMO_OPTIONS += ["--num-minibatches=16", "--eval-episodes=5"]
 PRESETS = {  # what a preset sets: its noises with their rates, grid options, the scripts' options
     "demo": {
         "pairs": [("RandomNormalNoisyObservation(1.0)", 1.0)],  # harms with any five seeds
@@ -66,13 +68,7 @@ PRESETS = {  # what a preset sets: its noises with their rates, grid options, th
         "envs": ["InvertedPendulum-v5"],
         "seeds": [range(1, 6)],
         "total_timesteps": 20_480,
-        # compiling would take longer than learning; the others make that fast
-        "options": [
-            "--no-compile",
-            "--learning-rate=2e-3",
-            "--num-minibatches=16",
-            "--eval-episodes=5",
-        ],
+        "options": DEMO_OPTIONS,
         "runs_dir": "runs/demo",  # never into a sweep's folders: these runs are shorter
     },
     "baseline": {},
@@ -164,8 +160,8 @@ def make_run(args, algorithm, env_id, configuration, seed, phase=""):
 
 def name_of(args, algorithm, env_id, configuration, seed):
     """Return the name of a run's folder."""
-    names = ("env_kwargs", "test_noise", "test_noise_rate")
-    given = {name: args.given_words[algorithm].get(name, []) for name in names}
+    named = ("env_kwargs", "test_noise", "test_noise_rate")
+    given = {name: args.given_words[algorithm].get(name, []) for name in named}
     try:
         return run_name(env_id, args.exp_names[algorithm], *configuration.texts, seed, **given)
     except ValueError as error:
@@ -213,15 +209,9 @@ def baseline_seeds(args, seeds, configurations):
 def command_line(run):
     """Return a run's command, complete: it can be pasted into a shell in the project's folder."""
     words = [os.environ.get("PYTHON", "python"), *run.command]
-    path = [folder for folder in [os.environ.get("PYTHONPATH")] if folder and has_module(run)]
-    if os.path.dirname(run.script.path):  # it lies elsewhere, and noisy_wrappers here
-        path.insert(0, str(PROJECT) if os.path.isabs(run.script.path) else ".")
+    # A script that lies elsewhere needs noisy_wrappers, which lies here
+    path = [str(PROJECT)] if os.path.dirname(run.script.path) else []
+    path += filter(None, [os.environ.get("PYTHONPATH")])
     if path:
         words = ["env", f"PYTHONPATH={':'.join(path)}", *words]
     return shlex.join(words)
-
-
-def has_module(run):
-    """Tell whether a command may name a module of the user's, as module:Name does."""
-    own_noise = any(re.match(r"[\w.]+:[^\W\d]", word) for word in run.command)
-    return ":" in run.kind[1] or own_noise or bool(os.path.dirname(run.script.path))

@@ -93,19 +93,6 @@ def fresh_seeds(number):
     return range(FIRST_CONFIRMATION_SEED, FIRST_CONFIRMATION_SEED + number)
 
 
-def spread(returns):
-    """Return the standard deviation over the seeds of one configuration, pooled over the search.
-
-    returns: {(configuration, seed): return}. NaN if no candidate has two.
-    """
-    groups = {}
-    for (candidate, seed), value in returns.items():
-        if seed < FIRST_CONFIRMATION_SEED:
-            groups.setdefault(candidate, []).append(value)
-    std, freedom = statistics.pooled_std(list(groups.values()))
-    return float(std) if freedom else math.nan
-
-
 def missing(candidates, seeds, returns):
     """Return the runs that have no return yet, the first seed of every candidate first."""
     wanted = [(candidate, seed) for seed in seeds for candidate in candidates]

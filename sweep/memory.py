@@ -13,8 +13,6 @@ from noisy_wrappers import BASELINE
 from sweep.grid import name_of
 from sweep.looks import Plan
 
-KEPT = 20  # commands
-
 
 def file_of(runs_dir):
     """Return the file of a folder."""
@@ -42,27 +40,20 @@ def choice_key(args, algorithm, env_id):
 def plan_of(args, algorithm, env_id):
     """Return the Plan that a choice began its confirmation with, or None."""
     kept = load(args.runs_dir)["plans"].get(choice_key(args, algorithm, env_id))
-    try:
-        return Plan(tuple(map(int, kept["looks"])), float(kept["level"])) if kept else None
-    except (KeyError, TypeError, ValueError) as error:
-        return fail(f"cannot read a plan in {file_of(args.runs_dir)} ({in_words(error)})")
+    return Plan(tuple(kept["looks"]), kept["level"]) if kept else None
 
 
 def keep_plans(args, plans):
     """Keep the plans of confirmations that begin now, {key: Plan}, and the command."""
     command = {name: getattr(args, name) for name in ("algos", "envs", "words", "extra_words")}
     path = file_of(args.runs_dir)
-    kept = load(args.runs_dir)
-    new = {key: plan._asdict() for key, plan in plans.items() if key not in kept["plans"]}
-    if not new and command in kept["commands"][-1:]:
-        return
+    new = {key: plan._asdict() for key, plan in plans.items()}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with rewritten(path) as file:  # another command may write at the same time
             kept = load(args.runs_dir)
-            kept["plans"] = new | kept["plans"]
             others = [one for one in kept["commands"] if one != command]
-            kept["commands"] = [*others, command][-KEPT:]
+            kept = {"commands": [*others, command], "plans": new | kept["plans"]}
             json.dump(kept, file, indent=1)
     except OSError as error:
         fail(f"--runs-dir: cannot write {path}: {error.strerror}")

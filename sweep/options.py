@@ -1,13 +1,12 @@
 """The arguments of benchmark.sh that name a grid; `./benchmark.sh --help` explains them."""
 
 import argparse
-import difflib
 import os
 import re
 from pathlib import Path
 
 from analysis.errors import fail
-from noisy_wrappers import canonical_env_id, read_test_noise, safe_name, split_noises
+from noisy_wrappers import canonical_env_id, read_test_noise, split_noises
 from sweep import scripts
 from sweep.grid import ENVS, PRESETS, SEEDS, rate
 
@@ -24,209 +23,6 @@ GIVEN_BY_THE_GRID = {  # options of the scripts, and those of the sweep that set
 }
 OF_ANY_CHOICE = {"--algos", "--envs", "--runs-dir"}  # what a status needs to find a choice
 MOST_SEEDS = 100_000  # of one option
-LISTS = ["--algos", "--envs", "--noises", "--noise-rates", "--seeds", "--baseline-seeds"]
-
-
-def parse_args(view, caller, argv):
-    """Return the grid's arguments.
-
-    Also, for each algorithm: `scripts`, its Script; `given_words`, the options after the "--", and
-    `extra`, their words for its commands: see scripts.read_words; `exp_names`, of its runs.
-
-    Exits with one line about the first argument that no run could be started with.
-    """
-    parser = argparse.ArgumentParser(prog="benchmark.sh", add_help=False, allow_abbrev=False)
-    parser.error = lambda message: fail(message.removeprefix("argument "))
-    parser.add_argument("preset", nargs="?")
-    parser.add_argument("--algos", nargs="+", type=str.lower, default=list(SEEDS))
-    parser.add_argument("--envs", nargs="+", default=ENVS)
-    parser.add_argument("--noises", nargs="+", type=entry, default=[])
-    parser.add_argument("--noise-rates", nargs="+", type=rate, default=[])
-    parser.add_argument("--seeds", nargs="+", type=seeds)
-    parser.add_argument("--total-timesteps", type=whole_number, default=1_000_000)
-    parser.add_argument("--runs-dir", default="runs")
-    parser.add_argument("--baseline-seeds", nargs="+", type=seeds)
-    parser.add_argument("--exclude", nargs="+", action="extend", type=entry, default=[])
-    parser.add_argument("--budget", type=whole_number)
-    parser.add_argument("--confirm", type=whole_number, default=25)
-    parser.add_argument("--looks", type=whole_number)
-    parser.add_argument("--metric", choices=("return", "success_rate"), default="return")
-    split = argv.index("--") if "--" in argv else len(argv)
-    words, extra = argv[:split], argv[split + 1 :]
-    preset = words[0] if words and not words[0].startswith("--") else None
-    if preset not in PRESETS and not (preset is None and view == "status"):
-        named = words[0] if words else ""
-        fail(f"unknown preset {named!r}; choose one of {', '.join(PRESETS)}")
-    extra = [*PRESETS.get(preset, {}).get("options", []), *extra]
-    known = flags(parser)
-    given = {word.partition("=")[0] for word in words if word.startswith("--")}
-    for name in sorted(given.difference(known)):
-        fail(unknown_option(name, known))
-    for name in LISTS:
-        if sum(word.partition("=")[0] == name for word in words) > 1:
-            fail(f"{name} is there twice: put all its values after one of them")
-    parser.set_defaults(**{"pairs": []} | PRESETS.get(preset, {}))
-    args = parser.parse_args(words)
-    if view == "status" and preset == "choose" and given <= OF_ANY_CHOICE and not extra:
-        kept = kept_words(args, given, caller)
-        if kept and kept != words:
-            return parse_args(view, caller, kept)
-    if args.preset != preset:
-        fail(f"the preset comes first: {args.preset} --...")
-    args.view, args.caller, args.given = view, caller, given
-    args.words, args.extra_words = without_folder(words), extra
-    args.jobs, args.elsewhere = machines()
-    args.runs_dir = from_project(caller, args.runs_dir)
-    args.metric = args.metric.replace("_", " ")
-    args.default_noises = not given & {"--noises"}
-    if args.noises == [[("paper", None)]]:
-        args.pairs, args.noises = PRESETS["paper"]["pairs"], []
-    # a status that names no grid is one of whatever the folder holds
-    whole_folder = preset in (None, "custom") and given <= {"--runs-dir"}
-    args.names_grid = view != "status" or not whole_folder
-    if args.names_grid:
-        check(args, extra)
-    return args
-
-
-def kept_words(args, given, caller):
-    """Return the words of the choice that a status without further options is about, or None."""
-    from sweep import memory  # and with it SciPy: nothing else should wait for that
-
-    algos = args.algos if "--algos" in given else []
-    envs = args.envs if "--envs" in given else []
-    kept = memory.words_of_choice(from_project(caller, args.runs_dir), algos, envs)
-    return kept and [*kept[0], "--runs-dir", args.runs_dir, *(["--", *kept[1]] if kept[1] else [])]
-
-
-def without_folder(words):
-    """Return the words of a command without --runs-dir and its value."""
-    kept = []
-    for word, previous in zip(words, ["", *words], strict=False):
-        if word.partition("=")[0] != "--runs-dir" and previous != "--runs-dir":
-            kept.append(word)
-    return kept
-
-
-def check(args, words):
-    """Exit with one line about an argument that is wrong; give environments their full names.
-
-    words: for the scripts.
-    """
-    args.algos = list(dict.fromkeys(args.algos))
-    args.scripts = {name: scripts.find(name, args.caller) for name in args.algos}
-    try:
-        args.envs = list(dict.fromkeys(map(canonical_env_id, args.envs)))
-    except ValueError as error:
-        fail(f"--envs: {error}")
-    if len(set(map(safe_name, args.envs))) < len(args.envs):
-        fail("--envs: two of these would have the same folders; rename one, or take them apart")
-    for name in ("--exclude", "--budget", "--confirm", "--looks", "--metric"):
-        if name in args.given and args.preset != "choose":
-            fail(f"{name} is an option of choose")
-    if args.preset == "choose" and not {"--algos", "--envs"} <= args.given:
-        fail("choose needs --algos and --envs: it chooses a noise for each of them")
-    for name in args.given & {"--seeds", "--baseline-seeds"}:
-        if args.preset == "choose":
-            fail(f"choose picks its own seeds: leave out {name}; see --budget and --confirm")
-    if args.total_timesteps < 1:
-        fail(f"--total-timesteps must be at least 1, not {args.total_timesteps}")
-    check_words(args, words)
-
-
-def check_words(args, words):
-    """Read the words after the "--"; exit about those that belong to the grid, or to no script."""
-    for word in words:
-        if re.search(r"[\t\n]", word):
-            fail(f"{word!r}: a command is one line, so its words have no tabs and ends of lines")
-    for flag in (word.partition("=")[0].replace("_", "-") for word in words):
-        if flag in GIVEN_BY_THE_GRID:
-            fail(f"{flag} is part of the grid: use {GIVEN_BY_THE_GRID[flag]}, before the --")
-        if flag == "--overwrite":
-            fail("--overwrite would start interrupted runs afresh: delete their folders instead")
-    read = {name: scripts.read_words(script, words) for name, script in args.scripts.items()}
-    args.given_words = {name: given for name, (given, _) in read.items()}
-    args.extra = {name: command for name, (_, command) in read.items()}
-    for given in args.given_words.values():
-        given |= spelt_as_stored(given)
-    args.exp_names = {
-        name: " ".join(args.given_words[name].get("exp_name", [script.exp_name]))
-        for name, script in args.scripts.items()
-    }
-    if len(set(args.exp_names.values())) < len(args.algos):
-        fail(
-            "--exp-name: several algorithms would write into the same folders: name one algorithm "
-            "with --algos, or leave --exp-name out and use another --runs-dir"
-        )
-
-
-def spelt_as_stored(given):
-    """Return the options about the noise of tests as a run stores them."""
-    if "test_noise" not in given:
-        return {}
-    try:
-        rates = list(map(rate, given.get("test_noise_rate", [])))
-        test = read_test_noise(given["test_noise"], rates)
-    except ValueError as error:
-        fail(f"--test-noise: {error}")
-    return dict(zip(("test_noise", "test_noise_rate"), map(list, test.texts), strict=True))
-
-
-def machines():
-    """Return how many runs go on at a time, None if unknown, and whether on other machines.
-
-    benchmark.sh, which reads the executor's options, tells it by environment variables.
-    """
-    jobs, hosts = os.environ.get("SWEEP_JOBS"), os.environ.get("SWEEP_HOSTS")
-    elsewhere = bool(hosts) or os.environ.get("SWEEP_EXECUTOR") == "slurm"
-    if jobs:
-        return int(jobs) * (hosts.count(",") + 1 if hosts else 1), elsewhere
-    return None if elsewhere else len(os.sched_getaffinity(0)), elsewhere
-
-
-def flags(parser):
-    """Return the options of a parser."""
-    return [f"--{name.replace('_', '-')}" for name in vars(parser.parse_args([]))]
-
-
-def unknown_option(name, known):
-    """Say what to write instead of an option that the grid does not have."""
-    ours = [scripts.read(path) for path in scripts.scripts_in(scripts.PROJECT).values()]
-    of_scripts = {scripts.spelt(option) for script in ours for option in script.options}
-    of_scripts -= GIVEN_BY_THE_GRID.keys()
-    if name in of_scripts:
-        return f"{name} is an option of the scripts: put it at the end, after --"
-    if name in EXECUTOR_OPTIONS:  # benchmark.sh reads it, unless it is written with a value
-        return f"{name} takes no value"
-    near = difflib.get_close_matches(name, [*known, *EXECUTOR_OPTIONS], n=1)
-    hint = f"did you mean {near[0]}?" if near else "./benchmark.sh --help lists them"
-    return f"unknown option {name}; {hint}"
-
-
-def from_project(caller, text):
-    """Return a path that counts from the caller's folder as one that counts from the project's.
-
-    A relative one stays so where it lies in the project: it means the same on other machines.
-    """
-    if not text:
-        fail("--runs-dir must name a folder")
-    path = os.path.normpath(os.path.join(caller, os.path.expanduser(text)))
-    if not os.path.isabs(text) and Path(path).is_relative_to(os.getcwd()):
-        path = os.path.relpath(path)
-    if not re.fullmatch(r"[^-\t\n][^\t\n]*", path):
-        fail("--runs-dir must be a path without tabs and newlines that begins with no dash")
-    try:
-        os.stat(path)
-    except FileNotFoundError:
-        pass
-    except OSError as error:
-        fail(f"--runs-dir: {path}: {error.strerror}")
-    return path
-
-
-def from_caller(args, path):
-    """Return a path that counts from the project's folder as the caller can paste it."""
-    return str(path) if args.caller == os.getcwd() else os.path.abspath(path)
 
 
 def whole_number(text):
@@ -248,8 +44,7 @@ def seeds(text):
         reason = f"takes numbers and ranges, separated by spaces: 1 2 3 or 1-3, not {text!r}"
         raise argparse.ArgumentTypeError(reason)
     if last - first >= MOST_SEEDS:
-        reason = f"{text!r} is more than {MOST_SEEDS:,} seeds"
-        raise argparse.ArgumentTypeError(reason)
+        raise argparse.ArgumentTypeError(f"{text!r} is more than {MOST_SEEDS:,} seeds")
     return range(first, last + 1)
 
 
@@ -266,3 +61,176 @@ def entry(text):
         reason = f"{text!r}: give each of these noises a rate with @, or none of them"
         raise argparse.ArgumentTypeError(reason)
     return pairs
+
+
+SEVERAL = {"nargs": "+", "action": "extend"}
+OPTIONS = {  # their defaults, and how argparse reads them
+    "algos": (list(SEEDS), SEVERAL | {"type": str.lower}),
+    "envs": (ENVS, SEVERAL),
+    "noises": ([], SEVERAL | {"type": entry}),
+    "noise_rates": ([], SEVERAL | {"type": rate}),
+    "seeds": (None, SEVERAL | {"type": seeds}),
+    "baseline_seeds": (None, SEVERAL | {"type": seeds}),
+    "total_timesteps": (1_000_000, {"type": whole_number}),
+    "runs_dir": ("runs", {}),
+    "exclude": ([], SEVERAL | {"type": entry}),
+    "budget": (None, {"type": whole_number}),
+    "confirm": (25, {"type": whole_number}),
+    "looks": (None, {"type": whole_number}),
+    "metric": ("return", {"choices": ("return", "success_rate")}),
+}
+
+
+def parse_args(view, caller, argv):
+    """Return the grid's arguments.
+
+    Also, for each algorithm: `scripts`, its Script; `given_words`, the options after the "--", and
+    `extra`, their words for its commands: see scripts.read_words; `exp_names`, of its runs.
+
+    Exits with one line about the first argument that no run could be started with.
+    """
+    given_only = {"argument_default": argparse.SUPPRESS}
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, **given_only)
+    parser.error = lambda message: fail(message.removeprefix("argument "))
+    for name, (_, how) in OPTIONS.items():
+        parser.add_argument(scripts.spelt(name), **how)
+    split = argv.index("--") if "--" in argv else len(argv)
+    words, extra = argv[:split], argv[split + 1 :]
+    preset = words[0] if words and not words[0].startswith("--") else None
+    if preset not in PRESETS and not (preset is None and view == "status"):
+        named = words[0] if words else ""
+        fail(f"unknown preset {named!r}; choose one of {', '.join(PRESETS)}")
+    found, unknown = parser.parse_known_args(words[preset is not None :])
+    if unknown:
+        fail(unknown_option(unknown[0].partition("=")[0]))
+    given = {scripts.spelt(name) for name in vars(found)}
+    defaults = {"pairs": [], "options": []} | {name: value for name, (value, _) in OPTIONS.items()}
+    args = argparse.Namespace(**defaults | PRESETS.get(preset, {}) | vars(found))
+    args.preset, args.view, args.caller, args.given = preset, view, caller, given
+    args.runs_dir = from_project(caller, args.runs_dir)
+    if view == "status" and preset == "choose" and given <= OF_ANY_CHOICE and not extra:
+        kept = kept_words(args)
+        if kept and kept != words:
+            return parse_args(view, caller, kept)
+    args.words, args.extra_words = words, [*args.options, *extra]
+    args.jobs = runs_at_a_time()
+    args.metric = args.metric.replace("_", " ")
+    args.default_noises = "--noises" not in given
+    if args.noises == [[("paper", None)]]:
+        args.pairs, args.noises = PRESETS["paper"]["pairs"], []
+    # a status that names no grid is one of whatever the folder holds
+    whole_folder = preset in (None, "custom") and given <= {"--runs-dir"}
+    args.names_grid = view != "status" or not whole_folder
+    if args.names_grid:
+        check(args)
+    return args
+
+
+def kept_words(args):
+    """Return the words of the choice that a status without further options is about, or None."""
+    from sweep import memory  # and with it SciPy: nothing else should wait for that
+
+    algos = args.algos if "--algos" in args.given else []
+    envs = args.envs if "--envs" in args.given else []
+    kept = memory.words_of_choice(args.runs_dir, algos, envs)
+    return kept and [*kept[0], "--runs-dir", args.runs_dir, *(["--", *kept[1]] if kept[1] else [])]
+
+
+def check(args):
+    """Exit with one line about an argument that is wrong; give environments their full names."""
+    args.algos = list(dict.fromkeys(args.algos))
+    args.scripts = {name: scripts.find(name, args.caller) for name in args.algos}
+    try:
+        args.envs = list(dict.fromkeys(map(canonical_env_id, args.envs)))
+    except ValueError as error:
+        fail(f"--envs: {error}")
+    for name in ("--exclude", "--budget", "--confirm", "--looks", "--metric"):
+        if name in args.given and args.preset != "choose":
+            fail(f"{name} is an option of choose")
+    if args.preset == "choose" and not {"--algos", "--envs"} <= args.given:
+        fail("choose needs --algos and --envs: it chooses a noise for each of them")
+    for name in args.given & {"--seeds", "--baseline-seeds"}:
+        if args.preset == "choose":
+            fail(f"choose picks its own seeds: leave out {name}; see --budget and --confirm")
+    if args.total_timesteps < 1:
+        fail(f"--total-timesteps must be at least 1, not {args.total_timesteps}")
+    check_words(args)
+
+
+def check_words(args):
+    """Read the words after the "--"; exit about those that belong to the grid, or to no script."""
+    for word in args.extra_words:
+        if re.search(r"[\t\n]", word):
+            fail(f"{word!r}: a command is one line, so its words have no tabs and ends of lines")
+        flag = word.partition("=")[0].replace("_", "-")
+        if flag in GIVEN_BY_THE_GRID:
+            fail(f"{flag} is part of the grid: use {GIVEN_BY_THE_GRID[flag]}, before the --")
+        if flag == "--overwrite":
+            fail("--overwrite would start interrupted runs afresh: delete their folders instead")
+    read = {
+        name: scripts.read_words(script, args.extra_words) for name, script in args.scripts.items()
+    }
+    args.extra = {name: command for name, (_, command) in read.items()}
+    args.given_words = {name: given | spelt_as_stored(given) for name, (given, _) in read.items()}
+    args.exp_names = {
+        name: " ".join(args.given_words[name].get("exp_name", [script.exp_name]))
+        for name, script in args.scripts.items()
+    }
+    if len(set(args.exp_names.values())) < len(args.algos):
+        fail(
+            "--exp-name: several algorithms would write into the same folders: name one algorithm "
+            "with --algos, or leave --exp-name out and use another --runs-dir"
+        )
+
+
+def spelt_as_stored(given):
+    """Return the options about the noise of tests as a run stores them."""
+    if "test_noise" not in given:
+        return {}
+    try:
+        rates = list(map(rate, given.get("test_noise_rate", [])))
+        noises, rates = read_test_noise(given["test_noise"], rates).texts
+    except ValueError as error:
+        fail(f"--test-noise: {error}")
+    return {"test_noise": list(noises), "test_noise_rate": list(rates)}
+
+
+def runs_at_a_time():
+    """Return how many runs go on at a time, None if unknown.
+
+    benchmark.sh, which reads the executor's options, tells it by environment variables.
+    """
+    jobs, hosts = os.environ.get("SWEEP_JOBS"), os.environ.get("SWEEP_HOSTS")
+    if jobs:
+        return int(jobs) * (hosts.count(",") + 1 if hosts else 1)
+    elsewhere = hosts or os.environ.get("SWEEP_EXECUTOR") == "slurm"
+    return None if elsewhere else len(os.sched_getaffinity(0))
+
+
+def unknown_option(name):
+    """Say what to write instead of an option that the grid does not have."""
+    ours = [scripts.read(path) for path in scripts.scripts_in(scripts.PROJECT).values()]
+    of_scripts = {scripts.spelt(option) for script in ours for option in script.options}
+    if name in of_scripts - GIVEN_BY_THE_GRID.keys():
+        return f"{name} is an option of the scripts: put it at the end, after --"
+    known = [*map(scripts.spelt, OPTIONS), *EXECUTOR_OPTIONS]
+    hint = scripts.did_you_mean(name, known) or "; ./benchmark.sh --help lists them"
+    return f"unknown option {name}{hint}"
+
+
+def from_project(caller, text):
+    """Return a path that counts from the caller's folder as one that counts from the project's.
+
+    A relative one stays so where it lies in the project: it means the same on other machines.
+    """
+    path = os.path.normpath(os.path.join(caller, os.path.expanduser(text)))
+    if not os.path.isabs(text) and Path(path).is_relative_to(os.getcwd()):
+        path = os.path.relpath(path)
+    if not text or not re.fullmatch(r"[^-\t\n][^\t\n]*", path):
+        fail("--runs-dir must be a path without tabs and newlines that begins with no dash")
+    return path
+
+
+def from_caller(args, path):
+    """Return a path that counts from the project's folder as the caller can paste it."""
+    return str(path) if args.caller == os.getcwd() else os.path.abspath(path)

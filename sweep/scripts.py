@@ -5,6 +5,7 @@ option means, and whether a value is good, the script says itself.
 """
 
 import ast
+import contextlib
 import difflib
 import functools
 import hashlib
@@ -19,22 +20,14 @@ PROJECT = Path(__file__).resolve().parent.parent
 ENDING = "_continuous_noisy.py"  # of a script's file name; what stands before it is the algorithm
 
 
-class Option(NamedTuple):
-    """A field of a script's Args."""
-
-    kind: str  # its annotation, as text
-    default: Any = None
-    has_default: bool = False  # is the default known? An expression is not: only the script knows
-
-
 class Script(NamedTuple):
     """A training script."""
 
-    algorithm: str  # in lower case, as on a command line
     path: str  # as a command names it: relative in the project's folder
-    options: dict[str, Option]
+    options: dict[str, str]  # the fields of its Args, each with its annotation
+    defaults: dict[str, Any]  # those that are known: an expression, only the script knows
     sha256: str  # of its text
-    constants: dict[str, int]  # whole numbers that it defines
+    eval_frequency: int | None  # steps between tests where a run names none, if it tells
 
     @property
     def file(self):
@@ -44,14 +37,7 @@ class Script(NamedTuple):
     @property
     def exp_name(self):
         """The name of the experiment that it gives its runs by default."""
-        option = self.options.get("exp_name", Option(""))
-        return option.default if option.has_default else self.file.removesuffix(".py")
-
-    @property
-    def defaults(self):
-        """The defaults that are known: {argument: value}."""
-        known = self.options.items()
-        return {name: option.default for name, option in known if option.has_default}
+        return self.defaults.get("exp_name", self.file.removesuffix(".py"))
 
 
 def find(algorithm, caller):
@@ -74,15 +60,8 @@ def find(algorithm, caller):
 @functools.cache
 def scripts_in(folder):
     """Return the training scripts of a folder: {algorithm: path}."""
-    found = {}
-    try:
-        for path in sorted(folder.glob(f"*{ENDING}")):
-            name = path.name.removesuffix(ENDING)
-            if re.fullmatch(r"\w+", name):
-                found.setdefault(name.lower(), path)
-    except OSError:  # a folder that may not be listed
-        pass
-    return found
+    paths = sorted(folder.glob(f"*{ENDING}"))
+    return {path.name.removesuffix(ENDING).lower(): path for path in paths}
 
 
 @functools.cache
@@ -96,44 +75,26 @@ def read(path):
     classes = {node.name: node for node in nodes if isinstance(node, ast.ClassDef)}
     if "Args" not in classes:
         fail(f"{path} has no class Args, whose fields are a script's options")
+    fields = [node for node in classes["Args"].body if isinstance(node, ast.AnnAssign)]
+    constants = [node for node in nodes if isinstance(node, ast.Assign)]
+    frequency = known({node.targets[0]: node.value for node in constants}).get("EVAL_FREQUENCY")
     inside = path.is_relative_to(PROJECT)
     return Script(
-        algorithm=path.name.removesuffix(ENDING).lower(),
         path=str(path.relative_to(PROJECT) if inside else path),
-        options=fields(classes, "Args"),
+        options={field.target.id: ast.unparse(field.annotation).strip("'\"") for field in fields},
+        defaults=known({field.target: field.value for field in fields}),
         sha256=hashlib.sha256(content).hexdigest(),
-        constants=dict(constants(nodes)),
+        eval_frequency=frequency if type(frequency) is int else None,
     )
 
 
-def fields(classes, name):
-    """Return the fields of a dataclass {name: Option}, those of its bases in this file first."""
-    found = {}
-    for base in classes[name].bases:
-        if isinstance(base, ast.Name) and base.id in classes and base.id != name:
-            found |= fields(classes, base.id)
-    for node in classes[name].body:
-        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-            kind = ast.unparse(node.annotation).strip("'\"")
-            found[node.target.id] = Option(kind, *literal(node.value))
-    return found
-
-
-def literal(node):
-    """Return the value of an expression and True, or None and False where it is no literal."""
-    try:
-        return ast.literal_eval(node), True
-    except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
-        return None, False
-
-
-def constants(nodes):
-    """Yield (name, number) of the whole numbers that a module defines."""
-    for node in nodes:
-        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-            value, is_known = literal(node.value)
-            if is_known and type(value) is int:
-                yield node.targets[0].id, value
+def known(assignments):
+    """Return {name: value} of those assignments {target: expression} that have a literal."""
+    values = {}
+    for target, expression in assignments.items():
+        with contextlib.suppress(ValueError, TypeError, SyntaxError):
+            values[ast.unparse(target)] = ast.literal_eval(expression)
+    return values
 
 
 # ------------------------------------------------------------------------- words of a command line
@@ -142,12 +103,12 @@ def constants(nodes):
 def read_words(script, words):
     """Read a script's options from the words after "--".
 
-    Returns {argument: its words, or True or False of a switch}, and the words for the command, with
-    whole numbers such as 1e6 written out. Exits with one line about a name that the script does not
-    have: a typing error is not worth 9,100 failed runs.
+    Returns {argument: its words, or True or False of a switch}, and the words for the command.
+    Exits with one line about a name that the script does not have: a typing error is not worth
+    9,100 failed runs.
     """
     given, command = {}, []
-    switches = {name for name, option in script.options.items() if option.kind == "bool"}
+    switches = {name for name, kind in script.options.items() if kind == "bool"}
     flags = {spelt(name): name for name in script.options}
     flags |= {f"--no-{spelt(name)[2:]}": name for name in switches}
     for word in words:
@@ -160,15 +121,13 @@ def read_words(script, words):
             given[name] = flag == spelt(name) if name in switches else []
             command.append(flag)
             if equals:
-                value = whole(value, script.options[name].kind)
                 given[name] = [value]
                 command[-1] += f"={value}"
         elif not given:
             fail(f"{script.file} has no option {word}; after -- comes the name of an option")
         else:
-            value = whole(word, script.options[name].kind)
-            given[name] = [*given[name], value] if isinstance(given[name], list) else [value]
-            command.append(value)
+            given[name] = [*given[name], word] if isinstance(given[name], list) else [word]
+            command.append(word)
     return given, command
 
 
@@ -181,16 +140,6 @@ def did_you_mean(flag, flags):
 def spelt(name):
     """Return how an argument is written on a command line."""
     return f"--{name.replace('_', '-')}"
-
-
-def whole(text, kind):
-    """Write a whole number such as 1e6 with digits, where a script wants one."""
-    if not re.search(r"\bint\b", kind) or re.search(r"\b(float|str)\b", kind):
-        return text
-    try:
-        return str(int(float(text))) if "e" in text.lower() and float(text).is_integer() else text
-    except (ValueError, OverflowError):
-        return text
 
 
 def is_same(value, words):

@@ -25,30 +25,16 @@ UNITS = {"return": "", SUCCESS: POINTS}  # of a difference, by the metric
 
 
 def before_a_batch(found, args):
-    """Return lines that say, before a batch starts, what it is for and what all of it will take.
+    """Return lines that say, before a batch starts, what is due and what all of it will take.
 
-    They also say what gain can be confirmed; before any run only in standard deviations.
+    Before any run, they also say what gain can be confirmed.
     """
     if not any(choice.state.due for choice in found):
         return []
-    lines = []
+    lines = [*map(describe, found), total(found, args)]
     if not any(choice.returns for choice in found):
-        lines += [question(choice) for choice in found]
-    lines += [*map(describe, found), total(found, args)]
-    lines += filter(None, (detectable_gain(choice, args) for choice in found))
-    place = from_caller(args, args.runs_dir)
-    return [*dict.fromkeys(lines), f"runs, logs and the verdict are stored in {place}"]
-
-
-def question(choice):
-    """Say what a choice will decide, and how."""
-    which = f"the best of {choice.number} configurations" if choice.number > 1 else "the noise"
-    *early, last = choice.plan.looks
-    looks = f", or fewer: after {', '.join(map(str, early))} it may be clear" if early else ""
-    return (
-        f"{choice.name}: is {which} better than no noise? {last} fresh seeds of each will decide"
-        f"{looks}"
-    )
+        lines += dict.fromkeys(detectable_gain(choice.plan) for choice in found)
+    return [*lines, f"runs, logs and the verdict are stored in {from_caller(args, args.runs_dir)}"]
 
 
 def total(found, args):
@@ -69,25 +55,17 @@ def total(found, args):
             runs = [len(choice.state.due), *choice.batches[done:]]
             left.append([number * [choice.run_seconds] for number in runs])
     batches = [sum(batch, []) for batch in itertools.zip_longest(*left, fillvalue=[])]
-    return f"{text}, {time_left(batches, args.jobs, args.elsewhere and not finished)}"
+    return f"{text}, {time_left(batches, args.jobs)}"
 
 
-def detectable_gain(choice, args):
-    """Say what gain the confirmation can show, or nothing once runs are done without a spread."""
-    seeds = choice.plan.looks[-1]
-    gain = detectable_shift(seeds, seeds, nominal_levels(choice.plan)[-1])
-    said = f"{seeds} fresh seeds confirm a true gain of"
-    power = "with 80 % power"
-    if verdicts := shared_level(choice.plan):
-        power += f", where {verdicts} verdicts share the level"
-    if not choice.returns:
-        return f"{said} {gain:.1f} standard deviations over seeds {power}"
-    spread = halving.spread(choice.returns)
-    if not spread > 0:
-        return ""
-    shift = rounded(gain * spread, gain * spread) + UNITS[args.metric]
-    deviations = f"{gain:.1f} standard deviations over seeds in the search"
-    return f"{choice.name}: {said} about {shift} ({deviations}) {power}"
+def detectable_gain(plan):
+    """Say what gain a confirmation can show."""
+    seeds = plan.looks[-1]
+    gain = detectable_shift(seeds, seeds, nominal_levels(plan)[-1])
+    text = f"{seeds} fresh seeds confirm a true gain of {gain:.1f} standard deviations over seeds"
+    verdicts = shared_level(plan)
+    shared = f", where {verdicts} verdicts share the level" if verdicts else ""
+    return f"{text} with 80 % power{shared}"
 
 
 def shared_level(plan):
@@ -119,7 +97,8 @@ def standing(found, args):
     When all choices are finished, these are the verdicts.
     """
     if not any(choice.state.due for choice in found):
-        yield from (sentence_of(choice, args) for choice in found)
+        for choice in found:
+            yield sentence(choice, judge(choice, args), UNITS[args.metric])
         return
     for choice in found:
         yield describe(choice)
@@ -137,37 +116,27 @@ def standing(found, args):
 def report(found, args):
     """Print the verdicts, and write choice.csv; or, where runs are left, what to do about them."""
     if any(choice.state.due for choice in found):
-        print(*(obstacle(choice, len(found)) for choice in found), sep="\n")
+        print(*map(obstacle, found), sep="\n")
         return
-    print(*(sentence_of(choice, args) for choice in found), sep="\n", flush=True)
     rows = []
     for choice in found:
-        verdict = judged(choice, args)
+        verdict = judge(choice, args)
+        print(sentence(choice, verdict, UNITS[args.metric]), flush=True)
         rows += halving.records(*choice.kind, choice.state, choice.returns, verdict.helps)
     write_choice(Path(args.runs_dir, choice_file(args.metric)), rows)
 
 
-def sentence_of(choice, args):
-    """Say what a finished choice found."""
-    [winner] = choice.state.candidates
-    share, unit = shared_level(choice.plan), UNITS[args.metric]
-    return sentence(choice.name, winner, choice.number, judged(choice, args), share, unit)
-
-
-def judged(choice, args):
+def judge(choice, args):
     """Return the Verdict of a finished choice; a rate of success is one of so many episodes."""
     episodes = next(iter(choice.runs.values())).number("eval_episodes", 10)
     episodes = episodes if args.metric == SUCCESS else None
     return halving.judge(choice.state, choice.plan, choice.returns, episodes)
 
 
-def sentence(name, winner, number, verdict, share=0, unit=""):
-    """Say in one plain sentence what came out.
-
-    name: the algorithm and the environment. number: of configurations that were searched. share:
-    how many verdicts share the level. unit: of the difference.
-    """
-    comparison = verdict.comparison
+def sentence(choice, verdict, unit=""):
+    """Say in one plain sentence what a choice has found; unit: of the difference."""
+    [winner] = choice.state.candidates
+    comparison, share = verdict.comparison, shared_level(choice.plan)
     seeds = f"{verdict.seeds} fresh seeds"
     if verdict.seeds < verdict.planned:
         seeds = f"stopped after {verdict.seeds} of {verdict.planned} planned fresh seeds"
@@ -176,17 +145,18 @@ def sentence(name, winner, number, verdict, share=0, unit=""):
     if verdict.needed < LEVEL:
         evidence += f", needed: {two_digits(verdict.needed)}"
         evidence += f" (level shared by {share} verdicts)" if share else ""
-    none = f"none of {number} configurations could be shown to help; the best of them, {winner}"
-    said = none if number > 1 else f"{winner} could not be shown to help"
+    said = f"{winner} could not be shown to help"
+    if choice.number > 1:
+        said = f"none of {choice.number} configurations could be shown to help; "
+        said += f"the best of them, {winner}"
     if verdict.helps:
         said = f"{winner} beats no noise"
     elif verdict.significant:
-        said = (
-            f"{none}, is worse than no noise" if number > 1 else f"{winner} is worse than no noise"
-        )
+        said = f"{said}, is worse" if choice.number > 1 else f"{winner} is worse"
+        said += " than no noise"
     else:
         evidence += excluded(comparison, unit)
-    return f"{name}: {said}: {evidence}.{borderline(verdict)}"
+    return f"{choice.name}: {said}: {evidence}.{borderline(verdict)}"
 
 
 def borderline(verdict):
@@ -198,8 +168,8 @@ def borderline(verdict):
     return f" Borderline: the interval {'excludes' if excludes_zero else 'includes'} zero."
 
 
-def obstacle(choice, choices):
-    """Say that a choice of so many cannot continue, and what to do."""
+def obstacle(choice):
+    """Say that a choice cannot continue, and what to do."""
     if not choice.state.due:
         return f"{describe(choice)}; the verdict comes with the others"
     failed = [run for run in choice.state.due if not choice.runs[run].damage]
@@ -211,7 +181,6 @@ def obstacle(choice, choices):
     for noise in dict.fromkeys(noise for noise, _ in failed if noise != BASELINE):
         excluded = "+".join(f"{name}@{rate}" for name, rate in zip(*noise.texts, strict=True))
         text += f'\n  If it fails every time, leave it out: --exclude "{excluded}"'
-        text += " (of all choices of the command, finished ones too)" if choices > 1 else ""
     return text
 
 

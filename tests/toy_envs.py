@@ -46,18 +46,20 @@ class Push(gym.Env):
 
 
 class Count(gym.Env):
-    """Observes the step, 1.0 is every reward; `break_at` gives NaN from that step of the run on."""
+    """Observes the step; 1.0 is every reward. `breaks` gives NaN from step 70 of the run on."""
 
     observation_space = Box(-np.inf, np.inf, (1,), np.float32)
     action_space = Box(-1.0, 1.0, (1,), np.float32)
 
-    def __init__(self, shape=(1,), break_reward_at=np.inf, break_observation_at=np.inf):
+    def __init__(self, shape=(1,), breaks=""):
         self.observation_space = Box(-np.inf, np.inf, shape, np.float32)
-        self.break_reward_at, self.break_observation_at = break_reward_at, break_observation_at
-        self.total = 0
+        self.breaks, self.total = breaks, 0
+
+    def value(self, name, whole):
+        return np.nan if self.breaks == name and self.total >= 70 else whole
 
     def observe(self):
-        value = np.nan if self.total >= self.break_observation_at else self.steps
+        value = self.value("observation", self.steps)
         return np.full(self.observation_space.shape, value, np.float32)
 
     def reset(self, *, seed=None, options=None):
@@ -67,8 +69,7 @@ class Count(gym.Env):
 
     def step(self, action):
         self.steps, self.total = self.steps + 1, self.total + 1
-        reward = np.nan if self.total >= self.break_reward_at else 1.0
-        return self.observe(), reward, False, False, {}
+        return self.observe(), self.value("reward", 1.0), False, False, {}
 
 
 class Other(Count):
@@ -91,24 +92,15 @@ class Category(Other):
 
 
 class Buggy(Count):
-    """Its author made a mistake, in the constructor, in reset or in step."""
+    """Its author made a mistake, in the constructor or in step."""
 
     def __init__(self, where):
         super().__init__()
-        self.where = where
-        self.mistake("constructor")
-
-    def mistake(self, where):
-        if where == self.where:
+        if where == "constructor":
             {}["missing"]
 
-    def reset(self, **kwargs):
-        self.mistake("reset")
-        return super().reset(**kwargs)
-
     def step(self, action):
-        self.mistake("step")
-        return super().step(action)
+        return {}["missing"]
 
 
 class Parts(Count):
@@ -133,14 +125,13 @@ class Parts(Count):
 class Endless(Count):
     """Ends its episodes after `length` steps, and never without; it declares no time limit."""
 
-    def __init__(self, length=np.inf, truncated=False):
+    def __init__(self, length=np.inf):
         super().__init__()
-        self.length, self.truncated = length, truncated
+        self.length = length
 
     def step(self, action):
         observation, reward, _, _, info = super().step(action)
-        ends = self.steps >= self.length
-        return observation, reward, ends and not self.truncated, ends and self.truncated, info
+        return observation, reward, self.steps >= self.length, False, info
 
 
 class Slow(Count):
@@ -149,18 +140,6 @@ class Slow(Count):
     def step(self, action):
         time.sleep(0.005)
         return super().step(action)
-
-
-class OneReset(Count):
-    """Its author forgot something when an episode begins anew."""
-
-    resets = 0
-
-    def reset(self, **kwargs):
-        self.resets += 1
-        if self.resets == 2:
-            raise RuntimeError("the window is open already")
-        return super().reset(**kwargs)
 
 
 class Talks(Count):
@@ -200,17 +179,15 @@ def register(name, entry_point, steps, **kwargs):
     gym.register(f"{name}-v0", entry_point, max_episode_steps=steps, kwargs=kwargs)
 
 
-sequence = gym.spaces.Sequence(Box(-1.0, 1.0, (2,)))
 register("Tiny", Tiny, 8)
 register("Push", Push, 20)
 register("Count", Count, 8)
 register("Square", Count, 8, shape=(2, 2))
-register("NanReward", Count, 8, break_reward_at=70)
-register("NanObservation", Count, 8, break_observation_at=70)
+register("NanReward", Count, 8, breaks="reward")
+register("NanObservation", Count, 8, breaks="observation")
 register("DictObservation", Parts, 8)
 register("OneHotObservation", Parts, 8, categories=True)
 register("CategoryObservation", Category, 8, observation_space=gym.spaces.Discrete(3))
-register("SequenceObservation", Other, 8, observation_space=sequence)
 register("Endless", Endless, None)
 register("NoLimit", Endless, None, length=20)
 register("DiscreteAction", Other, 8, action_space=gym.spaces.Discrete(3))
@@ -218,10 +195,8 @@ register("Unbounded", Other, 8, action_space=Box(-np.inf, np.inf, (1,)))
 largest = float(np.finfo(np.float32).max)  # which stands for no bound
 register("FloatMax", Other, 8, action_space=Box(-largest, largest, (1,)))
 register("BuggyConstructor", Buggy, 8, where="constructor")
-register("BuggyReset", Buggy, 8, where="reset")
 register("BuggyStep", Buggy, 8, where="step")
 register("Slow", Slow, 100)
-register("OneReset", OneReset, 8)
 register("Talks", Talks, 8)
 register("IsSuccess", Solves, 8, key="is_success", kind=np.bool_)
 register("Success", Solves, 8, key="success", kind=int)

@@ -85,35 +85,18 @@ def draw_again(rng, shape, values):
     return rng.choice(values, shape)
 
 
-class Returns(dict):
-    """The returns of a choice, drawn when they are looked up."""
-
-    def __init__(self, rng, draw, gain, spread):
-        """The first noise has the gain, and returns with noise `spread` times the deviation."""
-        super().__init__()
-        self.rng, self.draw, self.gain, self.spread = rng, draw, gain, spread
-
-    def __missing__(self, run):
-        """Draw the return of a run."""
-        noise, _ = run
-        value = self.draw(self.rng, ())
-        if noise != BASELINE:
-            value = self.spread * value + self.gain * (noise == NOISES[0])
-        self[run] = float(value)
-        return self[run]
-
-
 NOISES = [Configuration.parse("noise", i) for i in range(90)]
 
 
-def choose(noises, plan, returns):
-    """Make a choice to its end; return its state."""
+def choose(noises, plan, draw_return):
+    """Make a choice to its end, with the returns that are drawn; return its state, and these."""
+    returns = {}
     while True:
         state = halving.advance(NOISES[:noises], 3 * noises, plan, returns)
         if not state.due:
-            return state
-        for run in state.due:
-            returns[run]  # is drawn
+            return state, returns
+        for noise, seed in state.due:
+            returns[noise, seed] = draw_return(noise)
 
 
 TESTS = {}  # of one choice: advance tests the earlier looks again whenever it is asked
@@ -128,14 +111,21 @@ def once(x, y):
 
 
 def simulate(noises, plan, gain, draw=normal, spread=1.0, trials=1000, seed=0):
-    """Return the shares of choices that find the good noise, confirm it, claim any; their runs."""
+    """Return the shares of choices that find the good noise, confirm it, claim any; their runs.
+
+    The first noise has the gain, and returns with noise deviate `spread` times as much.
+    """
     rng, sums = np.random.default_rng(seed), np.zeros(4)
+
+    def draw_return(noise):
+        value = float(draw(rng, ()))
+        return value if noise == BASELINE else spread * value + gain * (noise == NOISES[0])
+
     quick = {"RANDOM_PARTITIONS": PARTITIONS, "partitions": ALL_PARTITIONS}
     with mock.patch.multiple(permutation, **quick), mock.patch.object(looks, "permutation_t", once):
         for _ in range(trials):
             TESTS.clear()
-            returns = Returns(rng, draw, gain, spread)
-            state = choose(noises, plan, returns)
+            state, returns = choose(noises, plan, draw_return)
             claims = halving.judge(state, plan, returns).helps
             found = state.candidates == NOISES[:1]
             sums += found, found and claims, claims, len(returns)

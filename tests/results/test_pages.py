@@ -45,7 +45,4 @@ def test_a_comparison_has_formats(tmp_path, monkeypatch, capsys):
     assert out[0] == "| n | with noise | without | p |"
     assert out[2] == "| 3 + 4 | 1,234.6 ± 2.0 | -9.0 ± 1.0 | 0.012 |"
     assert out[3] == "| – | – | – | 0.5 |"
-
-
-def test_no_minus_zero():
     assert show.formatted("{a:+z.0f}", {"a": "-0.2"}) == "+0"

@@ -9,7 +9,6 @@ import torch._inductor.config
 from check_script import BrokenError, Trial
 
 ROOT = Path(__file__).parents[2]
-IMPORT = ("import contextlib\n", "import contextlib\nimport copy\n")
 
 
 def broken(folder, algorithm, *replacements, name="broken_continuous_noisy.py"):
@@ -29,78 +28,79 @@ def reason(promise, trial):
     return str(error.value)
 
 
-def test_a_script_that_never_learns(tmp_path):
-    trial = broken(tmp_path, "td3", ("if global_step > args.learning_starts:", "if False:"))
-    assert "nothing was updated" in reason(check_script.trains, trial)
+def before(text, line):
+    """Put a line before a text that is indented as it is."""
+    indent = " " * (len(text) - len(text.lstrip()))
+    return text, f"{indent}{line}\n{text}"
 
 
-def test_a_formula_of_acting_alone(tmp_path):
-    old = "actions, _, _ = self(observations, eps)"
-    trial = broken(tmp_path, "sac", (old, old.replace("eps)", "eps)[0].clamp(0.3, 0.4), 0, 0")))
-    assert "actor_loss() learns actions" in reason(check_script.acts, trial)
+MISSING = "put all that training changes into `state`"
+LOSS = "    loss = -q1.mean()\n"
+ACTING = "actions, _, _ = self(observations, eps)"
+LEARNING = "z = (actions - self.actor_mean(observations)"
+INPUTS = "inputs = torch.cat([observations, actions], 1)"
+COMPARED = "self.config = noisy.resumed_run(old, new)"
+IMPORT = before("import contextlib\n", "import copy")
+MISTAKES = {  # the promise, the script and what is said: the texts that are replaced
+    ("trains", "td3", "nothing was updated"): [("if global_step > args.learning_starts:", "if 0:")],
+    ("acts", "sac", "actor_loss() learns actions"): [
+        (ACTING, f"{ACTING}[0].clamp(0.3, 0.4), 0, 0")
+    ],
+    ("trains", "ppo", "acts with one policy"): [(LEARNING, f"{LEARNING}.relu()")],
+    ("trains", "ppo", "and learns another"): [  # acts with a copy that was right at the start
+        IMPORT,
+        before("        self.actor_logstd = nn.", "self.first = copy.deepcopy(self.actor_mean)"),
+        ("in_numpy(self.actor_mean), self", "in_numpy(self.first), self"),
+    ],
+    ("acts", "td3", "actions in training are"): [
+        IMPORT,
+        before("    online_parameters = [*actor", "first_actor = copy.deepcopy(actor)"),
+        ("action = actor.policy(observation, ", "action = first_actor.policy(observation, "),
+    ],
+    ("acts", "sac", "load_policy()"): [
+        IMPORT,
+        before("    target_entropy = -", "first = copy.deepcopy(actor.state_dict())"),
+        ('{"actor": actor.state_dict()}', '{"actor": first}'),
+    ],
+    ("learns", "ppo", "no gradient of critic."): [(" + args.vf_coef * value_loss, c", ", c")],
+    ("learns", "sac", "critic_loss() never changes"): [("Adam(critic.", "Adam(target.")],
+    ("follows", "td3", "network.0.weight of 'target_actor'"): [
+        ("target_parameters = [*target_actor.parameters(), ", "target_parameters = ["),
+        ("online_parameters = [*actor.parameters(), ", "online_parameters = ["),
+    ],
+    ("follows", "sac", "scale of 'target'"): [  # a buffer
+        (INPUTS, f"{INPUTS} / self.scale"),
+        before("        self.networks = nn.", 'self.register_buffer("scale", torch.ones(1))'),
+        before("            curves = update_critic(", "critic.scale += 0.01"),
+    ],
+    ("resumes", "td3", MISSING): [('state |= {"target_actor": target_actor, ', "state |= {")],
+    ("resumes", "ppo", "ask stop()"): [("stopping = stop()", "stopping = 0")],
+    ("tests", "sac", "play in test_env"): [("noisy.play(test_env, ", "noisy.play(env, ")],
+    ("compiles", "td3", "of actor_loss() by"): [
+        before(LOSS, "q1 = q1 * (1.001 if torch.compiler.is_compiling() else 1.0)")
+    ],
+    ("compiles", "td3", "not compiled"): [before(LOSS, "torch._dynamo.graph_break()")],
+    ("options", "ppo", "it holds a run with begun"): [
+        before("    num_steps: int = 2048", "begun: float = time.time()")
+    ],
+    ("options", "ppo", "leave resumed_run() in Run"): [(COMPARED, "self.config = new")],
+    ("evaluates", "ppo", "let load_policy() build"): [
+        ("    return make_policy(agent, obs", "    return make_policy(Agent(env), obs")
+    ],
+    ("analyses", "ppo", "eval.csv"): [('self.eval_csv += f"{due},', 'self.eval_csv += f"first,')],
+}
+SLOW = ("compiles", "evaluates", "analyses")
 
 
-def test_a_formula_of_learning_alone(tmp_path):
-    old = "z = (actions - self.actor_mean(observations)) / self"
-    trial = broken(tmp_path, "ppo", (old, old.replace("(observations)", "(observations).relu()")))
-    assert "acts with one policy and learns another" in reason(check_script.trains, trial)
-
-
-def test_acting_with_a_copy_that_was_right_at_the_start(tmp_path):
-    setup = "        self.actor_logstd = nn.Parameter"
-    copied = (setup, "        self.first = copy.deepcopy(self.actor_mean)\n" + setup)
-    acting = ("in_numpy(self.actor_mean), self", "in_numpy(self.first), self")
-    trial = broken(tmp_path, "ppo", IMPORT, copied, acting)
-    assert "acts with one policy and learns another" in reason(check_script.trains, trial)
-
-
-def test_acting_with_an_old_copy(tmp_path):
-    setup = "    online_parameters = [*actor"
-    acting = "action = actor.policy(observation, eps)"
-    copied = (setup, "    first_actor = copy.deepcopy(actor)\n" + setup)
-    trial = broken(tmp_path, "td3", IMPORT, copied, (acting, "action = first_" + acting[9:]))
-    assert "actions in training are" in reason(check_script.acts, trial)
-
-
-def test_saving_another_network(tmp_path):
-    setup, saved = "    target_entropy = -", '{"actor": actor.state_dict()}'
-    copied = (setup, "    first = copy.deepcopy(actor.state_dict())\n" + setup)
-    trial = broken(tmp_path, "sac", IMPORT, copied, (saved, '{"actor": first}'))
-    assert "load_policy()" in reason(check_script.acts, trial)
-
-
-def test_a_network_that_the_loss_does_not_use(tmp_path):
-    old = " + args.vf_coef * value_loss, curves"
-    trial = broken(tmp_path, "ppo", (old, ", curves"))
-    assert "no gradient of critic." in reason(check_script.learns, trial)
-
-
-def test_an_optimizer_of_another_network(tmp_path):
-    old = "q_optimizer = torch.optim.Adam(critic."
-    trial = broken(tmp_path, "sac", (old, old.replace("critic", "target")))
-    assert "critic_loss() never changes" in reason(check_script.learns, trial)
-
-
-def test_targets_that_never_move(tmp_path):
-    old = "target_parameters = [*target_actor.parameters(), *target_critic.parameters()]"
-    trial = broken(tmp_path, "td3", (old, old.replace("*target_actor.parameters(), ", "")))
-    trial.path.write_text(trial.path.read_text().replace("[*actor.parameters(), *cri", "[*cri"))
-    assert "network.0.weight of 'target_actor'" in reason(check_script.follows, trial)
-
-
-def test_targets_that_never_move_in_their_buffers(tmp_path):
-    networks = "        self.networks = nn."
-    buffer = '        self.register_buffer("scale", torch.ones(1))\n'
-    inputs = "        inputs = torch.cat([observations, actions], 1)"
-    learning = "            curves = update_critic("
-    trial = broken(
-        tmp_path,
-        "sac",
-        (networks, buffer + networks),
-        (inputs, inputs + " / self.scale"),
-        (learning, "            critic.scale += 0.01\n" + learning),
-    )
-    assert "scale of 'target'" in reason(check_script.follows, trial)
+@pytest.mark.parametrize(
+    "mistake",
+    [pytest.param(one, marks=[pytest.mark.slow] * (one[0] in SLOW)) for one in MISTAKES],
+    ids=lambda mistake: f"{mistake[0]}: {mistake[2]}",
+)
+def test_a_promise_is_red_where_it_is_broken(mistake, tmp_path):
+    promise, algorithm, said = mistake
+    trial = broken(tmp_path, algorithm, *MISTAKES[mistake])
+    assert said in reason(getattr(check_script, promise), trial)
 
 
 def test_something_is_missing_in_the_state_where_episodes_are_short(tmp_path):
@@ -108,57 +108,7 @@ def test_something_is_missing_in_the_state_where_episodes_are_short(tmp_path):
     old = '"q_optimizer": q_optimizer, "actor_optimizer": actor_optimizer}'
     trial = broken(tmp_path, "td3", (old, '"actor_optimizer": actor_optimizer}'))
     trial.options = ["--max-episode-steps", "5"]
-    assert "put all that training changes into `state`" in reason(check_script.resumes, trial)
-
-
-def test_something_is_missing_in_the_state(tmp_path):
-    old = 'state |= {"target_actor": target_actor, "target_critic": target_critic}'
-    trial = broken(tmp_path, "td3", (old, 'state |= {"target_critic": target_critic}'))
-    assert "put all that training changes into `state`" in reason(check_script.resumes, trial)
-
-
-def test_a_run_that_does_not_stop(tmp_path):
-    trial = broken(tmp_path, "ppo", ("stopping = stop()", "stopping = 0"))
-    assert "ask stop()" in reason(check_script.resumes, trial)
-
-
-def test_tests_that_train(tmp_path):
-    trial = broken(tmp_path, "sac", ("noisy.play(test_env, ", "noisy.play(env, "))
-    assert "play in test_env" in reason(check_script.tests, trial)
-
-
-@pytest.mark.slow
-def test_a_compiled_loss_that_is_another(tmp_path):
-    old = "loss = -q1.mean()\n"
-    new = "q1 = q1 * (1.001 if torch.compiler.is_compiling() else 1.0)\n    " + old
-    trial = broken(tmp_path, "td3", (old, new))
-    assert "of actor_loss() by" in reason(check_script.compiles, trial)
-
-
-@pytest.mark.slow
-def test_a_loss_that_cannot_be_compiled(tmp_path):
-    old = "loss = -q1.mean()\n"
-    trial = broken(tmp_path, "td3", (old, "torch._dynamo.graph_break()\n    " + old))
-    assert "not compiled" in reason(check_script.compiles, trial)
-
-
-@pytest.mark.slow
-@torch._inductor.config.patch({"cpp.cxx": ("no-such-compiler",)})
-def test_no_compiler(tmp_path, monkeypatch):
-    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "cache"))
-    assert "no C++ compiler" in check_script.compiles(broken(tmp_path, "td3"))
-
-
-def test_an_option_whose_default_changes(tmp_path):
-    old = "    num_steps: int = 2048"
-    trial = broken(tmp_path, "ppo", (old, "    begun: float = time.time()\n" + old))
-    assert "it holds a run with begun" in reason(check_script.options, trial)
-
-
-def test_options_that_are_not_compared(tmp_path):
-    old = "self.config = noisy.resumed_run(old, new)"
-    trial = broken(tmp_path, "ppo", (old, "self.config = new"))
-    assert "leave resumed_run() in Run" in reason(check_script.options, trial)
+    assert MISSING in reason(check_script.resumes, trial)
 
 
 @pytest.mark.slow
@@ -168,18 +118,10 @@ def test_a_name_that_the_sweep_does_not_know(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_policy_that_is_loaded_otherwise(tmp_path):
-    old = "    return make_policy(agent, observation_stats, env)"
-    new = "    return make_policy(Agent(env), observation_stats, env)"
-    trial = broken(tmp_path, "ppo", (old, new))
-    assert "let load_policy() build" in reason(check_script.evaluates, trial)
-
-
-@pytest.mark.slow
-def test_tests_that_are_not_stored(tmp_path):
-    old = 'self.eval_csv += f"{due},'
-    trial = broken(tmp_path, "ppo", (old, old.replace("{due}", "first")))
-    assert "eval.csv" in reason(check_script.analyses, trial)
+@torch._inductor.config.patch({"cpp.cxx": ("no-such-compiler",)})
+def test_no_compiler(tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "cache"))
+    assert "no C++ compiler" in check_script.compiles(broken(tmp_path, "td3"))
 
 
 def test_a_line_for_each_promise(tmp_path, capsys, monkeypatch):

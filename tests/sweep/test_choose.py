@@ -4,7 +4,6 @@ import contextlib
 import csv
 import io
 import math
-import multiprocessing
 import os
 import re
 from pathlib import Path
@@ -15,15 +14,14 @@ import numpy as np
 import pytest
 import simulate_choose
 import stub_run
-from views import view
+from views import batches, view
 
-from analysis.choice import CHOICE_COLUMNS
 from analysis.formatting import rounded
 from analysis.statistics import compare, contrast
 from noisy_wrappers import BASELINE, Configuration
-from sweep import choose, telling
+from sweep import choose, halving, telling
 from sweep.environment import Environment, remember
-from sweep.halving import FIRST_CONFIRMATION_SEED, Verdict, advance, judge, records, sizes_of_rounds
+from sweep.halving import FIRST_CONFIRMATION_SEED, State, Verdict, advance, judge
 from sweep.looks import Plan, bounds, futility_limits, looks_after, nominal_levels
 from sweep.options import parse_args
 
@@ -63,14 +61,14 @@ def draw(rng, effects):
 
 
 def test_schedule():
-    assert sizes_of_rounds(1, 3) == []
-    assert sizes_of_rounds(2, 6) == [(2, 3)]
+    rounds = halving.sizes_of_rounds
+    assert rounds(1, 3) == [] and rounds(2, 6) == [(2, 3)]
     # The shares of two rounds are 12 * 2 / (2 + 1.41) = 7.03 runs and 4.97: 1.8 and 2.5 a noise.
-    assert sizes_of_rounds(4, 12) == [(4, 2), (2, 2)]
-    assert sizes_of_rounds(5, 15) == [(5, 1), (3, 2), (2, 2)]
-    assert sizes_of_rounds(90, 270) == [(90, 1), (45, 1), (23, 2), (12, 3), (6, 4), (3, 5), (2, 6)]
-    assert sizes_of_rounds(16, 16) == [(16, 1), (8, 1), (4, 1), (2, 1)]  # never less than one seed
-    assert len(sizes_of_rounds(64, 640)) == 6 and len(sizes_of_rounds(65, 640)) == 7
+    assert rounds(4, 12) == [(4, 2), (2, 2)]
+    assert rounds(5, 15) == [(5, 1), (3, 2), (2, 2)]
+    assert rounds(90, 270) == [(90, 1), (45, 1), (23, 2), (12, 3), (6, 4), (3, 5), (2, 6)]
+    assert rounds(16, 16) == [(16, 1), (8, 1), (4, 1), (2, 1)]  # never less than one seed
+    assert len(rounds(64, 640)) == 6 and len(rounds(65, 640)) == 7
 
 
 def test_advance_by_hand():
@@ -109,17 +107,6 @@ def test_equal_scores_are_decided_by_the_order_given():
     assert play(noises, 15, table)[0].rounds[1].survivors == noises[:2]
 
 
-def test_a_planted_noise_is_found_and_confirmed():
-    rng = np.random.default_rng(0)
-    for _ in range(10):
-        effects = np.zeros(90)
-        best = rng.integers(90)
-        effects[best] = 1.5  # five standard deviations of a seed
-        state, returns = play(named(90), 270, draw(rng, effects))
-        assert state.candidates == [named(90)[best]]
-        assert judge(state, ONE_LOOK, returns).helps
-
-
 def test_the_choice_is_as_good_as_a_grid_of_ten_seeds():
     rng, chosen, grid = np.random.default_rng(0), [], []
     for _ in range(150):
@@ -143,6 +130,7 @@ def test_bounds_of_obrien_and_fleming():
     assert bounds(*FIVE_LOOKS) == pytest.approx([4.877, 3.357, 2.680, 2.290, 2.031], abs=5e-4)
     assert bounds((25,), 0.05) == pytest.approx([1.95996], abs=1e-5)
     assert nominal_levels(FIVE_LOOKS)[-1] == pytest.approx(0.0423, abs=1e-4)
+    assert looks_after(25) == FIVE_LOOKS.looks and looks_after(50, 3) == (17, 34, 50)
     assert bounds((20, 40), 0.05) == pytest.approx([2.963, 1.969], abs=1e-3)
 
 
@@ -152,11 +140,6 @@ def test_all_looks_together_keep_the_level():
     for level in (0.05, 0.0125):
         passed = (np.abs(z) >= bounds(FIVE_LOOKS.looks, level)).any(axis=1).mean()
         assert passed == pytest.approx(level, rel=0.03)
-
-
-def test_looks_after():
-    assert [looks_after(n) for n in (25, 9, 12)] == [(5, 10, 15, 20, 25), (9,), (6, 12)]
-    assert looks_after(25, 1) == (25,) and looks_after(50, 3) == (17, 34, 50)
 
 
 def test_futility_by_hand():
@@ -216,13 +199,11 @@ def test_advance_gives_the_same_whenever_it_is_asked():
 
 
 @pytest.mark.parametrize(
-    ("gain", "draw", "share", "runs"),
-    [(0, "normal", (0.005, 0.05), (27, 35)), (1, "normal", (0.88, 0.97), (31, 39))],
+    ("gain", "share", "runs"), [(0, (0.005, 0.05), (27, 35)), (1, (0.88, 0.97), (31, 39))]
 )
-def test_the_simulation_of_a_confirmation(gain, draw, share, runs):
+def test_the_simulation_of_a_confirmation(gain, share, runs):
     """A small one of tools/simulate_choose.py, whose tables are in docs/statistics.md."""
-    draw = simulate_choose.DRAWS[draw]
-    _, _, claims, used = simulate_choose.simulate(1, simulate_choose.FIVE, gain, draw, trials=300)
+    _, _, claims, used = simulate_choose.simulate(1, simulate_choose.FIVE, gain, trials=300)
     assert share[0] <= claims <= share[1] and runs[0] <= used <= runs[1]
 
 
@@ -235,16 +216,19 @@ GOOD = GOOD._replace(difference_percent=21.0, percent_low=15.0, percent_high=28.
 
 def test_verdicts_in_words():
     noise = Configuration.parse("RandomEarlyTermination(50)", 1.0)
+    state = State([], [noise], range(1001, 1011), [], 1)
+    choice = choose.Choice(("PPO", "Pusher-v5"), 90, ONE_LOOK, [], state, {}, {}, None)
 
-    def said(comparison, noises=90, share=0, seeds=10, planned=10, needed=0.05):
-        verdict = Verdict(comparison, seeds, planned, needed)
-        return telling.sentence("PPO on Pusher-v5", noise, noises, verdict, share)
+    def said(comparison, noises=90, level=0.05, planned=10, needed=0.05):
+        verdict = Verdict(comparison, 10, planned, needed)
+        of = choice._replace(number=noises, plan=Plan((planned,), level))
+        return telling.sentence(of, verdict)
 
     assert said(GOOD) == (
         "PPO on Pusher-v5: RandomEarlyTermination(50) at 1.0 beats no noise: 10 fresh seeds, "
         "+11.8 [8.4, 15.3] (+21 % [15, 28]), p = 0.011."
     )
-    early = said(GOOD, planned=25, needed=0.0126, share=3)
+    early = said(GOOD, planned=25, needed=0.0126, level=0.05 / 3)
     assert ": stopped after 10 of 25 planned" in early and "level shared by 3 verdicts" in early
     unclear = GOOD._replace(p=0.07, difference_low=-1.0, percent_low=-2.0)
     assert "none of 90 configurations could be shown to help; the best" in said(unclear)
@@ -255,28 +239,12 @@ def test_verdicts_in_words():
     assert not Verdict(bad, 10, 10, 0.05).helps and not Verdict(GOOD, 10, 10, 0.01).helps
 
 
-def test_records_of_choice_csv():
-    table = np.arange(4.0)[:, None] + np.zeros(SEARCH_SEEDS + CONFIRM)
-    state, returns = play(named(3), 3, table)
-    lines = records("PPO", "X", state, returns, helped=False)
-    assert [" ".join(map(str, line)) for line in lines] == [
-        "PPO X search 1 noise 0.0 1 0.0 no",
-        "PPO X search 1 noise 1.0 1 1.0 yes",
-        "PPO X search 1 noise 2.0 1 2.0 yes",
-        "PPO X search 2 noise 1.0 2 1.0 no",
-        "PPO X search 2 noise 2.0 2 2.0 yes",
-        "PPO X confirmation   0.0 10 3.0 ",
-        "PPO X confirmation  noise 2.0 10 2.0 no",
-    ]
-
-
 # THE RUN FOLDERS
 
 
 def arguments(text, tmp_path):
     words = ["--total-timesteps", "4000", *text.split(" | "), "--runs-dir", str(tmp_path)]
-    args = parse_args("status", "/", ["choose", *words])
-    return args
+    return parse_args("status", "/", ["choose", *words])
 
 
 def conclude(args):
@@ -284,19 +252,6 @@ def conclude(args):
     with contextlib.redirect_stdout(io.StringIO()) as out:
         telling.report(choose.choices(args), args)
     return out.getvalue().splitlines()
-
-
-def batches(args):
-    """Run a choice to its end in this process; returns the names of its folders, batch by batch."""
-    found = []
-    while True:
-        choices = choose.choices(args)
-        due = [choice.runs[run] for choice in choices for run in choice.state.due]
-        if not due:
-            return found
-        found.append({run.folder.name for run in due})
-        for run in due:
-            stub_run.train(run.command)
 
 
 def train_due(args, number=None):
@@ -328,13 +283,17 @@ def test_two_algorithms_and_environments_at_once(tmp_path):
     assert set().union(*found) == {path.name for path in tmp_path.glob("*/*__*")}
     sentences = conclude(args)
     assert [sentence.partition(":")[0] for sentence in sentences] == [
-        f"{algorithm} on {env}"
-        for algorithm in ("PPO", "SAC")
-        for env in ("Pendulum-v1", "MountainCarContinuous-v0")
+        "PPO on Pendulum-v1",
+        "PPO on MountainCarContinuous-v0",
+        "SAC on Pendulum-v1",
+        "SAC on MountainCarContinuous-v0",
     ]
     assert all("(level shared by 4 verdicts)" in sentence for sentence in sentences)
     lines = read(tmp_path / "choice.csv")
     assert len(lines) == 4 * (3 + 2 + 2)
+    survivors = [line["survives"] for line in lines[:5]]  # of three noises two, of these one
+    assert (survivors[:3].count("yes"), survivors[3:].count("yes")) == (2, 1)
+    assert [line["seeds"] for line in lines[:7]] == ["1", "1", "1", "2", "2", "5", "5"]
     assert {line["noise_rate"] for line in lines} == {"0.0", "1.0", "0.3 + 1.0:0.0"}
     for line in lines:  # a run counts with its last two tests of ten
         noise = Configuration.parse(line["noise"], line["noise_rate"])
@@ -361,10 +320,8 @@ def test_a_noise_is_chosen_by_the_rate_of_success(tmp_path):
         rates[noise] = 100 * np.mean(np.array(runs)[:, -2:] > 100)
         assert float(line["score"]) == pytest.approx(rates[noise])
     gain = rates.pop(noise) - rates.pop(BASELINE)
-    found = re.search(
-        r"5 fresh seeds, ([-+][\d.]+) \[.*\] percentage points of success, p", verdict
-    )
-    assert float(found[1]) == pytest.approx(gain, abs=0.5) and abs(gain) > 5
+    pattern = r"5 fresh seeds, ([-+][\d.]+) \[.*\] percentage points of success, p"
+    assert float(re.search(pattern, verdict)[1]) == pytest.approx(gain, abs=0.5) and abs(gain) > 5
     assert "(80 %" in verdict or " %" not in verdict  # never percent of a rate
     returns = arguments(f"--algos | ppo | --envs | {env_id} | {THREE}", tmp_path)
     assert "percentage points" not in conclude(returns)[0]
@@ -380,9 +337,9 @@ def test_choose_by_success_needs_an_environment_that_tells_it(tmp_path, capsys):
     told = "PPO on Pendulum-v1: it tells no `is_success` or `success`, as --metric success_rate"
     assert f"warning: {told}" in capsys.readouterr().err
     alone = text.replace(" | toy_envs:Success-v0", "")
-    with pytest.raises(SystemExit) as exit_:
+    with pytest.raises(SystemExit):
         choose.choices(arguments(f"{alone} | {THREE}", tmp_path))
-    assert exit_.value.code == 2 and f"error: {told}" in capsys.readouterr().err
+    assert f"error: {told}" in capsys.readouterr().err
 
 
 def test_a_run_that_tells_no_success_had_none(tmp_path):
@@ -415,7 +372,7 @@ def test_the_readme_says_what_it_takes_by_default(tmp_path):
         words = ["choose", "--algos", algorithm, "--envs", "Hopper", "--runs-dir", str(tmp_path)]
         args = parse_args("status", "/", words)
         known = Environment(0.05e-3, 200, 1000, 11, True, {})
-        remember(args.runs_dir, "Hopper-v5", known)
+        remember(args, "Hopper-v5", known)
         choices = choose.choices(args)
         assert telling.total(choices, args).startswith(f"at most {runs} runs, ")
         assert runs * choices[0].run_seconds / 3600 == pytest.approx(announced, rel=0.1)
@@ -428,71 +385,33 @@ def test_the_default_noises_and_those_of_the_paper(tmp_path):
         return choice.state.candidates
 
     assert len(tried()) == 22 and {noise.noise_rate for noise in tried()} == {"0.05", "1.00"}
-    assert len({noise.noise for noise in tried()}) == 11
     additive = [n.noise for n in tried() if re.match("RandomNormal|RandomUniformNoisy", n.noise)]
     assert len(additive) == 10 and all("relative=True" in noise for noise in additive)
-    assert [str(noise) for noise in tried("--noise-rates", "0.2")] == [
-        f"{noise.noise} at 0.2" for noise in tried()[::2]
-    ]
+    assert len(tried("--noise-rates", "0.2")) == 11
     assert len(tried("--noises", "paper")) == 90
     assert len(tried("--noises", "paper", "--noise-rates", "0.2")) == 15
 
 
-def test_what_a_report_advises(tmp_path, capsys):
+def test_what_a_report_advises(tmp_path):
     args = arguments(f"--algos | ppo | --envs | Pendulum-v1 | {THREE}", tmp_path)
-
-    def said():
-        capsys.readouterr()
-        telling.report(choose.choices(args), args)
-        return capsys.readouterr().out
-
-    out = said()  # where nothing finishes, it is not the noise
+    out = "\n".join(conclude(args))  # where nothing finishes, it is not the noise
     assert "leave PPO on Pendulum-v1 out: see --algos and --envs" in out and "--exclude" not in out
-    train_due(args, 1)
-    assert said().count("--exclude") == 3
-    choice = train_due(args)  # where one is damaged, it is not to be retried
+    choice = train_due(args, 1)
     path = choice.runs[choice.state.due[0]].folder / "eval.csv"
-    path.write_text(path.read_text()[:-1])
-    assert said().endswith("runs to do: 1.\n")
-
-
-def test_an_excluded_noise_is_no_other_choice(tmp_path):
-    words = f"--algos | ppo | --envs | Pendulum-v1 | {THREE}"
-    train_due(arguments(words, tmp_path))
-    # as `report` prints it, a line for each noise that fails
-    excluded = f"{words} | --exclude | {A}@1 | --exclude | RandomMixupObservation(0.50)@1.0"
-    [choice] = choose.choices(arguments(excluded, tmp_path))
-    assert choice.number == 1 and not choice.state.rounds
-    [choice] = choose.choices(arguments(excluded.rpartition(" | --exclude")[0], tmp_path))
-    assert choice.number == 2 and len(choice.returns) == 4
+    assert "\n".join(conclude(args)).count("--exclude") == 3
+    train_due(args)
+    path.write_text(path.read_text()[:-1])  # what is damaged is not to be retried
+    assert conclude(args)[-1].endswith("runs to do: 1.")
 
 
 def test_what_the_confirmation_can_show(tmp_path):
-    words = f"--algos | ppo | --envs | Pendulum-v1 | --noises | {A}@1"
-
-    def lines(words):
-        args = arguments(words, tmp_path)
-        plan = telling.before_a_batch(choose.choices(args), args)
-        return [line for line in plan if "fresh seeds confirm" in line]
+    def said(algos):
+        args = arguments(f"--algos | {algos} | --envs | Pendulum-v1 | --noises | {A}@1", tmp_path)
+        return "\n".join(telling.before_a_batch(choose.choices(args), args))
 
     unit = "standard deviations over seeds with 80 % power"
-    assert lines(words) == [f"25 fresh seeds confirm a true gain of 0.8 {unit}"]
-    [line] = lines(words.replace("ppo", "ppo | sac"))
-    assert line.endswith(f" 0.9 {unit}, where 2 verdicts share the level")
-    # Once there is a spread, in the return's own units
-    mixup = "RandomMixupObservation(0.5)"
-    two = f"{words} | {mixup}@1 | --budget | 6 | --confirm | 5"
-    train_due(arguments(two, tmp_path))
-    tests = [
-        [fmean(stub_run.tests_of("ppo", "Pendulum-v1", [n], [1.0], s)[-2:]) for s in (1, 2, 3)]
-        for n in (A, mixup)
-    ]
-    spread = math.sqrt(fmean(np.var(tests, axis=1, ddof=1)))
-    [line] = lines(two)
-    gain, units = re.search(r"of about ([\d.]+) \(([\d.]+) standard deviations over", line).groups()
-    assert float(gain) == pytest.approx(spread * float(units), rel=0.06)
-    train_due(arguments(two, tmp_path), 4)  # fresh seeds change nothing about it
-    assert lines(two) == [line]
+    assert f"\n25 fresh seeds confirm a true gain of 0.8 {unit}\n" in said("ppo")
+    assert f" 0.9 {unit}, where 2 verdicts share the level\n" in said("ppo | sac")
 
 
 @pytest.mark.slow
@@ -505,13 +424,11 @@ def test_what_was_fixed_beforehand_is_kept(tmp_path, capsys, monkeypatch):
         args.view = "list"
         return choose.choices(args)
 
-    arguments(one, tmp_path)
-    assert not (tmp_path / "choice.json").exists()  # a status keeps nothing
     with monkeypatch.context() as patch, pytest.raises(SystemExit):  # a full disk
         patch.setattr(os, "fsync", mock.Mock(side_effect=OSError(28, "No space left on device")))
         listed(one)
     assert "choice.json: No space left on device" in capsys.readouterr().err
-    assert not list(tmp_path.glob("*choice.[j0-9]*"))
+    assert not (tmp_path / "choice.json").exists()
     [choice] = listed(f"{one} | --confirm | 10")
     assert choice.plan == Plan((5, 10), 0.05)
     for other in ("--confirm | 20", "--looks | 1 | --confirm | 10"):
@@ -522,8 +439,6 @@ def test_what_was_fixed_beforehand_is_kept(tmp_path, capsys, monkeypatch):
     first, second = listed(two)  # an environment is added
     assert first.plan == choice.plan and second.plan == Plan((5, 10, 15, 20, 25), 0.025)
     assert listed(one)[0].plan == choice.plan
-    by_success = "--envs | toy_envs:Success-v0 | --metric | success_rate"
-    assert listed(one.replace("--envs | Pendulum-v1", by_success))[0].plan.level == 0.05
     (tmp_path / "choice.json").write_text("{")
     with pytest.raises(SystemExit):  # it must not be decided anew
         listed(one)
@@ -564,31 +479,9 @@ def test_another_choice_keeps_the_lines_of_the_first(tmp_path):
     before = read(tmp_path / "choice.csv")
     batches(second)
     for _ in range(2):
-        [sentence] = conclude(second)
-        assert sentence.startswith(f"SAC on Pendulum-v1: {A} at 1.0 ")
+        conclude(second)
         lines = read(tmp_path / "choice.csv")
         assert lines[:-2] == before and len(lines) == 4
-
-
-@pytest.mark.slow
-def test_two_commands_that_end_side_by_side_keep_each_others_lines(tmp_path, monkeypatch):
-    path = tmp_path / "choice.csv"
-    line = ("x",) * len(CHOICE_COLUMNS)
-    replace = os.replace
-    fork = multiprocessing.get_context("fork")
-    second = fork.Process(target=telling.write_choice, args=(path, [line]))
-
-    def replace_late(temporary, path):
-        monkeypatch.undo()
-        second.start()
-        second.join(timeout=1)  # the second has written by now, or waits for the first
-        replace(temporary, path)
-
-    monkeypatch.setattr(os, "replace", replace_late)
-    telling.write_choice(path, [("first", *line[1:])])
-    second.join()
-    assert second.exitcode == 0
-    assert [found["algorithm"] for found in read(path)] == ["first", "x"]
 
 
 def test_status_says_who_survives(tmp_path, monkeypatch):
@@ -601,9 +494,6 @@ def test_status_says_who_survives(tmp_path, monkeypatch):
     noises.sort(key=score)  # the best is given last, and named first
     text = "--algos | ppo | --envs | Pendulum-v1 | --noise-rates | 1 | --confirm | 4 | --budget | 7"
     args = arguments(f"{text} | --noises | {' | '.join(noises)}", tmp_path)
-    line, total = telling.standing(choose.choices(args), args)
-    assert total == "15 runs in all, 7 to search and 8 to confirm; 0 done"
-    assert line == "PPO on Pendulum-v1, round 1 of 2: 3 of 3 configurations, seed 1; runs to do: 3"
     train_due(args)
     assert list(telling.standing(choose.choices(args), args)) == [
         "PPO on Pendulum-v1, round 2 of 2: 2 of 3 configurations, seeds 1 to 3; runs to do: 4",

@@ -13,19 +13,18 @@ from collections import Counter
 from importlib import import_module
 from pathlib import Path
 
-import gymnasium as gym
 import pytest
 import tyro
 from views import ROOT, finish, folders, locked, log_of, view
 
 import noisy_wrappers
-from sweep import options, scripts
-from sweep.grid import MOST_BASELINES
+from analysis import logs
+from sweep import scripts
 
 ALGORITHMS = {"sac": 5, "td3": 5, "ppo": 10}  # seeds
 SCALE = "RandomUniformScaleReward(0.5, 1.5)"
 A = "RandomNormalNoisyReward(1)"
-MAKEFILE = ROOT / "Makefile"
+ENDING = "_continuous_noisy"
 C = "choose --algos ppo --envs Hopper-v5"
 GRID = ["--algos", "sac", "--envs", "Pendulum-v1", "--seeds", "1"]
 
@@ -77,10 +76,6 @@ def test_paper_grid():
         assert of == {seed: 455 for seed in range(1, seeds + 1)}
     assert {line.total_timesteps for line in lines} == {1_000_000}
     assert [line.seed for line in lines] == sorted(line.seed for line in lines)
-    # Seeds differ in their number only, so the first seed stands for all in the next test.
-    for seed in range(2, 11):
-        first = [x.text.replace("--seed 1 ", f"--seed {seed} ") for x in lines if x.seed == 1]
-        assert {line.text for line in lines if line.seed == seed} <= set(first)
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -113,11 +108,9 @@ def test_other_presets():
             assert line.noise_rate == (["0.05"] if scale else ["1.0"])
     demo = {(x.script[:3], x.env_id, x.runs_dir, x.total_timesteps) for x in dry_run("demo")}
     assert demo == {("ppo", "InvertedPendulum-v5", "runs/demo", 20_480)}
-    [noise] = {x.noise[0] for x in dry_run("demo") if x.noise}
-    slug = "RandomNormalNoisyObservation_1.0"
-    picture = f"runs/demo/results/curves_PPO_{slug}.svg"
-    assert noise == "RandomNormalNoisyObservation(1.0)" and picture in MAKEFILE.read_text()
-    assert view("status", *C.split()).out.startswith("runs/choose: ")
+    assert {x.noise[0] for x in dry_run("demo") if x.noise} == {"RandomNormalNoisyObservation(1.0)"}
+    picture = "runs/demo/results/curves_PPO_RandomNormalNoisyObservation_1.0.svg"
+    assert picture in (ROOT / "Makefile").read_text()
 
 
 def test_folders_that_need_care(tmp_path, monkeypatch):
@@ -139,35 +132,14 @@ def test_a_report_quotes_the_folder(tmp_path):
     assert result.code == 1 and "damaged" in result.out and not result.err
 
 
-def test_a_folder_that_no_file_system_can_hold_ends_in_a_line(tmp_path):
-    for words in ("list demo", "status demo", "status"):
-        result = view(*words.split(), "--runs-dir", tmp_path / ("x" * 300))
-        assert result.code == 2 and result.err.count("\n") == 1, result.err
-        assert result.err.startswith("error: --runs-dir: /") and "too long" in result.err
-
-
-def test_a_command_with_a_module_of_the_users_takes_the_path_along(monkeypatch, tmp_path):
-    """No other command does: a file there may have the name of one of Python's modules."""
-    (tmp_path / "my_noises.py").write_text(
-        "import noisy_wrappers\n\n\nclass Sticky(noisy_wrappers.RewardNoise):\n    pass\n"
-    )
-    monkeypatch.syspath_prepend(tmp_path)
+def test_a_command_takes_the_path_of_a_users_modules_along(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", "/own")
-    grid = ["custom", *GRID, "--noise-rates", "1:0", "--noises", "my_noises:Sticky()"]
-    plain, own = view("list", *grid).out.splitlines()[-2:]
-    assert "PYTHONPATH" not in plain and "\tenv PYTHONPATH=/own " in own
-
-
-def test_a_status_of_a_whole_folder_asks_for_no_environment(tmp_path, monkeypatch):
-    finish(tmp_path / "one")
-    monkeypatch.setattr(options, "canonical_env_id", None)
-    shown = view("status", "--runs-dir", tmp_path)
-    assert (shown.code, shown.err) == (0, "") and "1 run: 1 done" in shown.out
+    assert "\tenv PYTHONPATH=/own " in view("list", "demo").out
 
 
 def test_spellings_and_rate_zero_are_one_run():
     noises = ["RandomUniformScaleReward(.5, 1.5)", "RandomUniformScaleReward(0.50, high=1.5)"]
-    grid = ["--algos=SAC", "--envs", "Hopper-v5", "Hopper-v5", "--seeds", "3", "3-4"]
+    grid = ["--algos=SAC", "--envs", "Hopper-v5", "Hopper-v5", "--seeds", "3", "3", "--seeds", "4"]
     lines = dry_run("custom", *grid, "--noises", *noises, "--noise-rates", "0.10", "0", ".1")
     assert [(line.seed, line.noise) for line in lines] == [
         (seed, noise) for seed in (3, 4) for noise in ([], [SCALE])
@@ -178,58 +150,52 @@ def test_rates_of_ones_own():
     cells = ["--noises", f"{A}@0.1+RandomEarlyTermination(50)@1:0", "RandomDropoutObservation(0.9)"]
     cells += ["--noise-rates", "0.5", "1.0:0", "--baseline-seeds", "1"]
     lines = dry_run("custom", *GRID, *cells)
-    early, reward, drop = (
-        "RandomEarlyTermination(50)",
-        "RandomNormalNoisyReward(1.0)",
-        "RandomDropoutObservation(0.9)",
-    )
-    assert [list(zip(line.noise, line.noise_rate, strict=True)) for line in lines] == [
-        [],
-        [(early, "1.0:0.0"), (reward, "0.1")],
-        [(drop, "0.5")],
-        [(drop, "1.0:0.0")],
+    both = ["RandomEarlyTermination(50)", "RandomNormalNoisyReward(1.0)"]
+    drop = ["RandomDropoutObservation(0.9)"]
+    assert [(line.noise, line.noise_rate) for line in lines] == [
+        ([], []),
+        (both, ["1.0:0.0", "0.1"]),
+        (drop, ["0.5"]),
+        (drop, ["1.0:0.0"]),
     ]
-    lines = dry_run("custom", *GRID, "--noises", f"{A}@0.1")
-    assert [line.noise_rate for line in lines] == [[], ["0.1"]]
     assert {x.total_timesteps for x in dry_run("demo", "--total-timesteps", "2.5e3")} == {2500}
 
 
 # FINISHED RUNS
 
 
-def test_status_arithmetic(tmp_path):
-    grid = ["baseline", "--algos", "sac", "--envs", "Hopper-v5", "--seeds", "1-7"]
+def test_states_and_what_is_left(tmp_path, monkeypatch):
+    """Running is what holds the lock, which is only asked for: to take it would end the run."""
+    monkeypatch.delattr(logs.fcntl, "lockf")
+    grid = ["baseline", "--algos", "sac", "--envs", "Hopper-v5", "--seeds", "1-9"]
     grid += ["--total-timesteps", "1000", "--runs-dir", tmp_path]
-    done, running, slow, failed, stopped, lost, deleted = folders(*grid)
+    done, running, silent, elsewhere, future, failed, stopped, lost, deleted = folders(*grid)
     (tmp_path / "logs").mkdir()
     finish(done)
-    for folder, text in {
-        done: "step=1000/1000 sps=200 eval_return=1.0\n# now host: exit=0\n",
-        running: "step=100/1000 sps=100 eta=0:00:09\nstep=200/1000 sps=100 eta=0:00:08\n",
-        slow: "step=200/1000 sps=10 eta=0:01:20\n",
-        failed: "step=600/1000 sps=100\nTraceback\n  x\nValueError: broken\n"
-        "(training stopped)\n# now host: exit=1\n",
-        stopped: "step=500/1000 sps=100\n# now host: exit=143\n",
-        lost: "step=500/1000 sps=100\n",
-        deleted: "step=1000/1000 sps=100\n# now host: exit=0\n",
-    }.items():
-        log_of(folder).write_text("# now host: python sac_continuous_noisy.py --seed 1\n" + text)
-    os.utime(log_of(lost), (time.time() - 300,) * 2)
-    with locked(running):
-        result = view("status", *grid)
-    assert result.code == 0
-    # 800 + 800 + 400 + 500 + 500 + 1000 steps are left. At 200, 100, 10, 100, 100, 100 and 100
-    # steps per second the mean time of a step is 0.155 / 7 seconds; two run at a time: 44.29 s.
-    state = "7 runs: 1 done, 1 running, 1 probably running, 1 failed, 3 to do; "
-    state += "3,000 of 7,000 steps; about 44 s left, 110 steps/s"
-    assert state in result.out
-    assert re.search(rf"exit 1 +{log_of(failed)} +ValueError: broken\n", result.out)
-
-
-def test_an_at_in_a_noises_argument_is_no_rate():
-    keyed = "my_noises:Keyed(1, keys='a@b')"
-    assert options.entry(keyed) == [(keyed, None)]
-    assert options.entry(f"{keyed}@0.5+{A}@1:0") == [(keyed, 0.5), (A, "1:0")]
+    for folder, age, text in (  # age: of the log, in minutes
+        (done, 1, "step=1000/1000 sps=200 eval_return=1.0\n# now host: exit=0\n"),
+        (running, 1, "step=100/1000 sps=100\nstep=200/1000 sps=100 eta=0:00:08\n"),
+        (silent, 14, "step=500/1000 sps=100\ncompiling\n"),
+        (elsewhere, 1, "step=200/1000 sps=10 eta=0:01:20\n"),
+        (future, -999, "step=500/1000 sps=100\n"),  # another machine's clock is wrong
+        (failed, 1, "step=600/1000 sps=100\nValueError: bad\n(stopped)\n# now host: exit=1\n"),
+        (stopped, 1, "step=500/1000 sps=100\n# now host: exit=143\n"),
+        (lost, 5, "step=500/1000 sps=100\n"),
+        (deleted, 1, "step=1000/1000 sps=100\n# now host: exit=0\n"),
+    ):
+        log_of(folder).write_text(f"# now host: python sac_continuous_noisy.py\n{text}")
+        os.utime(log_of(folder), (time.time() - 60 * age,) * 2)
+    with locked(running), locked(silent):
+        status, report = view("status", *grid), view("report", *grid).out
+    # 800 + 500 + 800 + 500 + 400 + 500 + 500 + 1000 steps are left. At 200, 10 and seven times 100
+    # steps per second the mean time of a step is 0.175 / 9 seconds; three run at a time: 32.4 s.
+    state = "9 runs: 1 done, 2 running, 1 probably running, 1 failed, 4 to do; "
+    state += "4,000 of 9,000 steps; about 32 s left, 210 steps/s"
+    assert status.code == 0 and state in status.out
+    assert re.search(rf"exit 1 +{log_of(failed)} +ValueError: bad\n", status.out)
+    assert re.search(rf"silent for 14 min +{log_of(silent)} +compiling", status.out)
+    assert "2 running, 1 failed, 5 to do" in report and report.count("still running") == 2
+    assert not (lost / ".lock").exists()
 
 
 @pytest.fixture
@@ -248,7 +214,6 @@ def one(tmp_path):
         ({"gamma": 0.99}, "--gamma 0.5", "--gamma 0.99, not 0.5"),
         ({"learning_starts": 10}, "", "--learning-starts 10, not 5000"),  # an option of today's
         ({}, "--tau 0.1", "--tau 0.005, not 0.1"),  # an option that the run did not have
-        ({"noise_rates": [0.5]}, "--gamma 0.9", "--gamma 0.99, not 0.9"),
         ({"max_episode_steps": 50}, "--max-episode-steps None", "--max-episode-steps 50, not None"),
     ],
 )
@@ -274,13 +239,7 @@ def test_a_run_with_the_same_arguments_is_done(one):
     grid, folder = one
     made = {"env_id": "Pendulum-v1", "exp_name": "sac_continuous_noisy", "gamma": 0.99, "gone": 1}
     finish(folder, **made, torch_threads=8, compile=False, learning_starts=5000, hidden=[64, 64])
-    same = (
-        "",
-        "--gamma .990",
-        "--learning_starts=5e3 --no-compile --torch-threads 2",
-        "--gamma=99e-2",
-    )
-    for words in same:
+    for words in ("", "--gamma .990", "--learning_starts=5_000 --no-compile --torch-threads 2"):
         shown = view("report", *grid, "--", *words.split())
         assert shown.code == 0 and "1 run: 1 done" in shown.out, shown.out + shown.err
 
@@ -320,24 +279,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-WIDTH = 64
-
 
 @dataclass
-class Base:
-    env_id: str = "Hopper-v5"
-    seed: int = 1
-    total_timesteps: int = 1_000_000
-    noise: tuple[str, ...] = ()
-    noise_rate: tuple[float | str, ...] = ()
-    runs_dir: str = "runs"
-    exp_name: str = Path(__file__).stem
-
-
-@dataclass
-class Args(Base):
+class Args:
     """Arguments."""
 
+    env_id: str = "Hopper-v5"
+    exp_name: str = Path(__file__).stem
     label: str = "plain"
     """A docstring below an option."""
     hidden: tuple[int, ...] = (64, 2 * 32)
@@ -358,26 +306,27 @@ def elsewhere(tmp_path):
 
 
 def test_an_algorithm_is_a_script_of_the_project_or_of_the_callers_folder(elsewhere):
-    grid = ["custom", "--algos", "redq", "sac", "--envs", "Pendulum-v1", "--seeds", "1"]
-    found = view("list", *grid, "--noises", f"{A}@1", "--runs-dir", "r", caller=elsewhere)
-    lines = [line.split("\t") for line in found.out.splitlines()]
-    assert found.code == 0 and len(lines) == 4
-    own = [command for folder, command in lines if folder.endswith("__redq_continuous_noisy")]
-    start = f"env PYTHONPATH={ROOT} {sys.executable} {elsewhere}/redq_continuous_noisy.py --env-id "
-    assert len(own) == 2 and all(command.startswith(start) for command in own)
-    assert all("PYTHONPATH" not in command for _, command in lines if command not in own)
-    unknown = view("list", "custom", "--algos", "dqn", *grid[4:], caller=elsewhere)
-    assert (
-        unknown.code == 2 and f"no dqn_continuous_noisy.py in {ROOT} or {elsewhere}" in unknown.err
-    )
-    assert unknown.err.endswith("; choose from ppo, redq, sac, td3\n")
+    rest = ["--envs", "Pendulum-v1", "--seeds", "1", "--runs-dir", "r"]
+
+    def listed(*algos):
+        return view("list", "baseline", "--algos", *algos, *rest, caller=elsewhere)
+
+    found = listed("redq", "sac")
+    lines = dict(line.split("\t") for line in found.out.splitlines())
+    assert found.code == 0 and len(lines) == 2
+    [own] = [command for folder, command in lines.items() if folder.endswith("__redq" + ENDING)]
+    path = elsewhere / "redq_continuous_noisy.py"
+    assert own.startswith(f"env PYTHONPATH={ROOT} {sys.executable} {path} --env-id ")
+    assert sum("PYTHONPATH" in command for command in lines.values()) == 1
+    unknown = listed("dqn")
+    assert f"no dqn_continuous_noisy.py in {ROOT} or {elsewhere}" in unknown.err
+    assert unknown.code == 2 and unknown.err.endswith("; choose from ppo, redq, sac, td3\n")
     (elsewhere / "sac_continuous_noisy.py").write_text(OWN)  # which one is meant?
     (elsewhere / "bad_continuous_noisy.py").write_text("class Args(:")
     scripts.scripts_in.cache_clear()
-    both = view("list", *grid, caller=elsewhere)
+    both = listed("sac")
     assert both.code == 2 and "differ: give one of them another name" in both.err
-    bad = view("list", "custom", "--algos", "bad", *grid[4:], caller=elsewhere)
-    assert "bad_continuous_noisy.py: " in bad.err
+    assert "bad_continuous_noisy.py: " in listed("bad").err
 
 
 @pytest.mark.parametrize(
@@ -385,28 +334,19 @@ def test_an_algorithm_is_a_script_of_the_project_or_of_the_callers_folder(elsewh
     [
         ("--label text-1 --hidden 32 32", {"label": "text-1", "hidden": [32, 32]}),
         ("--entropy -1e-3 --shift=-2", {"entropy": -0.001, "shift": -2.0}),
-        ("--data /a/b.txt --width 1e6", {"data": "/a/b.txt", "width": 1_000_000}),
+        ("--data /a/b.txt --width 1_000", {"data": "/a/b.txt", "width": 1_000}),
         ("--width None --kind b", {"width": None, "kind": "b"}),
         ("--layer_norm --no-layer_norm", {"layer_norm": False}),
     ],
 )
 def test_options_are_the_scripts_own_business(words, made, elsewhere, tmp_path):
     """Values of any kind pass, and are compared with what the run has stored."""
-    grid = [
-        "baseline",
-        "--algos",
-        "redq",
-        *GRID[2:],
-        "--total-timesteps",
-        "9",
-        "--runs-dir",
-        tmp_path,
-    ]
+    grid = ["baseline", "--algos", "redq", *GRID[2:], "--total-timesteps", "9"]
+    grid += ["--runs-dir", tmp_path]
     listed = view("list", *grid, "--", *words.split(), caller=elsewhere)
     [folder, command] = listed.out.rstrip().split("\t")
     passed = shlex.split(command)[shlex.split(command).index(str(tmp_path)) + 1 :]
-    wanted = words.replace("1e6", "1000000").replace("_", "-").split()
-    assert passed == wanted
+    assert passed == words.replace("--layer_norm --no-layer_", "--layer-norm --no-layer-").split()
     defaults = {"label": "plain", "hidden": [64, 64], "entropy": -0.69, "shift": -0.5, "data": "x"}
     defaults |= {"width": None, "kind": "a", "layer_norm": False, "eval_episodes": 10}
     args = {"env_id": "Pendulum-v1", "exp_name": "redq_continuous_noisy"} | defaults
@@ -416,8 +356,6 @@ def test_options_are_the_scripts_own_business(words, made, elsewhere, tmp_path):
     plain = view("list", *grid, caller=elsewhere)  # without the options
     same = defaults | made == defaults
     assert (plain.code == 0) is same and ("other arguments" in plain.err) is not same
-    other = view("list", *grid, "--", "--label", "other", caller=elsewhere)
-    assert other.code == 2 and "not other" in other.err
 
 
 def test_the_noise_of_tests_is_part_of_a_runs_name(tmp_path):
@@ -433,15 +371,6 @@ def test_the_noise_of_tests_is_part_of_a_runs_name(tmp_path):
     assert folder.name.endswith("__tests_p1.0_NormalNoisyAction_0.1")
 
 
-def test_names_of_options_are_checked_where_nothing_is_to_do(one):
-    grid, folder = one
-    finish(folder, env_id="Pendulum-v1")
-    for words in ("--gama 0.99", "0.99", "--no-gamma"):
-        result = view("list", *grid, "--", *words.split())
-        assert (result.code, result.out) == (2, "")
-        assert f"sac_continuous_noisy.py has no option {words.split()[0]}; " in result.err
-
-
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_what_a_source_tells_is_what_tyro_reads(algorithm):
     script = scripts.find(algorithm, ROOT)
@@ -454,15 +383,11 @@ def test_what_a_source_tells_is_what_tyro_reads(algorithm):
         "--gamma 0.5 --eval_episodes=3 --no-compile --matmul_precision medium",
         "--eval-frequency None",
         "--gamma=.5 --gamma 1 --cuda --no_overwrite --max-episode-steps 1_000",
-        "--checkpoint-frequency 1e5 --eval-frequency=2e3",
     ):
         given, command = scripts.read_words(script, words.split())
         read = vars(tyro.cli(args, args=command))
         assert all(scripts.is_same(read[name], given[name]) for name in given)
-        changed = {name for name, value in read.items() if value != defaults[name]}
-        assert changed <= given.keys() and len(given) == len(
-            set(re.findall(r"--(?:no.)?(\w\w+)", words))
-        )
+        assert {name for name in read if read[name] != defaults[name]} <= given.keys()
 
 
 # HOW MANY RUNS
@@ -485,7 +410,6 @@ def test_baselines_that_pay(noises, more, baselines):
     assert Counter(line.seed for line in lines if line.noise) == dict.fromkeys([1, 2, 3], noises)
     said = "" if baselines == [1, 2, 3] else f" ({len(baselines)} of them without noise)"
     assert view("list", *grid).err == f"{len(lines)} runs{said}, {len(lines)} to do\n"
-    assert max(map(len, [baselines])) <= max(3, MOST_BASELINES * 3)
 
 
 # BAD INPUT
@@ -495,30 +419,19 @@ def test_baselines_that_pay(noises, more, baselines):
     ("args", "message"),
     [
         ("custom --noises Foo(1) --noise-rates 1", "bad noise 'Foo(1)': unknown name; valid are"),
-        (
-            "custom --noises RandomNormalNoisyReward(1)",
-            '--noises needs --noise-rates, or a rate with each noise, as in "NOISE@0.1"',
-        ),
+        (f"custom --noises {A}", "--noises needs --noise-rates, or a rate with each"),
         ("custom --noise-rates 1", "--noise-rates needs --noises that have no rate of their own"),
         (f"custom --noises {A}@1+{A}", "give each of these noises a rate with @, or none"),
         ("paper --budget 5", "--budget is an option of choose"),
         (f"{C} --seeds 1-3", "leave out --seeds"),
-        (
-            f"{C} --noises paper --budget 89",
-            "--budget must be at least 90, a run for each configuration, not 89",
-        ),
+        (f"{C} --noises paper --budget 89", "--budget must be at least 90, a run for each"),
         (f"{C} --budget 100000", "--budget 100000 is too large: the best would run with"),
         (f"{C} Pusher-v5 --confirm 4", "--confirm must be at least 5, not 4: "),
         (f"{C} --exclude {A}@0.3", "--exclude: RandomNormalNoisyReward(1.0) at 0.3 is not among"),
         (f"{C} --exclude {A}", '--exclude needs a rate with each noise, as in "NOISE@0.1"'),
         ("demo --envs nope:Env-v0", "--envs: there is no environment 'nope:Env-v0': No module"),
-        (
-            "demo --seeds 1 2-1",
-            "--seeds: takes numbers and ranges, separated by spaces: 1 2 3 or 1-3",
-        ),
-        ("demo --seeds 1-3 --seeds 7", "--seeds is there twice: put all its values after one of"),
+        ("demo --seeds 1 2-1", "--seeds: takes numbers and ranges"),
         ("demo -- --exp-name a\tb", "'a\\tb': a command is one line, so its words have no tabs"),
-        ("demo -- --exp-name a\nb", "'a\\nb': a command is one line, so its words have no tabs"),
         ("demo --seeds 1-99999999999", "'1-99999999999' is more than 100,000 seeds"),
         (f"{C} --looks 13", "--looks must be from 1 to half of --confirm, not 13"),
         ("best -- --exp-name mine", "--exp-name: several algorithms would write into the same"),
@@ -527,7 +440,8 @@ def test_baselines_that_pay(noises, more, baselines):
         ("demo --runs-dir=-x", "--runs-dir must be a path"),
         ("--algos sac demo", "unknown preset '--algos'"),
         ("demo -- --overwrite", "--overwrite would start interrupted runs afresh"),
-        ("demo --dry-run=1", "--dry-run takes no value"),
+        ("demo -- --gama 0.9", "has no option --gama; did you mean --gamma?"),
+        ("paper -- 0.9", "has no option 0.9; "),
         ("demo --total-timesteps 0", "--total-timesteps must be at least 1, not 0"),
         ("demo -- --seed 2", "--seed is part of the grid: use --seeds, before the --"),
         ("best --algos sac ppo -- --tau 0.1", "ppo_continuous_noisy.py has no option --tau"),
@@ -543,18 +457,10 @@ def test_bad_input(args, message, tmp_path):
     assert not result.out and not list(tmp_path.iterdir())
 
 
-def test_environments_whose_folders_would_be_the_same_are_refused():
-    for name in ("mine/Boat-v0", "mine-Boat-v0"):
-        gym.register(name, "gymnasium.envs.classic_control:PendulumEnv")
-    result = view("list", "baseline", "--envs", "mine/Boat", "mine-Boat")
-    assert result.code == 2 and "two of these would have the same folders" in result.err
-
-
 def test_a_list_of_runs_waits_for_no_heavy_import(monkeypatch):
     """status, watch and the dry run of 9,100 commands answer in a moment."""
     monkeypatch.delenv("MUJOCO_GL", raising=False)  # which is checked by importing MuJoCo
     code = "import sys; from sweep.__main__ import main; main('list', '/', ['demo']); "
-    code += "print(*sys.modules)"
-    command = [sys.executable, "-c", code]
+    command = [sys.executable, "-c", f"{code}print(*sys.modules)"]
     shown = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     assert not {"torch", "scipy", "pandas", "mujoco"} & set(shown.stdout.split())

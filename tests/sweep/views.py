@@ -11,7 +11,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
 
+import stub_run
+
 from noisy_wrappers import __version__
+from sweep import choose
 from sweep.__main__ import main
 
 ROOT = Path(__file__).parents[2]
@@ -65,6 +68,24 @@ def locked(folder):
         holder.stdout.readline()
         yield
         holder.stdin.close()
+
+
+def batches(args):
+    """Make the runs of choices in this process, until none is due but those that fail.
+
+    Returns the names of their folders, batch by batch.
+    """
+    found, failed = [], set()
+    while True:
+        due = [choice.runs[run] for choice in choose.choices(args) for run in choice.state.due]
+        if failed.issuperset(run.folder for run in due):
+            return found
+        found.append({run.folder.name for run in due})
+        for run in due:
+            try:
+                stub_run.train(run.command)
+            except SystemExit:
+                failed.add(run.folder)
 
 
 def log_of(folder):
