@@ -44,8 +44,7 @@ class Given(gym.Env):
     [
         BOX,
         gym.spaces.Box(0, 255, (2, 3), np.uint8),
-        gym.spaces.Dict({"a": BOX, "b": gym.spaces.Discrete(4)}),
-        gym.spaces.Tuple([gym.spaces.MultiBinary(2), BOX]),
+        gym.spaces.Tuple([gym.spaces.Dict({"a": BOX, "b": gym.spaces.Discrete(4)}), BOX]),
         gym.spaces.Discrete(5),
     ],
 )
@@ -70,9 +69,6 @@ def test_noise_goes_beneath_flattening():
     assert layers(noisy) == [*names, "RandomNormalNoisyObservation", "FlattenObservation"]
     got = noisy.reset(seed=0)[0]
     assert (got[:3] != clean[:3]).all() and (got[3:] == clean[3:]).all()
-    image = make_flat(Given(gym.spaces.Box(0, 255, (2, 3), np.uint8)))  # its pixels are as before
-    names = ["FiniteNumbers", "FlattenObservation", "RecordEpisodeStatistics"]
-    assert layers(make_noisy(image, [], [])) == names
 
 
 def test_finite_numbers_look_into_dictionaries():
@@ -98,10 +94,7 @@ def test_make_flat_refuses_what_networks_cannot_take():
             make_flat(Given(BOX, actions))
 
 
-@pytest.mark.parametrize(
-    "reward",
-    [2, np.float32(2), np.array([2.0], np.float32), np.array(2), torch.tensor([2])],
-)
+@pytest.mark.parametrize("reward", [2, np.float32(2), np.array([2.0]), torch.tensor([2])])
 def test_rewards_are_floats(reward):
     env = FiniteNumbers(Given(BOX))
     env.env.reward = reward
@@ -112,30 +105,20 @@ def test_rewards_are_floats(reward):
     assert (terminated, truncated, info) == (True, False, {"some": "info"})
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("bad", [np.nan, -np.inf])
 def test_finite_numbers_stop_at_what_is_not_finite(bad):
     env = make_noisy(make_flat(Given(BOX)), [A], [1.0])  # beneath noise
     for _ in range(2):  # steps are those of the episode
         env.reset()
-        for _ in range(3):
-            env.step(None)
-    env.unwrapped.reward = bad
-    with pytest.raises(NotFiniteError, match=f"step 4 of an episode.*reward {bad}"):
-        env.step(None)
-    env.unwrapped.reward, env.unwrapped.observation = 1.0, np.array([0.5, bad, 0.5])
-    with pytest.raises(NotFiniteError, match=rf"observation \[0.5, {bad}, 0.5\]"):
-        env.step(None)
-    with pytest.raises(NotFiniteError, match="step 0 of an episode"):
-        env.reset()
-
-
-def test_finite_numbers_tell_a_divergence_from_a_broken_environment():
-    env = FiniteNumbers(Given(BOX))
-    env.env.reward = np.nan
-    with pytest.raises(NotFiniteError, match=r"was given the action \[0.0, nan\]"):
-        env.step(np.array([0, np.nan]))
-    with pytest.raises(NotFiniteError, match="returned the reward nan"):
         env.step(np.zeros(2))
+    env.unwrapped.reward = bad
+    with pytest.raises(NotFiniteError, match=f"step 2 of an episode.*returned the reward {bad}"):
+        env.step(np.zeros(2))
+    with pytest.raises(NotFiniteError, match=r"was given the action \[0.0, nan\]"):
+        env.step(np.array([0, np.nan]))  # as after a divergence
+    env.unwrapped.observation = np.array([0.5, bad, 0.5])
+    with pytest.raises(NotFiniteError, match=rf"step 0 .*observation \[0.5, {bad}, 0.5\]"):
+        env.reset()
 
 
 def pendulum():
@@ -174,44 +157,27 @@ def test_an_env_state_continues_what_was_interrupted():
     assert play_on(other, other_rng, 5) == expected
 
 
-def mersenne(seed):
-    return np.random.Generator(np.random.MT19937(seed))
-
-
-@pytest.mark.parametrize("make_generator", [np.random.default_rng, np.random.RandomState, mersenne])
-def test_an_env_state_has_only_pythons_own_types(make_generator):
-    """dm_control's environments have a RandomState, whose state holds an array."""
-    env, rng = pendulum()
-    env.unwrapped.np_random = make_generator(3)
-    play_on(env, rng, 2)
-    env.unwrapped.np_random.normal(size=3)  # a RandomState keeps every second one
-    saved = json.loads(json.dumps(EnvState(env, rng).state_dict()))
-    expected = env.unwrapped.np_random.normal(size=5).tolist()
-    env.unwrapped.np_random = make_generator(4)
-    EnvState(env, rng).load_state_dict(saved)
-    assert env.unwrapped.np_random.normal(size=5).tolist() == expected
-
-
 class Drawing(gym.Env):
-    """Draws from all kinds of generators that are its attributes, and spawns at every reset."""
+    """Draws from all kinds of generators that are its attributes, and spawns at every reset.
 
-    observation_space = gym.spaces.Box(-9, 9, (7,), np.float64)
+    dm_control's environments have a RandomState, whose state holds an array.
+    """
+
+    observation_space = gym.spaces.Box(-9, 9, (6,), np.float64)
     action_space = gym.spaces.Dict(a=gym.spaces.Box(-1, 1, (1,)))
 
     def __init__(self):
         self.goals = gym.spaces.Box(-1, 1, (1,))
-        self.dice = random.SystemRandom()  # nothing can restore it, and nothing fails
         self.gone = weakref.proxy(Drawing.reset.__get__(self))  # of what has been deleted
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         if seed is not None:
-            self.rng, self.old = np.random.default_rng(seed), np.random.RandomState(seed)
-            self.python, self.seeds = random.Random(seed), np.random.SeedSequence(seed)
+            self.rng = np.random.Generator(np.random.MT19937(seed))
+            self.old, self.python = np.random.RandomState(seed), random.Random(seed)
             self.goals.seed(seed)
         drawn = [self.rng.normal(), self.old.normal(), self.python.random()]
         drawn += [self.np_random.spawn(1)[0].normal(), self.rng.spawn(2)[1].normal()]
-        drawn += [np.random.default_rng(self.seeds.spawn(1)[0]).normal()]
         return np.array([*drawn, self.goals.sample()[0]]), {}
 
 
@@ -260,16 +226,6 @@ def test_an_environment_that_ignores_its_seed_is_seeded_all_the_same():
     pendulum, bare = make_flat(gym.make("Pendulum-v1")), gym.make("Pendulum-v1")
     for seed in (3, None, 4):
         np.testing.assert_array_equal(pendulum.reset(seed=seed)[0], bare.reset(seed=seed)[0])
-
-
-def test_an_environments_own_record_gives_way():
-    """Ours has the true return of what is trained in, also where an environment records itself."""
-    inner = gym.wrappers.RecordEpisodeStatistics(gym.make("Pendulum-v1", max_episode_steps=3))
-    env = make_noisy(make_flat(gym.wrappers.TransformReward(inner, lambda r: 1.0)), [A], [1.0])
-    for _ in range(2):
-        env.reset()
-        infos = [env.step(np.zeros(1, np.float32))[4] for _ in range(3)]
-        assert infos[2]["episode"]["l"] == infos[2]["episode"]["r"] == 3
 
 
 def test_an_env_state_of_another_stack_is_refused():
