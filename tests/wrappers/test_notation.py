@@ -197,3 +197,4 @@ def test_what_a_program_has_stored():
 def test_an_entry_is_split_into_its_noises():
     assert split_noises(f"{SCALE}+{SHIFT}") == split_noises(f" {SCALE} + {SHIFT} ")
     assert split_noises("A(1e+5)@1:0+B()@.5") == ["A(1e+5)@1:0", "B()@.5"]
+    assert split_noises("own:A('x + y()')+B()") == ["own:A('x + y()')", "B()"]

@@ -4,13 +4,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from cases import GenericEnv, constant_env, numbered_env, rollout, streams
-from test_nested import GOALS, MIXED, sampled
+from test_nested import GOALS, sampled
 
 from noisy_wrappers import RandomMixupObservation, RandomObservationBias, RandomObservationDelay
 
 
-@pytest.mark.parametrize("rate", [0.4, 1.0])
-@pytest.mark.parametrize("scale", [0.3, (0.3, 0.0, 2.0)])
+@pytest.mark.parametrize(("rate", "scale"), [(0.4, 0.3), (1.0, (0.3, 0.0, 2.0))])
 def test_bias_golden(rate, scale):
     bare = rollout(gym.wrappers.TimeLimit(GenericEnv(), 9), seed=3, steps=200)
     env = RandomObservationBias(gym.wrappers.TimeLimit(GenericEnv(), 9), rate, scale)
@@ -26,10 +25,9 @@ def test_bias_golden(rate, scale):
     assert len({*chosen}) == (1 if rate == 1 else 2)
 
 
-@pytest.mark.parametrize("reuse", [False, True])
-def test_a_delay_by_hand(reuse):
+def test_a_delay_by_hand():
     for delay, seen in [(0, [1, 2, 3, 4, 5]), (2, [1, 1, 1, 2, 3]), (10**6, [1] * 5)]:
-        env = RandomObservationDelay(numbered_env(reuse and delay > 0), 1.0, delay)
+        env = RandomObservationDelay(numbered_env(reuse=delay > 0), 1.0, delay)
         steps = rollout(env, seed=0, steps=4)
         assert [step[0][0] for step in steps] == seen
         steps[0][0][:] = 99  # the agent's copy
@@ -62,8 +60,6 @@ def test_keys_name_the_sensors_that_fail():
             assert seen[t]["desired_goal"] is samples[t]["desired_goal"]
             late = samples[t - 1]["observation"]
             assert (seen[t]["observation"] == late).all() == (wrapper is RandomObservationDelay)
-        env = wrapper(sampled(MIXED)[0], 1.0, *args)
-        assert all(step[0] in env.observation_space for step in rollout(env, seed=0, steps=20))
 
 
 def test_only_a_bias_leaves_the_space():
