@@ -217,6 +217,7 @@ register("DiscreteAction", Other, 8, action_space=gym.spaces.Discrete(3))
 register("Unbounded", Other, 8, action_space=Box(-np.inf, np.inf, (1,)))
 largest = float(np.finfo(np.float32).max)  # which stands for no bound
 register("FloatMax", Other, 8, action_space=Box(-largest, largest, (1,)))
+register("NoEnv", object, 8)
 register("BuggyConstructor", Buggy, 8, where="constructor")
 register("BuggyReset", Buggy, 8, where="reset")
 register("BuggyStep", Buggy, 8, where="step")
