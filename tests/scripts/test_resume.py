@@ -6,7 +6,6 @@ The commands are processes forked from a server (commands.py).
 import functools
 import io
 import os
-import pickle
 import random
 import resource
 import shutil
@@ -188,9 +187,7 @@ KILLS = {
     "the first one written, not on the disk": ("os.fsync", None, die_flushing_checkpoint),
     "the first one on the disk, not in place": ("os.replace", None, Nth("checkpoint", 1, die)),
     "mid-episode, after an evaluation that the checkpoint lacks": (TRAINING_STEP, 80, die),
-    "the next checkpoint half written": half_way("checkpoint"),
     "the next but one not in place": ("os.replace", None, Nth("checkpoint", 2, die)),
-    "mid-episode": (TRAINING_STEP, 71, die),
     "the policy half written": half_way("policy"),
     "a test not in place": ("os.replace", None, Nth("eval", 2, die)),  # the first is on resuming
     "the result not in place": ("os.replace", None, Nth("result", 1, die)),
@@ -259,7 +256,7 @@ def test_events_are_on_the_disk_before_the_checkpoint_is(alone, tmp_path):
 @pytest.mark.slow
 def test_killed_by_somebody_else_compiled(tmp_path):
     """With torch.compile, by kill -9 from outside."""
-    small = {"num_steps": 16, "total_timesteps": 1000, "eval_frequency": 250}
+    small = {"num_steps": 16, "total_timesteps": 240, "eval_frequency": 80}
     small |= {"matmul_precision": "highest", "compile": True, "checkpoint_frequency": 40}
     uninterrupted = command("PPO", tmp_path / "alone", **small)
     assert (uninterrupted.code, uninterrupted.err) == (0, "")
@@ -420,15 +417,11 @@ class Intruder:
 
 def test_a_checkpoint_cannot_run_code(stopped, tmp_path, capsys):
     trace, path = tmp_path / "trace", stopped / "checkpoint.pt"
-    checkpoint = ppo.read_state(path)
-    pickle.loads(pickle.dumps(Intruder(trace)))
-    assert trace.exists()  # it works where it is let in
-    trace.unlink()
-    path.write_bytes(pickle.dumps(Intruder(trace)))
-    untouched(capsys, stopped)
-    torch.save(checkpoint | {"eval_csv": Intruder(trace)}, path)
+    torch.save(ppo.read_state(path) | {"eval_csv": Intruder(trace)}, path)
     untouched(capsys, stopped)
     assert not trace.exists()
+    torch.load(path, weights_only=False)
+    assert trace.exists()  # it works where it is let in
 
 
 def test_a_run_with_other_arguments_is_refused_until_overwritten(stopped, alone, capsys):
@@ -528,14 +521,12 @@ def test_a_policy_of_0_3_plays_as_it_did(algorithm):
     np.testing.assert_allclose(results[:, 0], expected, rtol=1e-3)
 
 
-@each_script
-def test_a_run_of_0_3_is_not_resumed(algorithm, tmp_path, capsys):
-    run_dir = tmp_path / OLD_RUNS[algorithm].name
-    shutil.copytree(OLD_RUNS[algorithm], run_dir)
+def test_a_run_of_0_3_is_not_resumed(tmp_path, capsys):
+    run_dir = tmp_path / OLD_RUNS["PPO"].name
+    shutil.copytree(OLD_RUNS["PPO"], run_dir)
     saved = read_json(run_dir / "config.json")["args"]
-    args = SCRIPTS[algorithm].Args(**saved | {"runs_dir": str(tmp_path)})
     before = files(run_dir)
-    line = refused(capsys, SCRIPTS[algorithm].train, args)
+    line = refused(capsys, ppo.train, ppo.Args(**saved | {"runs_dir": str(tmp_path)}))
     assert "a run of version 0.3, whose numbers differ: finish it with that one" in line
     assert "--exp-name" in line and files(run_dir) == before
 
