@@ -541,25 +541,16 @@ def two_networks():
 @two_updaters
 def test_each_term_of_a_loss_has_its_gradient_and_other_networks_are_constants(algorithm):
     script, (network, other, x) = SCRIPTS[algorithm], two_networks()
-    no_limit = {"max_grad_norm": 1e9} if algorithm == "PPO" else {}
-    inputs = other, x, 0.3
-    gradient, _ = gradient_of(script, loss_of_a_researcher, network, *inputs, **no_limit)
-    loss, _ = loss_of_a_researcher(network, *inputs)
-    expected = torch.autograd.grad(loss, parameters(network))
-    torch.testing.assert_close(list(gradient.values()), list(expected))
-    assert all(p.grad is None for p in parameters(other))
-
-
-@two_updaters
-def test_frozen_layers_stay(algorithm):
-    script, (network, other, x) = SCRIPTS[algorithm], two_networks()
-    network[0].requires_grad_(False)
-    before = copy.deepcopy(network.state_dict())
-    optimizer = torch.optim.SGD(network.parameters(), lr=0.1)  # any optimizer
+    network[0].bias.requires_grad_(False)  # frozen
+    learned = [p for p in network.parameters() if p.requires_grad]
+    optimizer = torch.optim.SGD(learned, lr=1.0)  # any optimizer
+    loss, _ = loss_of_a_researcher(network, other, x, 0.3)
+    expected = [p.detach() - g for p, g in zip(learned, torch.autograd.grad(loss, learned))]  # noqa: B905
     args = script.Args(compile=False)
+    args.max_grad_norm = 1e9
     script.updater(loss_of_a_researcher, network, optimizer, args)(other, x, 0.3)
-    changed = {name for name, p in network.state_dict().items() if not torch.equal(p, before[name])}
-    assert changed == {"2.weight", "2.bias"}
+    torch.testing.assert_close([p.detach() for p in learned], expected)
+    assert all(p.grad is None for p in [*parameters(other), network[0].bias])
 
 
 @pytest.fixture
@@ -580,7 +571,7 @@ def graphs(monkeypatch):
 @two_updaters
 def test_numbers_given_to_an_update_do_not_recompile(algorithm, graphs):
     script, (network, other, x) = SCRIPTS[algorithm], two_networks()
-    plain, optimizers = copy.deepcopy(network), []
+    plain = copy.deepcopy(network)
     for learned in (network, plain):
         optimizer = torch.optim.SGD(learned.parameters(), lr=0.1)
         args = script.Args(compile=learned is network)
@@ -588,7 +579,6 @@ def test_numbers_given_to_an_update_do_not_recompile(algorithm, graphs):
         for coefficient in (0.5, 1, 0, np.float64(0.25), *np.linspace(0, 1, 10)):
             with torch.no_grad():
                 update(other, x, coefficient)
-        optimizers.append(optimizer)
     assert len(graphs) == 1
     torch.testing.assert_close(network.state_dict(), plain.state_dict())
 
@@ -643,21 +633,16 @@ def test_updates_as_graphs_and_plain_ones_agree(algorithm, tmp_path, monkeypatch
     torch.testing.assert_close(compiled, plain, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("precision", ["highest", "bf16"])
-def test_only_bf16_computes_products_in_bfloat16(precision):
-    args = sac.Args(matmul_precision=precision, compile=False)
-    network = nn.Linear(3, 2)
-    optimizer = torch.optim.Adam(network.parameters(), lr=0.5, fused=True)
-
+def test_only_bf16_computes_products_in_bfloat16():
     def loss(network, x):
         product = network(x)
         return product.float().sum(), {"product": product}
 
-    before = network.bias.detach().clone()
-    curves = sac.updater(loss, network, optimizer, args)(torch.ones(4, 3))
-    expected = {"highest": torch.float32, "bf16": torch.bfloat16}[precision]
-    assert curves["product"].dtype == expected
-    torch.testing.assert_close(network.bias.detach(), before - 0.5)  # Adam's first step, in float32
+    for precision, dtype in [("highest", torch.float32), ("bf16", torch.bfloat16)]:
+        inputs = nn.Linear(3, 2), torch.ones(4, 3)
+        gradient, curves = gradient_of(sac, loss, *inputs, matmul_precision=precision)
+        assert curves["product"].dtype == dtype
+        assert gradient["bias"].dtype == torch.float32
 
 
 @two_updaters
@@ -692,33 +677,6 @@ def test_ppo_starts_from_orthogonal_weights():
     assert not agent.actor_logstd.any()
 
 
-@pytest.mark.parametrize("script", [sac, td3])
-def test_the_test_policy_of_sac_and_td3_takes_the_mean_action(script):
-    env, observation = gym.make(ENV), np.array([1.0, -2.0, 0.5])
-    actor = script.Actor(env)
-    [network] = ordinary(actor.state_dict())
-    low, high = torch.tensor(env.action_space.low), torch.tensor(env.action_space.high)
-    squashed = torch.tanh(network(torch.Tensor(observation))[:2]).detach()
-    expected = squashed * (high - low) / 2 + (high + low) / 2
-    np.testing.assert_allclose(actor.policy(observation), expected, rtol=1e-5)
-
-
-@pytest.mark.parametrize("bias", [0.1, -9.0])  # inside the action space, and in its corner
-def test_the_test_policy_of_ppo_takes_the_mean_action(bias):
-    env, agent, stats = gym.make(ENV), ppo.Agent(gym.make(ENV)), ppo.Normalizer((3,))
-    samples = np.array([[0.0, 1.0, 2.0], [0.5, -3.0, 2.5], [2.0, 2.0, 1.5]])
-    for sample in samples:
-        stats.update(sample)
-    agent.actor_mean[-1].bias.data += bias
-    policy = ppo.make_policy(agent, stats, env)
-    _, actor_mean = ordinary(agent.state_dict(), nn.Tanh)
-    for observation in (np.array([1.0, -2.0, 0.5]), np.array([1.0, -2.0, 40.0])):  # 40: clipped
-        normalized = (observation - samples.mean(0)) / samples.std(0)
-        mean = actor_mean(torch.Tensor(normalized.clip(-10, 10))).detach().numpy()
-        expected = mean.clip(env.action_space.low, env.action_space.high)
-        np.testing.assert_allclose(policy(observation), expected, atol=1e-5)
-
-
 class Derived(nn.Linear):
     """A layer with a formula of its own."""
 
@@ -731,11 +689,9 @@ class Derived(nn.Linear):
     [
         ([nn.Linear(3, 4), nn.Tanh(), nn.Linear(4, 4), nn.ReLU(), nn.Linear(4, 2)], True),
         ([nn.Linear(3, 4), nn.GELU(), nn.Linear(4, 2)], False),
-        ([nn.Linear(3, 4), nn.LayerNorm(4), nn.Tanh(), nn.Linear(4, 2)], False),
         ([Derived(3, 2)], False),
         ([nn.Linear(3, 2, bias=False)], False),
         ([nn.utils.parametrizations.spectral_norm(nn.Linear(3, 2))], False),
-        ([nn.Sequential(nn.Linear(3, 2)), nn.Tanh()], False),
     ],
 )
 def test_a_network_acts_in_numpy_as_in_pytorch(layers, translated):
@@ -747,26 +703,6 @@ def test_a_network_acts_in_numpy_as_in_pytorch(layers, translated):
             forward.reset_mock()
             torch.testing.assert_close(torch.from_numpy(act(x.numpy())), expected)
             assert forward.called == (not translated)
-
-
-def test_an_agent_that_acts_and_learns_differently_is_stopped(tmp_path, monkeypatch, capsys):
-    wrong = {
-        "mean": lambda agent: (ppo.in_numpy(agent.critic), np.ones(2, np.float32)),
-        "std": lambda agent: (ppo.in_numpy(agent.actor_mean), np.float32([1.0, 1.1])),
-    }
-    for acting in wrong.values():
-        monkeypatch.setattr(ppo.Agent, "acting", acting)
-        line = refused(capsys, run, "PPO", tmp_path, code=1)
-        assert "acts with one policy and learns another: see acting() and forward()" in line
-
-    class Gelu(ppo.Agent):  # an agent of a researcher, changed in one place
-        def __init__(self, env):
-            super().__init__(env)
-            self.actor_mean[1] = nn.GELU()
-
-    monkeypatch.undo()
-    monkeypatch.setattr(ppo, "Agent", Gelu)
-    run("PPO", tmp_path)
 
 
 def test_normalized_numbers_are_clipped():
