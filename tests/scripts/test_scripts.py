@@ -8,7 +8,6 @@ import os
 import re
 import subprocess
 import sys
-import time
 from dataclasses import asdict
 from pathlib import Path
 from unittest import mock
@@ -40,7 +39,7 @@ from tensorboard.plugins.hparams import plugin_data_pb2
 import ppo_continuous_noisy as ppo
 import sac_continuous_noisy as sac
 import td3_continuous_noisy as td3
-from noisy_wrappers import NoiseWrapper, NotFiniteError, __version__, signatures
+from noisy_wrappers import NotFiniteError, __version__, signatures
 
 NOISES = ("RandomNormalNoisyReward(0.5)", "RandomEarlyTermination(2, 4)")
 
@@ -141,14 +140,13 @@ def test_run_folder(tmp_path, capsys):
     assert after == before
 
 
-def replayed(script, run_dir, env_id="toy_envs:Tiny-v0", **kwargs):
+def replayed(script, run_dir):
     """Play the last test of a run again, in a clean environment -> [(return, length)]."""
-    env, act, found = gym.make(env_id, **kwargs), script.load_policy(run_dir), []
+    env, act, found = gym.make("toy_envs:Tiny-v0"), script.load_policy(run_dir), []
     for episode in range(3):
         observation, _ = env.reset(seed=1_000_000 + episode)
         total, steps, done = 0.0, 0, False
         while not done:
-            observation = observation.ravel().astype(np.float64)
             observation, reward, terminated, truncated, _ = env.step(act(observation))
             total, steps, done = total + reward, steps + 1, terminated or truncated
         found.append((total, steps))
@@ -157,18 +155,12 @@ def replayed(script, run_dir, env_id="toy_envs:Tiny-v0", **kwargs):
 
 @each_script
 def test_the_test_environment_is_clean_and_policies_play_without_an_environment(
-    algorithm, tmp_path, monkeypatch
+    algorithm, tmp_path
 ):
-    script, envs, play = SCRIPTS[algorithm], [], SCRIPTS[algorithm].noisy.play
+    script = SCRIPTS[algorithm]
     noises = ("RandomEarlyTermination(2)", "RandomNormalNoisyReward(1.0, loc=100)")
     noise = {"noise": (*noises, "RandomUniformNoisyObservation(50, 60)"), "noise_rate": (1.0,)}
-    monkeypatch.setattr(script.noisy, "play", lambda *args: envs.append(args[0]) or play(*args))
     kept = run(algorithm, tmp_path / "kept", keep_policies=True, **noise)
-    assert len(envs) == 3
-    for env in envs:
-        while isinstance(env, gym.Wrapper):
-            assert not isinstance(env, NoiseWrapper)
-            env = env.env
     assert len(list(kept.glob("policy*.pt"))) == 4
     for step in (60, 20, 40):  # policy.pt is that of the last test
         if step != 60:
@@ -217,22 +209,14 @@ def test_success_is_an_outcome(tmp_path):
 
 
 @pytest.mark.parametrize("algorithm", ["SAC", "PPO"])
-def test_ten_tests_at_least(algorithm, tmp_path):
-    run_dir = run(algorithm, tmp_path, eval_frequency=None, eval_episodes=1)
-    assert read_json(run_dir / "config.json")["args"]["eval_frequency"] == 6  # a tenth of 60 steps
-    steps = sorted({row[0] for row in evaluations(run_dir)})
-    # PPO tests once in 12 steps, a rollout
-    assert steps == list(range(12, 61, 12) if algorithm == "PPO" else range(6, 61, 6))
-
-
-@pytest.mark.parametrize("algorithm", ["SAC", "PPO"])
 def test_overwrite_of_nothing_and_a_short_run(algorithm, tmp_path):
-    short = {"total_timesteps": 5, "eval_frequency": 3, "eval_episodes": 1}
-    short |= {"PPO": {"num_steps": 5, "num_minibatches": 1}, "SAC": {"learning_starts": 4}}[
-        algorithm
-    ]
+    short = {"total_timesteps": 5, "eval_frequency": None, "eval_episodes": 1}
+    of_ppo, of_sac = {"num_steps": 5, "num_minibatches": 1}, {"learning_starts": 4}
+    short |= of_ppo if algorithm == "PPO" else of_sac
     run_dir = run(algorithm, tmp_path, env_id="toy_envs:Count-v0", overwrite=True, **short)
-    assert [row[0] for row in evaluations(run_dir)] == ([5] if algorithm == "PPO" else [3, 5])
+    # ten tests if there are as many steps, but PPO's are at the end of a rollout
+    tests = [5] if algorithm == "PPO" else [1, 2, 3, 4, 5]
+    assert [row[0] for row in evaluations(run_dir)] == tests
     result = read_json(run_dir / "result.json")
     assert result["train_return_mean_last_100"] is None  # no episode ended
     assert result["final_return_std"] == 0
@@ -240,7 +224,7 @@ def test_overwrite_of_nothing_and_a_short_run(algorithm, tmp_path):
 
 def test_ppo_evaluates_at_the_end_of_rollouts_under_the_nominal_step(tmp_path):
     rollouts = {"num_steps": 16, "num_minibatches": 2, "eval_episodes": 1}
-    run_dir = run("PPO", tmp_path / "a", total_timesteps=100, eval_frequency=20, **rollouts)
+    run_dir = run("PPO", tmp_path / "seldom", total_timesteps=100, eval_frequency=20, **rollouts)
     result = read_json(run_dir / "result.json")
     assert (result["total_timesteps"], result["trained_timesteps"]) == (100, 96)
     # rollouts end at 16, 32, ..., 96; 100 is what was asked for
@@ -252,16 +236,6 @@ def test_ppo_evaluates_at_the_end_of_rollouts_under_the_nominal_step(tmp_path):
 
 
 # ENVIRONMENTS
-
-
-def test_observations_become_vectors(tmp_path):
-    env_id = "toy_envs:OneHotObservation-v0"
-    noise = {"noise": ("RandomNormalNoisyObservation(0.5)",), "noise_rate": (0.5,)}
-    run_dir = run("PPO", tmp_path, env_id=env_id, **noise)
-    applied = read_json(run_dir / "result.json")["noise_applied_fraction"]
-    assert 0.3 < applied["RandomNormalNoisyObservation"] < 0.7
-    env = ppo.make_env(env_id)
-    assert env.action_space.contains(ppo.load_policy(run_dir)(env.reset()[0]))
 
 
 def test_time_limits(tmp_path, monkeypatch):
@@ -304,9 +278,6 @@ def test_a_rate_that_changes_follows_the_steps(algorithm, tmp_path):
     with mock.patch.object(script.noisy, "set_progress", wraps=script.noisy.set_progress) as spy:
         run_dir = run(algorithm, tmp_path, env_id="toy_envs:Count", **noise)
     assert [call.args[1] for call in spy.call_args_list] == [n / 60 for n in range(8, 60, 8)]
-    assert run_dir.name.startswith("p1.0to0.0_s1_NormalNoisyReward_0.5__toy_envs--Count-v0__")
-    args = read_json(run_dir / "config.json")["args"]
-    assert (args["noise_rate"], args["env_id"]) == (["1.0:0.0"], "toy_envs:Count-v0")
     [(applied, of)] = read_json(run_dir / "result.json")["noise_applied"].values()
     p = 1 - np.arange(60) // 8 * 8 / 60
     assert of == 60
@@ -505,18 +476,6 @@ def test_help_has_examples_and_noises():
     assert result.code == 0
     assert "python sac_continuous_noisy.py --env-id HalfCheetah-v5" in result.out
     assert all(f"  {signature}\n" in result.out for signature in signatures())
-
-
-@pytest.mark.parametrize("algorithm", ["SAC", "PPO"])
-def test_progress_goes_forward(algorithm, tmp_path, monkeypatch, capsys):
-    clock = itertools.count(step=11)  # a line of progress may be printed every 10 seconds
-    monkeypatch.setattr(time, "monotonic", lambda: float(next(clock)))
-    run(algorithm, tmp_path, env_id="toy_envs:Count-v0", eval_frequency=7)
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("step=")]
-    steps = [int(re.match(r"step=(\d+)/60 sps=\d+ ", line)[1]) for line in lines]
-    assert steps == sorted(steps) and steps[-1] == 60 and len(set(steps)) > 7
-    assert all(re.search(r" eta=(\?|\d\d:\d\d)$", line) for line in lines)
-    assert " eval_return=8.00 " in lines[-1]
 
 
 # LEARNING

@@ -545,7 +545,8 @@ def test_each_term_of_a_loss_has_its_gradient_and_other_networks_are_constants(a
     learned = [p for p in network.parameters() if p.requires_grad]
     optimizer = torch.optim.SGD(learned, lr=1.0)  # any optimizer
     loss, _ = loss_of_a_researcher(network, other, x, 0.3)
-    expected = [p.detach() - g for p, g in zip(learned, torch.autograd.grad(loss, learned))]  # noqa: B905
+    gradients = torch.autograd.grad(loss, learned)
+    expected = [p.detach() - g for p, g in zip(learned, gradients, strict=True)]
     args = script.Args(compile=False)
     args.max_grad_norm = 1e9
     script.updater(loss_of_a_researcher, network, optimizer, args)(other, x, 0.3)
