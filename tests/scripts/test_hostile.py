@@ -26,11 +26,10 @@ from small_runs import (
     policy,
     refused,
     run,
-    td3_is_slow,
+    two_scripts,
 )
 
 import ppo_continuous_noisy as ppo
-from noisy_wrappers import SpaceError
 
 HOSTILE = {"env_id": "hostile_envs:Hostile-v0"}
 ALONE = {"env_id": "hostile_envs:HostileAlone-v0"}
@@ -74,10 +73,9 @@ def test_a_run_to_its_end_and_again(tmp_path, log, capsys):
     assert_closed(log(), number=8)
 
 
-@pytest.mark.parametrize(("name", "error"), [("Broken", KeyError), ("OtherShape", SpaceError)])
-def test_what_breaks_is_closed(name, error, tmp_path, log):
-    with pytest.raises(error):
-        run("PPO", tmp_path, env_id=f"hostile_envs:{name}-v0")
+def test_what_breaks_is_closed(tmp_path, log):
+    with pytest.raises(KeyError, match="broken"):
+        run("PPO", tmp_path, env_id="hostile_envs:Broken-v0")
     assert_closed(log())
 
 
@@ -104,18 +102,22 @@ def start(runs_dir, *moments, terminal=None, ignored=(), **kwargs):
     return commands.start(ppo.__file__, flags(args), *moments, before=before)
 
 
-def send(number, to_group=False):
-    return functools.partial(send_now, number, to_group)
+def terminate(*args):
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
-def send_now(number, to_group, *args):
-    os.kill(0 if to_group else os.getpid(), number)
+def terminate_group(*args):
+    os.kill(0, signal.SIGTERM)
+
+
+def hang_up(*args):
+    os.kill(os.getpid(), signal.SIGHUP)
 
 
 @pytest.mark.slow
 def test_a_signal_ends_the_episode_and_then_all_processes(tmp_path, log, capsys):
     short = {"total_timesteps": 120}
-    result = commands.ended(start(tmp_path / "runs", (STEP, 50, send(signal.SIGTERM)), **short))
+    result = commands.ended(start(tmp_path / "runs", (STEP, 50, terminate), **short))
     assert (result.code, result.err) == (143, "")
     assert result.out.count("stopping after this episode") == 1  # not of the workers, too
     assert_closed(log())
@@ -129,7 +131,7 @@ def test_a_signal_ends_the_episode_and_then_all_processes(tmp_path, log, capsys)
 @pytest.mark.slow
 def test_a_signal_to_the_group_ends_all_processes(tmp_path, log):
     """As a cluster sends it: the workers end at once, and the script with them or after them."""
-    result = commands.ended(start(tmp_path, (STEP, 90, send(signal.SIGTERM, to_group=True))))
+    result = commands.ended(start(tmp_path, (STEP, 90, terminate_group)))
     assert result.code in (143, 1)  # 1: it asked a worker that had ended
     assert_closed(log())
 
@@ -144,13 +146,9 @@ def interrupt_twice(*args):
 def test_a_second_ctrl_c_ends_the_workers_too(tmp_path, log):
     assert commands.ended(start(tmp_path, (STEP, 50, interrupt_twice))).code == 128 + signal.SIGINT
     workers = [int(line.split()[1]) for line in log() if line.startswith("worker")]
-    try:
-        for _ in range(50):
-            time.sleep(0.1 * any(map(is_alive, workers)))
-        assert not any(map(is_alive, workers))
-    finally:
-        for worker in filter(is_alive, workers):
-            os.kill(worker, signal.SIGKILL)
+    for _ in range(50):
+        time.sleep(0.1 * any(map(is_alive, workers)))
+    assert not any(map(is_alive, workers))
 
 
 class Terminal:
@@ -201,7 +199,7 @@ def test_the_window_of_a_terminal_is_closed(tmp_path, log):
 @pytest.mark.slow
 def test_a_hangup_that_was_ignored_stays_ignored(tmp_path):
     kwargs = {"total_timesteps": 60, "ignored": (signal.SIGHUP,)}  # as nohup does
-    result = commands.ended(start(tmp_path, (STEP, 50, send(signal.SIGHUP)), **kwargs))
+    result = commands.ended(start(tmp_path, (STEP, 50, hang_up), **kwargs))
     assert (result.code, result.err) == (0, "")
 
 
@@ -222,7 +220,7 @@ def forget_seeds():
     torch.seed()
 
 
-@td3_is_slow
+@two_scripts
 def test_a_seed_seeds_all_that_is_random_also_after_a_stop(algorithm, tmp_path):
     runs = {}
     for name, seed in (("stopped", 1), ("other", 2), ("one", 1)):
@@ -236,14 +234,12 @@ def test_a_seed_seeds_all_that_is_random_also_after_a_stop(algorithm, tmp_path):
     torch.testing.assert_close(policy(runs["one"]), policy(runs["stopped"]), rtol=0, atol=0)
 
 
-@td3_is_slow
+@two_scripts
 def test_tests_neither_notice_training_nor_are_noticed(algorithm, tmp_path):
     half = {"env_id": "hostile_envs:HostileHalf-v0"}
     seldom, often = (run(algorithm, tmp_path / str(n), eval_frequency=n, **half) for n in (0, 14))
     assert len(evaluations(often)) > len(evaluations(seldom)) == 3
     torch.testing.assert_close(policy(seldom), policy(often), rtol=0, atol=0)
-    networks = {name: x for name, x in policy(often).items() if "stats" not in name}
-    assert {x.dtype for x in networks.values()} == {torch.float32}  # and actions are float16
     script, results = SCRIPTS[algorithm], []
     for _ in range(2):
         forget_seeds()

@@ -35,6 +35,7 @@ from small_runs import (
     read_json,
     refused,
     run,
+    two_scripts,
     wait_for_a_later_name,
 )
 
@@ -57,8 +58,6 @@ OFF_POLICY = {"total_timesteps": 180, "learning_starts": 135}
 OFF_POLICY |= {"batch_size": 16, "buffer_size": 120}  # which overflows
 EARLY, LATE = 2, 10  # ends of an episode: near steps 25 and 150
 TRAINING_STEP = "gymnasium.wrappers.RecordEpisodeStatistics.step"
-
-two_scripts = pytest.mark.parametrize("algorithm", ["SAC", "PPO"])  # TD3 trains in SAC's order
 
 
 def hopper(algorithm):
@@ -287,14 +286,6 @@ def test_several_signals_end_the_episode_and_the_run_resumes(tmp_path):
     assert 65 <= step < 100
     result = command("PPO", tmp_path, (TRAINING_STEP, 20, send(signal.SIGINT)), **hopper("PPO"))
     assert (result.code, result.err) == (130, "") and f"resumed at step {step}\n" in result.out
-
-
-@pytest.mark.slow
-def test_a_second_ctrl_c_ends_the_program_at_once(tmp_path):
-    action = send(signal.SIGTERM, signal.SIGINT)
-    result = command("PPO", tmp_path, (TRAINING_STEP, 30, action), **hopper("PPO"))
-    assert (result.code, result.err) == (128 + signal.SIGINT, "")
-    assert not list(tmp_path.glob("*/checkpoint.pt"))
 
 
 # FROM A CHECKPOINT

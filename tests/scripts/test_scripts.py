@@ -31,7 +31,7 @@ from small_runs import (
     read_json,
     refused,
     run,
-    td3_is_slow,
+    two_scripts,
 )
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams import plugin_data_pb2
@@ -208,7 +208,7 @@ def test_success_is_an_outcome(tmp_path):
     assert [row[4] for row in table] == ["success", "", "", "", "", "1", "1", "", "", ""]
 
 
-@pytest.mark.parametrize("algorithm", ["SAC", "PPO"])
+@two_scripts
 def test_overwrite_of_nothing_and_a_short_run(algorithm, tmp_path):
     short = {"total_timesteps": 5, "eval_frequency": None, "eval_episodes": 1}
     of_ppo, of_sac = {"num_steps": 5, "num_minibatches": 1}, {"learning_starts": 4}
@@ -271,7 +271,7 @@ def test_what_a_constructor_draws_is_the_same_in_the_tests_of_all_runs(tmp_path,
     assert len({first, second, test}) == 3
 
 
-@td3_is_slow
+@each_script
 def test_a_rate_that_changes_follows_the_steps(algorithm, tmp_path):
     script = SCRIPTS[algorithm]
     noise = {"noise": ("RandomNormalNoisyReward(0.5)",), "noise_rate": ("1:0",)}
@@ -351,7 +351,7 @@ def test_nan_stops_the_run(what, tmp_path):
     assert not list(tmp_path.glob("*/result.json")) + list(tmp_path.glob("*/policy.pt"))
 
 
-@td3_is_slow
+@each_script
 def test_a_loss_that_is_not_finite_stops_the_run(algorithm, tmp_path):
     rate = {"q_lr" if algorithm == "SAC" else "learning_rate": 1e18}
     if algorithm != "PPO":
@@ -374,7 +374,7 @@ CHARTS += "noise/RandomNormalNoisyReward/applied_fraction noise/RandomNormalNois
 CHARTS += "noise/RandomEarlyTermination/applied_fraction noise/RandomEarlyTermination/rate"
 
 
-@td3_is_slow
+@each_script
 def test_curves(algorithm, tmp_path):
     noise = {"noise": NOISES, "noise_rate": (0.5, 0.25), "total_timesteps": 120}
     noise |= {} if algorithm == "PPO" else {"learning_starts": 95}

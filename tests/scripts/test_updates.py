@@ -20,7 +20,7 @@ import torch.nn.functional as F
 from gymnasium import wrappers
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_runs import SCRIPTS, policy, refused, run
+from small_runs import SCRIPTS, policy, refused, run, two_scripts
 from torch.distributions import Normal
 
 import noisy_wrappers as noisy
@@ -523,8 +523,6 @@ def test_ppo_gradient():
 
 # UPDATES
 
-two_updaters = pytest.mark.parametrize("algorithm", ["SAC", "PPO"])  # TD3's is SAC's
-
 
 def loss_of_a_researcher(network, other, x, coefficient):
     """Use the learned network and another one, in several ways."""
@@ -538,7 +536,7 @@ def two_networks():
     return network, copy.deepcopy(network), torch.randn(5, 3)
 
 
-@two_updaters
+@two_scripts
 def test_each_term_of_a_loss_has_its_gradient_and_other_networks_are_constants(algorithm):
     script, (network, other, x) = SCRIPTS[algorithm], two_networks()
     network[0].bias.requires_grad_(False)  # frozen
@@ -569,7 +567,7 @@ def graphs(monkeypatch):
 
 
 @pytest.mark.slow
-@two_updaters
+@two_scripts
 def test_numbers_given_to_an_update_do_not_recompile(algorithm, graphs):
     script, (network, other, x) = SCRIPTS[algorithm], two_networks()
     plain = copy.deepcopy(network)
@@ -646,7 +644,7 @@ def test_only_bf16_computes_products_in_bfloat16():
         assert gradient["bias"].dtype == torch.float32
 
 
-@two_updaters
+@two_scripts
 def test_a_gradient_of_any_strides_is_applied_as_it_is(algorithm):
     """The fused Adam of PyTorch 2.13 reads a gradient's memory as if it were contiguous."""
     signs = torch.tensor([[1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
