@@ -163,27 +163,3 @@ def test_normalized_observations_have_mean_0_and_variance_1(tmp_path):
     normalized = normalizer(torch.tensor(observations))
     torch.testing.assert_close(normalized.mean(0), torch.zeros(2).double(), atol=0.01, rtol=0)
     torch.testing.assert_close(normalized.std(0), torch.ones(2).double(), atol=0.01, rtol=0)
-
-
-@pytest.mark.slow
-@torch.no_grad()
-def test_a_compiled_loss_reads_the_statistics_as_they_are(tmp_path):
-    script = imported(8, tmp_path)
-    space = script.gym.spaces.Box(-1, 1, (2,))
-    env = watched_run.SimpleNamespace(observation_space=space, action_space=space)
-    normalizer = script.Normalizer(env)
-    actor = script.Actor(env, normalizer)
-    args = watched_run.SimpleNamespace(compile=True, matmul_precision="highest")
-
-    def loss(actor, observations):
-        actions = actor(observations, 0.0)
-        return actions.sum(), {"actions": actions}
-
-    update = script.updater(loss, actor, torch.optim.SGD(actor.parameters(), lr=0.0), args)
-    observations, before = torch.randn(4, 2), None
-    for _ in range(3):
-        compiled, (_, eager) = update(observations), loss(actor, observations)
-        torch.testing.assert_close(compiled["actions"], eager["actions"])
-        assert before is None or not torch.allclose(compiled["actions"], before)
-        before = compiled["actions"].clone()
-        normalizer.update(np.array([5.0, -3.0]))

@@ -29,16 +29,6 @@ def test_rate_zero_is_the_bare_environment(text):
 
 
 @pytest.mark.parametrize("text", BASES)
-def test_unperturbed_data_are_the_very_same_objects(text):
-    data = (np.ones(3), 1.5, False, False, {"key": 1})
-    env = GenericEnv(reset=lambda env: (data[0], data[4]), step=lambda env, action: data)
-    env = build(text, env, 0.0)
-    observation, info = env.reset(seed=0)
-    assert observation is data[0] and info is data[4]
-    assert all(got is given for got, given in zip(env.step(0), data, strict=True))
-
-
-@pytest.mark.parametrize("text", BASES)
 def test_data_of_the_environment_are_never_mutated(text):
     first, owned = np.zeros(3), np.arange(1.0, 4.0)
     first.flags.writeable = owned.flags.writeable = False

@@ -1,6 +1,5 @@
 """Environments for networks."""
 
-import copy
 import json
 import random
 import weakref
@@ -9,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from cases import BOX, A, B, layers
+from cases import BOX, A, layers
 from gymnasium.wrappers import FlattenObservation
 
 from noisy_wrappers import (
@@ -20,7 +19,6 @@ from noisy_wrappers import (
     kept_generators,
     make_flat,
     make_noisy,
-    noise_wrappers,
     outcome,
 )
 
@@ -121,42 +119,6 @@ def test_finite_numbers_stop_at_what_is_not_finite(bad):
         env.reset()
 
 
-def pendulum():
-    """Return an environment whose own actions are rescaled, with noise, and a generator."""
-    env = gym.make("Pendulum-v1", max_episode_steps=7)
-    env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
-    env = make_noisy(env, [A, B, "RandomEarlyTermination(2, 5)"], [0.5, 0.5, 0.5])
-    env.action_space.seed(1)
-    env.reset(seed=1)
-    return env, np.random.default_rng(1)
-
-
-def play_on(env, rng, episodes):
-    """Return all that happens in some episodes."""
-    seen = []
-    for _ in range(episodes):
-        seen.append((*env.reset()[0].tolist(), rng.random()))
-        ended = False
-        while not ended:
-            observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
-            seen.append((*observation.tolist(), reward, terminated, truncated, info.get("noise")))
-            ended = terminated or truncated
-    counts = [(w.times_applied, w.opportunities) for w in noise_wrappers(env).values()]
-    return seen, counts, list(env.get_wrapper_attr("return_queue"))
-
-
-def test_an_env_state_continues_what_was_interrupted():
-    env, rng = pendulum()
-    play_on(env, rng, 4)
-    saved = copy.deepcopy(EnvState(env, rng).state_dict())
-    expected = play_on(env, rng, 5)
-    assert len(expected[2]) == 9
-    other, other_rng = pendulum()
-    play_on(other, other_rng, 2)
-    EnvState(other, other_rng).load_state_dict(saved)
-    assert play_on(other, other_rng, 5) == expected
-
-
 class Drawing(gym.Env):
     """Draws from all kinds of generators that are its attributes, and spawns at every reset.
 
@@ -226,14 +188,3 @@ def test_an_environment_that_ignores_its_seed_is_seeded_all_the_same():
     pendulum, bare = make_flat(gym.make("Pendulum-v1")), gym.make("Pendulum-v1")
     for seed in (3, None, 4):
         np.testing.assert_array_equal(pendulum.reset(seed=seed)[0], bare.reset(seed=seed)[0])
-
-
-def test_an_env_state_of_another_stack_is_refused():
-    env, rng = pendulum()
-    saved = EnvState(env, rng).state_dict()
-    bare = gym.make("Pendulum-v1")
-    bare.reset(seed=1)
-    assert EnvState(bare).state_dict()["returns"] == []
-    for other in (EnvState(env), EnvState(bare, rng)):
-        with pytest.raises(ValueError):
-            other.load_state_dict(saved)

@@ -10,9 +10,8 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from cases import GenericEnv, streams
+from cases import GenericEnv
 from gymnasium.utils.env_checker import check_env
-from test_actions import actions_env
 
 from noisy_wrappers import (
     Configuration,
@@ -38,24 +37,6 @@ def folder(tmp_path, monkeypatch):
     yield tmp_path
     sys.modules.pop("my_noises", None)
     parse_noise.__globals__["_read_noise"].cache_clear()
-
-
-def test_a_sticky_action_by_hand(folder):
-    bare = actions_env(gym.spaces.Discrete(100))
-    env = make_noisy(bare, [TEXT], [0.3], record_statistics=False)
-    gate, noise = streams(sys.modules["my_noises"].StickyAction, seed=5)
-    env.reset(seed=5)
-    expected, left, last, marks = [], 0, None, []
-    for action in range(60):
-        if gate.random() < 0.3:
-            left = noise.integers(1, 3, endpoint=True)
-        sticks = left > 0 and last is not None
-        left, last = left - 1, last if sticks else action
-        expected.append(last)
-        marks.append(("StickyAction",) if sticks else None)
-    assert [env.step(action)[4].get("noise") for action in range(60)] == marks
-    assert bare.received == expected
-    assert 0 < env.times_applied < env.opportunities == 60
 
 
 @pytest.mark.filterwarnings("ignore:.*WARN")
