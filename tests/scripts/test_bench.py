@@ -99,22 +99,6 @@ def test_programs_run_in_turn(tmp_path, monkeypatch):
     assert len(ratios) == 3 and theirs["ours / its"] == median(ratios)
 
 
-def test_side_by_side(tmp_path, monkeypatch, capsys):
-    def measure(options, *programs):
-        for program in programs:
-            program.speeds.append(100 if len(programs) == 1 else 80)
-
-    folder = checkout(tmp_path / "a", SCRIPT.format(log=tmp_path / "log", name="a"))
-    monkeypatch.setattr(bench, "PROJECT", folder)
-    monkeypatch.setattr(bench, "measure", measure)
-    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1})
-    [row] = bench.side_by_side("sac", "Any-v5", bench.parse(["--jobs", "2", "--pairs", "3"]))
-    assert row == {"alone": 100, "2 jobs": 160, "efficiency": 0.8}
-    with pytest.raises(SystemExit):
-        bench.parse(["--jobs", "3"])
-    assert "--jobs 3 needs as many cores, and there are 2" in capsys.readouterr().err
-
-
 def test_what_ends_says_why(tmp_path, monkeypatch):
     text = "import sys; print('one'); sys.exit('error: two')"
     monkeypatch.setattr(bench, "PROJECT", checkout(tmp_path / "a", text))

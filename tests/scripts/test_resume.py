@@ -473,7 +473,7 @@ def test_a_second_process_is_refused_while_the_first_one_lives(tmp_path):
         assert first.is_alive()
         time.sleep(0.01)
     for overwrite in (False, True):
-        second = command("SAC", tmp_path, **long, overwrite=overwrite)
+        second = command("SAC", tmp_path, (TRAINING_STEP, 30, die), **long, overwrite=overwrite)
         assert second.code == 2
         assert f"{folder(tmp_path)} is in use by another process" in one_line(second.err)
     assert first.is_alive() and list(tmp_path.glob("*/checkpoint.pt"))

@@ -5,12 +5,10 @@ import pytest
 from cases import OBSERVATION_CASES, GenericEnv, build, rollout, streams
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, Tuple
 from gymnasium.spaces.utils import flatten
-from gymnasium.utils.env_checker import check_env
 
 from noisy_wrappers import (
     ObservationNoise,
     RandomDropoutObservation,
-    RandomMixupObservation,
     RandomNormalNoisyObservation,
     RandomUniformNoisyObservation,
 )
@@ -115,28 +113,6 @@ def test_the_space_is_widened_in_its_entries():
     assert space["image"] == MIXED["image"]
     assert space["inner"][1] == Box(-3, 2, (2,), np.float32)
     assert space["inner"][0] == Discrete(3)
-
-
-@pytest.mark.filterwarnings("ignore:.*WARN")
-def test_check_env():
-    class Sampled(GenericEnv):
-        def draw(self):
-            self.observation_space.seed(int(self.np_random.integers(2**31)))
-            return self.observation_space.sample()
-
-    env = Sampled(Tuple((MIXED, Box(-1, 1, (2,)))))
-    check_env(RandomMixupObservation(RandomNormalNoisyObservation(env, 0.5, 1), 0.5, 0.5))
-
-
-def test_a_scale_for_each_dimension_of_the_vector():
-    scale = (0.0,) * 3 + (1.0,) * 4
-    keys = ("achieved_goal", "observation")
-    got = RandomNormalNoisyObservation(sampled(GOALS)[0], 1.0, scale, keys=keys).reset(seed=0)[0]
-    clean = sampled(GOALS)[1][0]
-    assert (got["achieved_goal"] == clean["achieved_goal"]).all()
-    assert (got["observation"] != clean["observation"]).all()
-    with pytest.raises(ValueError, match=r"scale has 7 numbers and .* has shape \(10,"):
-        RandomNormalNoisyObservation(sampled(GOALS)[0], 1.0, scale)
 
 
 def test_a_noise_must_return_as_many_numbers_as_it_gets():

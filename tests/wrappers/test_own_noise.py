@@ -2,11 +2,13 @@
 
 import csv
 import json
+import os
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import commands
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -94,23 +96,22 @@ def test_a_bug_keeps_its_traceback(folder):
 
 @pytest.mark.slow
 def test_a_sweep_and_a_test_from_the_folder_of_the_noise(folder):
-    def run(*words):
-        done = subprocess.run([*map(str, words)], cwd=folder, capture_output=True, text=True)
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout
+    def run(path, *words):
+        done = commands.run(path, words, cwd=folder)
+        assert done.code == 0, done.out + done.err
 
     sweep = "custom --algos ppo --envs InvertedPendulum-v5 --seeds 1 --total-timesteps 512 --jobs 1"
     sweep = [*sweep.split(), "--runs-dir", "runs", "--noises", TEXT, "--noise-rates", "0.5"]
     small = ["--", "--no-compile", "--num-steps", "256", "--eval-episodes", "2"]
-    env = ["env", f"PYTHON={sys.executable}"]
-    run(*env, ROOT / "benchmark.sh", *sweep, *small)
+    env = os.environ | {"PYTHON": sys.executable}
+    subprocess.run([ROOT / "benchmark.sh", *sweep, *small], cwd=folder, env=env, check=True)
     [noisy] = folder.glob("runs/p0.5_s1_my_noises--StickyAction_3__*/result.json")
     assert 0 < json.loads(noisy.read_text())["noise_applied_fraction"]["StickyAction"] < 0.6
     assert len([*folder.glob("runs/*/result.json")]) == 2
     test = ["--noises", TEXT, "--noise-rates", "1", "--episodes", "2"]
-    run(sys.executable, ROOT / "evaluate.py", "runs", *test)
+    run(ROOT / "evaluate.py", "runs", *test)
     (folder / "my_noises.py").unlink()
-    run(sys.executable, ROOT / "analyze.py")  # reads runs without their noise
+    run(ROOT / "analyze.py")  # reads runs without their noise
     tables = (folder / "runs/results/robustness.csv", folder / "runs/results/summary_PPO.csv")
     assert all(TEXT in table.read_text() for table in tables)
     rows = list(csv.DictReader((noisy.parent / "robustness.csv").open()))

@@ -71,13 +71,18 @@ def test_initial_states_are_those_of_the_bare_environment(text):
 
 @pytest.mark.parametrize("text", STEP_BASES)
 def test_a_lower_rate_perturbs_a_subset_of_the_steps(text):
-    def perturbed(rate):
-        env = build(text, GenericEnv(), rate)
-        steps = [env.reset(seed=4)[1]] + [env.step(0)[4] for _ in range(500)]
-        return {t for t, info in enumerate(steps) if "noise" in info}
+    def perturbed(rate, start=0):
+        env = build(text, GenericEnv(), rate if start == 0 else 0.0)
+        infos = [env.reset(seed=4)[1]]
+        for t in range(1, 500):
+            if t == start:
+                env.noise_rate = rate
+            infos.append(env.step(0)[4])
+        return {t for t, info in enumerate(infos) if "noise" in info}
 
     sets = [perturbed(rate) for rate in (0, 0.1, 0.2, 1)]
     assert all(low < high for low, high in zip(sets, sets[1:], strict=False))
+    assert perturbed(0.1, start=100) == {t for t in sets[1] if t >= 100}
 
 
 @pytest.mark.parametrize("text", BASES)
