@@ -138,25 +138,3 @@ def test_a_policy_of_a_gpu_needs_no_gpu_no_environment_and_no_tyro(tmp_path):
         [sys.executable, "-c", code], cwd=tmp_path, env=env, capture_output=True, text=True
     )
     assert (result.stdout, result.returncode) == ("".join(expected) + "set()\n", 0), result.stderr
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("algorithm", SMALL)
-def test_onnx_computes_the_actions(algorithm, tmp_path, monkeypatch):
-    onnxruntime = pytest.importorskip("onnxruntime")
-    pytest.importorskip("onnxscript")
-    monkeypatch.chdir(tmp_path)
-    names, observations = follow_page(algorithm, "Plain-v0", tmp_path)
-    exec(blocks(algorithm)[4 if algorithm == "ppo" else 3], names)
-    assert {path.name for path in tmp_path.iterdir()} == {"policy.npz", "policy.onnx", "runs"}
-    session = onnxruntime.InferenceSession("policy.onnx")
-    [name] = [entry.name for entry in session.get_inputs()]
-    for observation in observations:
-        inputs = observation
-        if algorithm == "ppo":
-            arrays = names["arrays"]
-            inputs = (observation - arrays["mean"]) / np.sqrt(arrays["var"] + 1e-8)
-            inputs = inputs.clip(-10, 10)
-        [[action]] = session.run(None, {name: inputs.astype(np.float32)[None]})
-        action = action.clip(names["low"], names["high"])
-        np.testing.assert_allclose(action, names["policy"](observation), rtol=0, atol=1e-5)

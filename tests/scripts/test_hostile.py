@@ -234,6 +234,19 @@ def test_a_seed_seeds_all_that_is_random_also_after_a_stop(algorithm, tmp_path):
     torch.testing.assert_close(policy(runs["one"]), policy(runs["stopped"]), rtol=0, atol=0)
 
 
+def test_what_a_constructor_draws_is_the_same_in_the_tests_of_all_runs(tmp_path, monkeypatch):
+    drawn = []
+
+    def learn(args, env, test_env, stop):
+        drawn.append((env.unwrapped.offset, test_env.unwrapped.offset))
+
+    monkeypatch.setattr(ppo, "learn", learn)
+    for seed in (1, 2, 1):
+        ppo.train(arguments("PPO", tmp_path, seed=seed, **ALONE))
+    (first, test), (second, same), again = drawn
+    assert test == same and again == (first, test) and len({first, second, test}) == 3
+
+
 @two_scripts
 def test_tests_neither_notice_training_nor_are_noticed(algorithm, tmp_path):
     half = {"env_id": "hostile_envs:HostileHalf-v0"}

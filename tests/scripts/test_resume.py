@@ -443,10 +443,11 @@ def test_a_new_option_is_another_run_unless_it_has_its_default(stopped, monkeypa
     assert "sizes [32], not [64, 64]" in untouched(capsys, stopped)
 
 
-def test_another_text_of_the_script_is_said_and_recorded(stopped, tmp_path, monkeypatch, capsys):
+def test_another_text_of_the_script_is_said_and_recorded(
+    stopped, tmp_path_factory, monkeypatch, capsys
+):
     config = read_json(stopped / "config.json")
-    copy = tmp_path.parent / f"{tmp_path.name}-copy" / "ppo_continuous_noisy.py"
-    copy.parent.mkdir()
+    copy = tmp_path_factory.mktemp("copy") / "ppo_continuous_noisy.py"
     copy.write_text(Path(ppo.__file__).read_text() + "# changed\n")
     kwargs = hopper("PPO") | {"exp_name": config["args"]["exp_name"]}
     said = "the script has changed since the run began; if it matters, use --exp-name\n"

@@ -7,7 +7,6 @@ import math
 import os
 import re
 import subprocess
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from unittest import mock
@@ -17,9 +16,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-import toy_envs
 from small_runs import (
-    ROOT,
     SCRIPTS,
     arguments,
     command,
@@ -238,37 +235,12 @@ def test_ppo_evaluates_at_the_end_of_rollouts_under_the_nominal_step(tmp_path):
 # ENVIRONMENTS
 
 
-def test_time_limits(tmp_path, monkeypatch):
+def test_time_limits(tmp_path):
     limit = {"env_id": "toy_envs:Endless-v0", "max_episode_steps": 5}
-    run_dir = run("PPO", tmp_path / "own", **limit)
+    run_dir = run("PPO", tmp_path, **limit)
     assert {row[2:] for row in evaluations(run_dir)} == {(5.0, 5)}
-    assert read_json(run_dir / "config.json")["args"]["max_episode_steps"] == 5
-    for script in SCRIPTS.values():
-        assert script.make_env("toy_envs:Endless-v0").spec.max_episode_steps == 10_000
-        assert script.make_env("Pendulum-v1").spec.max_episode_steps == 200
-    monkeypatch.setattr(ppo, "STEP_LIMIT", 11)
-    run_dir = run("PPO", tmp_path / "ours", env_id="toy_envs:Endless-v0")
-    assert {row[3] for row in evaluations(run_dir)} == {11}
-
-
-def test_what_a_constructor_draws_is_the_same_in_the_tests_of_all_runs(tmp_path, monkeypatch):
-    class Goal(toy_envs.Count):
-        def __init__(self):
-            super().__init__()
-            self.goal = np.random.normal()
-
-    gym.register("Goal-v0", Goal, max_episode_steps=8)
-    goals = []
-
-    def learn(args, env, test_env, stop):
-        goals.append((env.unwrapped.goal, test_env.unwrapped.goal))
-
-    monkeypatch.setattr(ppo, "learn", learn)
-    for seed in (1, 2, 1):
-        ppo.train(arguments("PPO", tmp_path, env_id="Goal-v0", seed=seed))
-    (first, test), (second, same), again = goals
-    assert test == same and again == (first, test)
-    assert len({first, second, test}) == 3
+    assert ppo.make_env("toy_envs:Endless-v0").spec.max_episode_steps == 10_000
+    assert ppo.make_env("Pendulum-v1").spec.max_episode_steps == 200
 
 
 @each_script
@@ -305,6 +277,7 @@ BAD = [  # arguments, what the line names
     ({"num_steps": 61}, "--num-steps must be from 2 * --num-minibatches (6) to"),
     ({"num_minibatches": 13}, "--num-steps must be from"),
 ]
+BAD += [] if torch.cuda.is_available() else [({"cuda": True}, "--cuda: PyTorch finds no GPU")]
 BAD_OF_OTHERS = [
     ({"env_id": "toy_envs:Unbounded-v0"}, "SAC needs bounded actions", "SAC"),
     ({"env_id": "toy_envs:FloatMax-v0"}, "TD3 needs bounded actions", "TD3"),
@@ -321,22 +294,6 @@ BAD_OF_OTHERS = [
 def test_bad_input(bad, word, algorithm, tmp_path, capsys):
     assert word in refused(capsys, run, algorithm, tmp_path, **bad)
     assert not list(tmp_path.glob("*/[!.]*"))  # at most an empty folder with its .lock
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="has a GPU")
-def test_cuda_without_a_gpu(tmp_path, capsys):
-    assert "--cuda" in refused(capsys, run, "PPO", tmp_path / "runs", cuda=True)
-    assert not (tmp_path / "runs").exists()
-
-
-@pytest.mark.slow
-def test_bad_command(tmp_path):
-    noise = ["--noise", "RandomUniformScaleReward(0.5)", "--noise-rate", "0.1"]
-    for options, word in [(noise, "high"), (["--total-timesteps", "many"], "many")]:
-        result = command("PPO", *options, cwd=tmp_path)
-        assert result.code == 2
-        assert word in result.err + result.out and "Traceback" not in result.err + result.out
-        assert list(tmp_path.iterdir()) == []
 
 
 # DIVERGENCE
@@ -439,24 +396,25 @@ def test_command_line(tmp_path):
     assert (again.code, again.out, again.err) == (0, f"{run_dir} is finished\n", "")
 
 
+MY_ENVS = """
+from toy_envs import Tiny, register
+
+class Mine(Tiny):
+    def reset(self, **kwargs):
+        import my_physics  # only now
+        return super().reset(**kwargs)
+
+register("Mine", Mine, 8)
+"""
+
+
 @pytest.mark.slow
 def test_a_module_beside_the_caller(tmp_path):
-    (tmp_path / "my_envs.py").write_text(
-        "from toy_envs import Tiny, register\n\n\n"
-        "class Mine(Tiny):\n"
-        "    def reset(self, **kwargs):\n"
-        "        import my_physics  # only now\n\n"
-        "        return super().reset(**kwargs)\n\n\n"
-        "register('Mine', Mine, 8)\n"
-    )
     (tmp_path / "my_physics.py").touch()
-    options = ["--env-id", "my_envs:Mine-v0", "--total-timesteps", "60", "--no-compile"]
-    options += ["--learning-starts=50", "--eval-frequency", "0", "--eval-episodes", "1"]
-    line = [sys.executable, sac.__file__, *options]
-    path = {"PYTHONPATH": str(ROOT / "tests")}
-    subprocess.run(line, cwd=tmp_path, env=os.environ | path, timeout=240, check=True)
-    [run_dir] = (tmp_path / "runs").iterdir()
-    assert read_json(run_dir / "config.json")["args"]["env_id"] == "my_envs:Mine-v0"
+    (tmp_path / "my_envs.py").write_text(MY_ENVS)
+    args = arguments("SAC", tmp_path / "runs", env_id="my_envs:Mine-v0", eval_frequency=0)
+    result = command("SAC", *flags(args), cwd=tmp_path)
+    assert (result.code, result.err) == (0, "")
 
 
 @pytest.mark.slow

@@ -97,14 +97,33 @@ class PlainBuffer:
         return [torch.tensor(np.array(column), dtype=torch.float32) for column in zip(*rows)]  # noqa: B905
 
 
-class PlainSAC:
-    def __init__(self, actor, critic, target, space, args, log_alpha=0.0):
+class PlainActorCritic:
+    """What SAC and TD3 have in common."""
+
+    def __init__(self, actor, critic, target, space, args):
         [self.actor] = ordinary(actor)
         self.q1, self.q2 = ordinary(critic)
         self.q1_target, self.q2_target = ordinary(target)
-        low, high = torch.tensor(space.low), torch.tensor(space.high)
-        self.scale, self.bias = (high - low) / 2, (high + low) / 2
-        self.args, self.target_entropy = args, -2.0
+        self.low, self.high = torch.tensor(space.low), torch.tensor(space.high)
+        self.scale, self.bias = (self.high - self.low) / 2, (self.high + self.low) / 2
+        self.args = args
+
+    def critic_loss(self, batch):
+        observations, actions, rewards, next_observations, terminated = batch
+        with torch.no_grad():
+            next_actions, bonus = self.next_actions(next_observations)
+            q1_next = q_value(self.q1_target, next_observations, next_actions)
+            q2_next = q_value(self.q2_target, next_observations, next_actions)
+            next_value = torch.min(q1_next, q2_next) + bonus
+            y = rewards + (1 - terminated) * self.args.gamma * next_value
+        q1_loss = F.mse_loss(q_value(self.q1, observations, actions), y)
+        return q1_loss + F.mse_loss(q_value(self.q2, observations, actions), y)
+
+
+class PlainSAC(PlainActorCritic):
+    def __init__(self, actor, critic, target, space, args, log_alpha=0.0):
+        super().__init__(actor, critic, target, space, args)
+        self.target_entropy = -2.0
         self.log_alpha = torch.full(
             (1,), log_alpha, dtype=self.actor[0].weight.dtype, requires_grad=True
         )
@@ -123,16 +142,9 @@ class PlainSAC:
         log_prob = normal.log_prob(x) - torch.log(self.scale * (1 - y.pow(2)) + 1e-6)
         return y * self.scale + self.bias, log_prob.sum(1)
 
-    def critic_loss(self, batch):
-        observations, actions, rewards, next_observations, terminated = batch
-        with torch.no_grad():
-            next_actions, next_log_pi = self.get_action(next_observations)
-            q1_next = q_value(self.q1_target, next_observations, next_actions)
-            q2_next = q_value(self.q2_target, next_observations, next_actions)
-            next_value = torch.min(q1_next, q2_next) - self.alpha * next_log_pi
-            y = rewards + (1 - terminated) * self.args.gamma * next_value
-        q1_loss = F.mse_loss(q_value(self.q1, observations, actions), y)
-        return q1_loss + F.mse_loss(q_value(self.q2, observations, actions), y)
+    def next_actions(self, next_observations):
+        next_actions, next_log_pi = self.get_action(next_observations)
+        return next_actions, -self.alpha * next_log_pi
 
     def actor_loss(self, observations):
         actions, log_pi = self.get_action(observations)
@@ -160,32 +172,21 @@ class PlainSAC:
             return self.get_action(torch.Tensor(observation)[None])[0][0].numpy()
 
 
-class PlainTD3:
-    def __init__(self, actor, critic, target_actor, target_critic, space, args):
-        [self.actor], [self.actor_target] = ordinary(actor), ordinary(target_actor)
-        self.q1, self.q2 = ordinary(critic)
-        self.q1_target, self.q2_target = ordinary(target_critic)
-        self.low, self.high = torch.tensor(space.low), torch.tensor(space.high)
-        self.scale, self.bias = (self.high - self.low) / 2, (self.high + self.low) / 2
-        self.args = args
+class PlainTD3(PlainActorCritic):
+    def __init__(self, actor, critic, space, args):
+        super().__init__(actor, critic, critic, space, args)
+        [self.actor_target] = ordinary(actor)
         self.q_optimizer = torch.optim.Adam(parameters(self.q1, self.q2), lr=args.learning_rate)
         self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), lr=args.learning_rate)
 
     def action(self, actor, observations):
         return torch.tanh(actor(observations)) * self.scale + self.bias
 
-    def critic_loss(self, batch):
-        observations, actions, rewards, next_observations, terminated = batch
-        with torch.no_grad():
-            noise = torch.randn_like(actions) * self.args.policy_noise
-            noise = noise.clamp(-self.args.noise_clip, self.args.noise_clip) * self.scale
-            next_actions = self.action(self.actor_target, next_observations) + noise
-            next_actions = torch.max(torch.min(next_actions, self.high), self.low)
-            q1_next = q_value(self.q1_target, next_observations, next_actions)
-            q2_next = q_value(self.q2_target, next_observations, next_actions)
-            y = rewards + (1 - terminated) * self.args.gamma * torch.min(q1_next, q2_next)
-        q1_loss = F.mse_loss(q_value(self.q1, observations, actions), y)
-        return q1_loss + F.mse_loss(q_value(self.q2, observations, actions), y)
+    def next_actions(self, next_observations):
+        noise = torch.randn(len(next_observations), 2) * self.args.policy_noise
+        noise = noise.clamp(-self.args.noise_clip, self.args.noise_clip) * self.scale
+        next_actions = self.action(self.actor_target, next_observations) + noise
+        return torch.max(torch.min(next_actions, self.high), self.low), 0.0
 
     def actor_loss(self, observations):
         return -q_value(self.q1, observations, self.action(self.actor, observations)).mean()
@@ -288,7 +289,7 @@ def test_td3_trains_as_a_plain_implementation(case, tmp_path):
     torch.manual_seed(args.seed)
     actor, critic = td3.Actor(env).state_dict(), td3.Critic(env).state_dict()
     td3.Actor(env), td3.Critic(env)
-    plain = PlainTD3(actor, critic, actor, critic, env.action_space, args)
+    plain = PlainTD3(actor, critic, env.action_space, args)
     ends = plain_training(plain, env, args)
     assert {"terminated", "truncated"} == set(ends)
 
@@ -397,13 +398,8 @@ def plain_ppo_training(plain, env, args):
     return normalizing, epochs
 
 
-LOOSE = {
-    "num_minibatches": 5,
-    "norm_adv": False,
-    "clip_vloss": False,
-    "anneal_lr": False,
-    "max_grad_norm": 100.0,
-}
+LOOSE = {"num_minibatches": 5, "norm_adv": False, "clip_vloss": False, "anneal_lr": False}
+LOOSE |= {"max_grad_norm": 100.0}
 TIGHT = {"bootstrap_truncated": True, "clip_coef": 0.02, "vf_coef": 1.0, "max_grad_norm": 0.1}
 STOPS = {"target_kl": 0.004, "learning_rate": 3e-3}
 
