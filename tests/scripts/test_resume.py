@@ -13,7 +13,6 @@ import signal
 import subprocess
 import sys
 import time
-import zipfile
 from dataclasses import field, make_dataclass
 from pathlib import Path
 
@@ -383,14 +382,10 @@ def untouched(capsys, path, **kwargs):
 def test_a_damaged_checkpoint_is_noticed(stopped, capsys):
     path = stopped / "checkpoint.pt"
     whole = path.read_bytes()
-    with zipfile.ZipFile(path) as archive:
-        members = [member for member in archive.infolist() if member.file_size]
     damaged = [whole[: len(whole) // 2], whole[:-1], b"", b"an essay"]
-    for member in members[:: max(1, len(members) // 3)]:
-        header = whole[member.header_offset :][:30]
-        lengths = int.from_bytes(header[26:28], "little") + int.from_bytes(header[28:], "little")
+    for part in (0.4, 0.6):  # one bit of large arrays
         damaged.append(bytearray(whole))
-        damaged[-1][member.header_offset + 30 + lengths + member.file_size // 2] ^= 1
+        damaged[-1][int(part * len(whole))] ^= 1
     for content in damaged:
         path.write_bytes(content)
         assert f"cannot read {path}" in untouched(capsys, stopped)
