@@ -90,20 +90,14 @@ def test_canonical_env_id():
         assert canonical_env_id(env_id) == canonical
 
 
-@pytest.mark.parametrize(
-    ("env_id", "reason"),
-    [
-        ("Hoper-v5", "Did you mean: `Hopper`"),
-        ("", "Malformed"),
-        ("no_such_module:Env-v0", "No module named 'no_such_module'"),
-        ("toy_envs:Nothing-v0", "Nothing"),
-    ],
-)
-def test_unknown_environments(env_id, reason):
-    with pytest.raises(ValueError) as error:
-        canonical_env_id(env_id)
-    message = str(error.value)
-    assert repr(env_id) in message and reason in message and "\n" not in message
+def test_unknown_environments():
+    module = "No module named 'no_such_module'"
+    reasons = {"Hoper-v5": "Did you mean: `Hopper`", "no_such_module:Env-v0": module}
+    for env_id, reason in (reasons | {"": "Malformed", "toy_envs:Nothing-v0": "Nothing"}).items():
+        with pytest.raises(ValueError) as error:
+            canonical_env_id(env_id)
+        message = str(error.value)
+        assert repr(env_id) in message and reason in message and "\n" not in message
 
 
 def test_what_a_module_raises_passes_through(tmp_path, monkeypatch):

@@ -4,7 +4,7 @@ import math
 
 import gymnasium as gym
 import pytest
-from cases import STEP_BASES, A, B, GenericEnv, build, constant_env
+from cases import A, B, constant_env
 
 from noisy_wrappers import (
     RandomDropoutObservation,
@@ -34,17 +34,6 @@ def test_the_rate_follows_the_progress_at_the_next_reset(schedule, rates):
     env.noise_rate = 0.9  # a number that is assigned replaces the schedule
     env.reset()
     assert env.noise_rate == 0.9
-
-
-@pytest.mark.parametrize("text", STEP_BASES)
-def test_a_rate_is_constant_within_an_episode(text):
-    env = build(text, GenericEnv(), "0:1")
-    for fraction, acts in [(0, False), (1, True), (0, False)]:
-        set_progress(env, fraction)
-        env.reset()
-        for later in (0.3, 1 - fraction, fraction):
-            set_progress(env, later)
-            assert ("noise" in env.step(0)[4]) == acts
 
 
 def noisy_pendulum():

@@ -4,7 +4,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from cases import GenericEnv, constant_env, numbered_env, rollout, streams
-from test_nested import GOALS, sampled
 
 from noisy_wrappers import RandomMixupObservation, RandomObservationBias, RandomObservationDelay
 
@@ -49,17 +48,6 @@ def test_delay_golden(rate):
         delays.append(drawn if gate.random() < rate else 0)
         assert seen == [max(0, t - delays[-1]) for t in range(1, 9)]
     assert set(delays) == {1, 2, 3} | ({0} if rate < 1 else set())
-
-
-def test_keys_name_the_sensors_that_fail():
-    for wrapper, args in [(RandomObservationBias, (1.0,)), (RandomObservationDelay, (1,))]:
-        env, samples = sampled(GOALS)
-        env = wrapper(env, 1.0, *args, keys=("observation",))
-        seen = [step[0] for step in rollout(env, seed=0, steps=20)]
-        for t in range(1, 20):
-            assert seen[t]["desired_goal"] is samples[t]["desired_goal"]
-            late = samples[t - 1]["observation"]
-            assert (seen[t]["observation"] == late).all() == (wrapper is RandomObservationDelay)
 
 
 def test_only_a_bias_leaves_the_space():
