@@ -51,8 +51,7 @@ class Count(gym.Env):
     observation_space = Box(-np.inf, np.inf, (1,), np.float32)
     action_space = Box(-1.0, 1.0, (1,), np.float32)
 
-    def __init__(self, shape=(1,), break_reward_at=np.inf, break_observation_at=np.inf):
-        self.observation_space = Box(-np.inf, np.inf, shape, np.float32)
+    def __init__(self, break_reward_at=np.inf, break_observation_at=np.inf):
         self.break_reward_at, self.break_observation_at = break_reward_at, break_observation_at
         self.total = 0
 
@@ -91,7 +90,7 @@ class Category(Other):
 
 
 class Buggy(Count):
-    """Its author made a mistake, in the constructor, in reset or in step."""
+    """Its author made a mistake, in the constructor or in step."""
 
     def __init__(self, where):
         super().__init__()
@@ -102,32 +101,9 @@ class Buggy(Count):
         if where == self.where:
             {}["missing"]
 
-    def reset(self, **kwargs):
-        self.mistake("reset")
-        return super().reset(**kwargs)
-
     def step(self, action):
         self.mistake("step")
         return super().step(action)
-
-
-class Parts(Count):
-    """Observes a dictionary of the step: as a number, twice, and perhaps as a category."""
-
-    def __init__(self, categories=False):
-        super().__init__()
-        spaces = {"position": Box(-np.inf, np.inf, (2,)), "speed": Box(-np.inf, np.inf, (1,))}
-        if categories:
-            spaces["phase"] = gym.spaces.Discrete(3)
-        self.observation_space = gym.spaces.Dict(spaces)
-
-    def observe(self):
-        observation = {
-            "position": np.full(2, self.steps, np.float32),
-            "speed": np.full(1, -self.steps, np.float32),
-            "phase": np.int64(self.steps % 3),
-        }
-        return {name: observation[name] for name in self.observation_space}
 
 
 class Endless(Count):
@@ -149,18 +125,6 @@ class Slow(Count):
     def step(self, action):
         time.sleep(0.005)
         return super().step(action)
-
-
-class OneReset(Count):
-    """Its author forgot something when an episode begins anew."""
-
-    resets = 0
-
-    def reset(self, **kwargs):
-        self.resets += 1
-        if self.resets == 2:
-            raise RuntimeError("the window is open already")
-        return super().reset(**kwargs)
 
 
 class Talks(Count):
@@ -200,17 +164,12 @@ def register(name, entry_point, steps, **kwargs):
     gym.register(f"{name}-v0", entry_point, max_episode_steps=steps, kwargs=kwargs)
 
 
-sequence = gym.spaces.Sequence(Box(-1.0, 1.0, (2,)))
 register("Tiny", Tiny, 8)
 register("Push", Push, 20)
 register("Count", Count, 8)
-register("Square", Count, 8, shape=(2, 2))
 register("NanReward", Count, 8, break_reward_at=70)
 register("NanObservation", Count, 8, break_observation_at=70)
-register("DictObservation", Parts, 8)
-register("OneHotObservation", Parts, 8, categories=True)
 register("CategoryObservation", Category, 8, observation_space=gym.spaces.Discrete(3))
-register("SequenceObservation", Other, 8, observation_space=sequence)
 register("Endless", Endless, None)
 register("NoLimit", Endless, None, length=20)
 register("DiscreteAction", Other, 8, action_space=gym.spaces.Discrete(3))
@@ -219,10 +178,8 @@ largest = float(np.finfo(np.float32).max)  # which stands for no bound
 register("FloatMax", Other, 8, action_space=Box(-largest, largest, (1,)))
 register("NoEnv", object, 8)
 register("BuggyConstructor", Buggy, 8, where="constructor")
-register("BuggyReset", Buggy, 8, where="reset")
 register("BuggyStep", Buggy, 8, where="step")
 register("Slow", Slow, 100)
-register("OneReset", OneReset, 8)
 register("Talks", Talks, 8)
 register("IsSuccess", Solves, 8, key="is_success", kind=np.bool_)
 register("Success", Solves, 8, key="success", kind=int)
