@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 import check_script
+import commands
 import numpy as np
 import pytest
 import torch
@@ -124,9 +125,8 @@ def test_a_changed_script_is_swept(number, tmp_path):
     sweep += ["--total-timesteps", "100", "--runs-dir", "runs", "--jobs", "2", "--"]
     trial = check_script.Trial(path, [], tmp_path)
     trial.command(ROOT / "benchmark.sh", *sweep, *options, *OPTIONS.get(number, []))
-    trial.command(sys.executable, ROOT / "evaluate.py", "runs", "--episodes", "2")
-    out = trial.command(sys.executable, ROOT / "analyze.py", "--runs-dir", "runs")
-    assert f"{algorithm.upper()}: 100 steps, seeds: 2" in out
+    analysed = commands.run(ROOT / "analyze.py", ["--runs-dir", "runs"], cwd=tmp_path)
+    assert f"{algorithm.upper()}: 100 steps, seeds: 2" in analysed.out, analysed.err
 
 
 def test_n_step_returns_are_those_of_the_episodes(tmp_path):

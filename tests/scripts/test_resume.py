@@ -106,7 +106,7 @@ def die_once_in_place(temporary, path):
 
 
 def wait(*args):
-    time.sleep(0.05)
+    time.sleep(0.02)
 
 
 def send(*numbers):
