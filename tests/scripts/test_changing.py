@@ -83,8 +83,7 @@ def imported(number, folder):
     return script
 
 
-# everyday: a change of the network, of the algorithm's loop (both of PPO or TD3, which are quick)
-EVERYDAY = (1, 9)
+EVERYDAY = (1, 9)  # two that are quick, of the network and of the loop; `make test` trains all
 
 
 @pytest.mark.parametrize(

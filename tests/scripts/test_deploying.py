@@ -45,22 +45,13 @@ class Sensors(gym.Env):
         return self.observe(), float(action.sum()), ended, False, {}
 
 
-class Plain(Sensors):
-    """A dictionary of two vectors."""
-
-    observation_space = Dict({"speed": Box(-9, 9, (2,)), "angle": Box(-3, 3, (1,))})
-
-    def observe(self):
-        return super().observe()["arm"]
-
-
-class HalfBounded(Plain):
+class HalfBounded(Sensors):
     """One action is bounded on one side only; for PPO."""
 
     action_space = Box(np.float32([-np.inf, -0.01]), np.float32([0.01, np.inf]))
 
 
-for environment in (Sensors, Plain, HalfBounded):
+for environment in (Sensors, HalfBounded):
     gym.register(f"{environment.__name__}-v0", environment, max_episode_steps=20)
 
 
@@ -107,7 +98,8 @@ def follow_page(algorithm, env_id, folder):
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "env_id"), [("sac", "Plain-v0"), ("td3", "Plain-v0"), ("ppo", "HalfBounded-v0")]
+    ("algorithm", "env_id"),
+    [("sac", "Sensors-v0"), ("td3", "Sensors-v0"), ("ppo", "HalfBounded-v0")],
 )
 def test_numpy_alone_plays_a_policy(algorithm, env_id, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -128,10 +120,10 @@ def test_a_policy_of_a_gpu_needs_no_gpu_no_environment_and_no_tyro(tmp_path):
     on_gpu = mock.patch("torch.serialization.location_tag", return_value="cuda:0")
     for algorithm in SMALL:
         with on_gpu:  # this is what a file of a GPU says of its tensors
-            script, run_dir = train(algorithm, "Plain-v0", tmp_path / algorithm)
+            script, run_dir = train(algorithm, "Sensors-v0", tmp_path / algorithm)
         code += f"from {script.__name__} import load_policy\n"
-        code += f"print(load_policy({str(run_dir)!r})(numpy.ones(3)).tolist())\n"
-        expected.append(f"{script.load_policy(run_dir)(np.ones(3)).tolist()}\n")
+        code += f"print(load_policy({str(run_dir)!r})(numpy.ones(10)).tolist())\n"
+        expected.append(f"{script.load_policy(run_dir)(np.ones(10)).tolist()}\n")
     code += "print({'tyro', 'mujoco', 'pandas'} & {*sys.modules})"
     env = os.environ | {"PYTHONPATH": str(ROOT)}
     result = subprocess.run(
