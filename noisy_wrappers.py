@@ -1844,7 +1844,6 @@ def _generators(env: Env) -> dict[str, Any]:
             if issubclass(type(value), gym.Space):
                 holders |= _parts_of_space(f"{i}.{name}", value)
     kinds = (np.random.Generator, np.random.RandomState, random.Random)
-    kinds += (np.random.SeedSequence,)  # which counts the children that it spawned
     found = {}
     for place, holder in holders.items():
         for name, value in vars(holder).items():
@@ -1866,8 +1865,6 @@ def _parts_of_space(place: str, space: gym.Space[Any]) -> dict[str, gym.Space[An
 
 def _stream(generator: Any) -> Any:
     """Return the state of a generator, or of random or np.random, in Python's own types."""
-    if isinstance(generator, np.random.SeedSequence):
-        return _without_arrays(generator.state)
     if generator is random or isinstance(generator, random.Random):
         return generator.getstate()
     if generator is np.random or isinstance(generator, np.random.RandomState):  # dm_control's
@@ -1879,9 +1876,7 @@ def _stream(generator: Any) -> Any:
 
 
 def _set_stream(generator: Any, stream: Any) -> None:
-    if isinstance(generator, np.random.SeedSequence):
-        generator.__init__(**stream)
-    elif generator is random or isinstance(generator, random.Random):
+    if generator is random or isinstance(generator, random.Random):
         version, words, normal = stream
         generator.setstate((version, tuple(words), normal))
     elif generator is np.random or isinstance(generator, np.random.RandomState):
@@ -1922,9 +1917,7 @@ def run_name(
     first = f"{rate}_s{seed}_{noise}" if noise else f"{rate}_s{seed}"
     environment = safe_name(env_id)
     for name, value in sorted(parse_env_kwargs(env_kwargs).items()):
-        is_text = isinstance(value, str) and parse_env_kwargs([f"{name}:{value}"])[name] == value
-        written = value if is_text else repr(value)  # the text '2' is not the number 2
-        plain = safe_name(written)
+        written, plain = str(value), safe_name(str(value))
         environment += f"_{name}={plain}" if plain == written else f"_{name}={_hashed(written)}"
     end = f"__{environment}__{safe_name(exp_name)}"
     if test := Configuration.read(test_noise, test_noise_rate).slug:
@@ -1942,12 +1935,11 @@ def _hashed(text: str, length: int = 8) -> str:
 
 
 def _words(noise: str) -> str:
-    """Return a noise as a part of a file's name; different noises have different ones."""
+    """Return a noise as a part of a file's name."""
     plain = noise.replace("=(", "=").replace("', '", "-").replace("'", "")  # keys=a-b
     words = safe_name("_".join(re.findall(r"[^(), ]+", plain)))
     name, _, arguments = noise.partition("(")
-    odd = "'" in re.sub(r"'[A-Za-z_][A-Za-z0-9_.]*'", "", noise)  # a key that is no plain name
-    if odd or (":" in name and re.search(r"""[(\[{'"]""", arguments)):  # own, not numbers only
+    if ":" in name and re.search(r"""[(\[{'"]""", arguments):  # own, and not of numbers only
         words += f"_{_hashed(noise)}"
     return words
 

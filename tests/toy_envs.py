@@ -51,8 +51,7 @@ class Count(gym.Env):
     observation_space = Box(-np.inf, np.inf, (1,), np.float32)
     action_space = Box(-1.0, 1.0, (1,), np.float32)
 
-    def __init__(self, shape=(1,), breaks=""):
-        self.observation_space = Box(-np.inf, np.inf, shape, np.float32)
+    def __init__(self, breaks=""):
         self.breaks, self.total = breaks, 0
 
     def value(self, name, whole):
@@ -101,25 +100,6 @@ class Buggy(Count):
 
     def step(self, action):
         return {}["missing"]
-
-
-class Parts(Count):
-    """Observes a dictionary of the step: as a number, twice, and perhaps as a category."""
-
-    def __init__(self, categories=False):
-        super().__init__()
-        spaces = {"position": Box(-np.inf, np.inf, (2,)), "speed": Box(-np.inf, np.inf, (1,))}
-        if categories:
-            spaces["phase"] = gym.spaces.Discrete(3)
-        self.observation_space = gym.spaces.Dict(spaces)
-
-    def observe(self):
-        observation = {
-            "position": np.full(2, self.steps, np.float32),
-            "speed": np.full(1, -self.steps, np.float32),
-            "phase": np.int64(self.steps % 3),
-        }
-        return {name: observation[name] for name in self.observation_space}
 
 
 class Endless(Count):
@@ -182,11 +162,8 @@ def register(name, entry_point, steps, **kwargs):
 register("Tiny", Tiny, 8)
 register("Push", Push, 20)
 register("Count", Count, 8)
-register("Square", Count, 8, shape=(2, 2))
 register("NanReward", Count, 8, breaks="reward")
 register("NanObservation", Count, 8, breaks="observation")
-register("DictObservation", Parts, 8)
-register("OneHotObservation", Parts, 8, categories=True)
 register("CategoryObservation", Category, 8, observation_space=gym.spaces.Discrete(3))
 register("Endless", Endless, None)
 register("NoLimit", Endless, None, length=20)
@@ -194,6 +171,7 @@ register("DiscreteAction", Other, 8, action_space=gym.spaces.Discrete(3))
 register("Unbounded", Other, 8, action_space=Box(-np.inf, np.inf, (1,)))
 largest = float(np.finfo(np.float32).max)  # which stands for no bound
 register("FloatMax", Other, 8, action_space=Box(-largest, largest, (1,)))
+register("NoEnv", object, 8)
 register("BuggyConstructor", Buggy, 8, where="constructor")
 register("BuggyStep", Buggy, 8, where="step")
 register("Slow", Slow, 100)

@@ -6,7 +6,6 @@ The commands are processes forked from a server (commands.py).
 import functools
 import io
 import os
-import pickle
 import random
 import resource
 import shutil
@@ -14,7 +13,6 @@ import signal
 import subprocess
 import sys
 import time
-import zipfile
 from dataclasses import field, make_dataclass
 from pathlib import Path
 
@@ -31,10 +29,12 @@ from small_runs import (
     each_script,
     flags,
     folder,
+    one_line,
     outcome,
     read_json,
     refused,
     run,
+    two_scripts,
     wait_for_a_later_name,
 )
 
@@ -55,10 +55,8 @@ HOPPER |= {"checkpoint_frequency": 40}
 ROLLOUTS = {"num_steps": 60, "num_minibatches": 4, "update_epochs": 2}
 OFF_POLICY = {"total_timesteps": 180, "learning_starts": 135}
 OFF_POLICY |= {"batch_size": 16, "buffer_size": 120}  # which overflows
-EARLY, EXPLORING, LATE = 2, 5, 10  # ends of an episode: near steps 25, 75 and 150
+EARLY, LATE = 2, 10  # ends of an episode: near steps 25 and 150
 TRAINING_STEP = "gymnasium.wrappers.RecordEpisodeStatistics.step"
-
-two_scripts = pytest.mark.parametrize("algorithm", ["SAC", "PPO"])  # TD3 trains in SAC's order
 
 
 def hopper(algorithm):
@@ -108,7 +106,7 @@ def die_once_in_place(temporary, path):
 
 
 def wait(*args):
-    time.sleep(0.05)
+    time.sleep(0.02)
 
 
 def send(*numbers):
@@ -187,9 +185,7 @@ KILLS = {
     "the first one written, not on the disk": ("os.fsync", None, die_flushing_checkpoint),
     "the first one on the disk, not in place": ("os.replace", None, Nth("checkpoint", 1, die)),
     "mid-episode, after an evaluation that the checkpoint lacks": (TRAINING_STEP, 80, die),
-    "the next checkpoint half written": half_way("checkpoint"),
     "the next but one not in place": ("os.replace", None, Nth("checkpoint", 2, die)),
-    "mid-episode": (TRAINING_STEP, 71, die),
     "the policy half written": half_way("policy"),
     "a test not in place": ("os.replace", None, Nth("eval", 2, die)),  # the first is on resuming
     "the result not in place": ("os.replace", None, Nth("result", 1, die)),
@@ -215,7 +211,7 @@ def test_killed_again_and_again_it_ends_as_if_left_alone(algorithm, alone, tmp_p
 
 
 @pytest.mark.slow
-@each_script
+@two_scripts
 def test_stopped_at_random_moments_it_ends_as_if_left_alone(algorithm, alone, tmp_path):
     seed = random.randrange(10**6)
     print("seed", seed)  # which pytest shows if this fails
@@ -258,7 +254,7 @@ def test_events_are_on_the_disk_before_the_checkpoint_is(alone, tmp_path):
 @pytest.mark.slow
 def test_killed_by_somebody_else_compiled(tmp_path):
     """With torch.compile, by kill -9 from outside."""
-    small = {"num_steps": 16, "total_timesteps": 1000, "eval_frequency": 250}
+    small = {"num_steps": 16, "total_timesteps": 240, "eval_frequency": 80}
     small |= {"matmul_precision": "highest", "compile": True, "checkpoint_frequency": 40}
     uninterrupted = command("PPO", tmp_path / "alone", **small)
     assert (uninterrupted.code, uninterrupted.err) == (0, "")
@@ -280,29 +276,15 @@ def test_killed_by_somebody_else_compiled(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "numbers, code",  # pkill and timeout signal a program as well as the one that passes it on
-    [((signal.SIGTERM, signal.SIGTERM, signal.SIGHUP), 143), ((signal.SIGINT,), 130)],
-)
-def test_a_signal_ends_the_episode_and_the_run_resumes(numbers, code, tmp_path):
+def test_several_signals_end_the_episode_and_the_run_resumes(tmp_path):
+    numbers = signal.SIGTERM, signal.SIGTERM, signal.SIGHUP  # of timeout, and of what it stops
     result = command("PPO", tmp_path, (TRAINING_STEP, 65, send(*numbers)), **hopper("PPO"))
-    assert (result.code, result.err) == (code, "")
-    told = "stopping after this episode; Ctrl-C again: without a checkpoint\n"
-    assert 1 <= result.out.count(told) <= len(numbers)  # two that arrive at once may be one
+    assert (result.code, result.err) == (143, "")
     assert result.out.endswith("\nstopped; run the same command again to resume\n")
-    checkpoint = ppo.read_state(folder(tmp_path) / "checkpoint.pt")
-    assert 65 <= checkpoint["step"] < 100
-    result = command("PPO", tmp_path, (TRAINING_STEP, 20, send(*numbers)), **hopper("PPO"))
-    assert (result.code, result.err) == (code, "")
-    assert f"resumed at step {checkpoint['step']}\n" in result.out
-
-
-@pytest.mark.slow
-def test_a_second_ctrl_c_ends_the_program_at_once(tmp_path):
-    action = send(signal.SIGTERM, signal.SIGINT)
-    result = command("PPO", tmp_path, (TRAINING_STEP, 30, action), **hopper("PPO"))
-    assert (result.code, result.err) == (128 + signal.SIGINT, "")
-    assert not list(tmp_path.glob("*/checkpoint.pt"))
+    step = ppo.read_state(folder(tmp_path) / "checkpoint.pt")["step"]
+    assert 65 <= step < 100
+    result = command("PPO", tmp_path, (TRAINING_STEP, 20, send(signal.SIGINT)), **hopper("PPO"))
+    assert (result.code, result.err) == (130, "") and f"resumed at step {step}\n" in result.out
 
 
 # FROM A CHECKPOINT
@@ -310,13 +292,16 @@ def test_a_second_ctrl_c_ends_the_program_at_once(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "episodes", [*(pytest.param(n, marks=pytest.mark.slow) for n in (EARLY, EXPLORING)), LATE]
+    ("algorithm", "episodes"),
+    [("SAC", LATE), ("PPO", LATE)]
+    + [pytest.param("TD3", LATE, marks=pytest.mark.slow)]
+    + [pytest.param(each, EARLY, marks=pytest.mark.slow) for each in ("SAC", "PPO")],
 )
-@each_script
 def test_stopped_and_resumed_it_ends_as_if_left_alone(
     algorithm, episodes, alone, copy_of_stopped, tmp_path
 ):
-    copy_of_stopped(algorithm, tmp_path, episodes)
+    stopped = copy_of_stopped(algorithm, tmp_path, episodes)
+    (stopped / "eval.csv").write_text("damaged, and healed")
     assert not differing(outcome(run(algorithm, tmp_path, **hopper(algorithm))), alone(algorithm))
 
 
@@ -344,28 +329,21 @@ class Part:
         self.state = state
 
 
-@pytest.fixture
-def a_run(tmp_path):
-    """Return a function that begins or resumes the run in a folder, without training."""
-    args = arguments("PPO", tmp_path, eval_frequency=20)
-
-    def begin():
-        env = ppo.noisy.make_noisy(ppo.make_env(args.env_id), [], [])
-        return ppo.Run(args, env)
-
-    return begin
+def a_run(runs_dir):
+    """Begin or resume the run in a folder, without training."""
+    args = arguments("PPO", runs_dir, eval_frequency=20)
+    return ppo.Run(args, ppo.noisy.make_noisy(ppo.make_env(args.env_id), [], []))
 
 
-def test_numbers_and_arrays_of_numpy_come_back(a_run):
-    state = {"array": np.arange(6.0).reshape(2, 3), "empty": np.zeros((0, 3), np.float32)}
-    state |= {"number": np.float64(0.1), "count": np.int64(3), "flag": np.bool_(True)}
-    state |= {"bits": np.uint8([1]), "half": np.float16([0.5]), "flags": np.array([True, False])}
+def test_numbers_and_arrays_of_numpy_come_back(tmp_path):
+    state = {"empty": np.zeros((0, 3), np.float32), "flags": np.array([True, False])}
+    state |= {"number": np.float64(0.1), "count": np.int64(3), "half": np.float16([0.5])}
     state |= {"tensor": torch.arange(3), "text": "é", "nested": [{"a": (1, None, 2.5)}]}
-    first = a_run()
+    first = a_run(tmp_path)
     assert first.resume({"mine": Part(**state)}) == 0
     first.save(8)
     first.lock.close()
-    mine, second = Part(), a_run()
+    mine, second = Part(), a_run(tmp_path)
     assert second.resume({"mine": mine}) == 8
     assert mine.state.keys() == state.keys()
     for name, value in state.items():
@@ -377,11 +355,21 @@ def test_numbers_and_arrays_of_numpy_come_back(a_run):
             assert mine.state[name] == value
 
 
-def test_state_that_cannot_be_read_back_is_named_at_the_start(a_run, capsys):
-    for value in (np.random.default_rng(), Path("x"), lambda: 0, np.array([Path("x")])):
+def test_state_that_cannot_be_read_back_is_named_at_the_start(tmp_path, capsys):
+    for value in (np.random.default_rng(), lambda: 0, np.array([Path("x")])):
         state = {"whole": Part(a=1), "mine": Part(value=value)}
-        line = refused(capsys, lambda state=state: a_run().resume(state))
+        line = refused(capsys, lambda state=state: a_run(tmp_path).resume(state))
         assert line.startswith("error: the state of 'mine' cannot be saved and read back: ")
+
+
+def test_a_checkpoint_of_other_parts_is_named(tmp_path, capsys):
+    first = a_run(tmp_path)
+    first.resume({"mine": Part(a=1)})
+    first.save(8)
+    first.lock.close()
+    state = {"mine": Part(a=1), "scheduler": Part(b=2)}
+    line = refused(capsys, lambda: a_run(tmp_path).resume(state))
+    assert "it holds ['mine'], not ['mine', 'scheduler']" in line
 
 
 # REFUSED
@@ -404,14 +392,10 @@ def untouched(capsys, path, **kwargs):
 def test_a_damaged_checkpoint_is_noticed(stopped, capsys):
     path = stopped / "checkpoint.pt"
     whole = path.read_bytes()
-    with zipfile.ZipFile(path) as archive:
-        members = [member for member in archive.infolist() if member.file_size]
-    damaged = [whole[:1000], whole[: len(whole) // 2], whole[:-1], whole[100:], b"", b"an essay"]
-    for member in members[:: max(1, len(members) // 4)] + members[-3:]:
-        header = whole[member.header_offset :][:30]
-        lengths = int.from_bytes(header[26:28], "little") + int.from_bytes(header[28:], "little")
+    damaged = [whole[: len(whole) // 2], whole[:-1], b"", b"an essay"]
+    for part in (0.4, 0.6):  # one bit of large arrays
         damaged.append(bytearray(whole))
-        damaged[-1][member.header_offset + 30 + lengths + member.file_size // 2] ^= 1
+        damaged[-1][int(part * len(whole))] ^= 1
     for content in damaged:
         path.write_bytes(content)
         assert f"cannot read {path}" in untouched(capsys, stopped)
@@ -429,28 +413,17 @@ class Intruder:
 
 def test_a_checkpoint_cannot_run_code(stopped, tmp_path, capsys):
     trace, path = tmp_path / "trace", stopped / "checkpoint.pt"
-    checkpoint = ppo.read_state(path)
-    pickle.loads(pickle.dumps(Intruder(trace)))
-    assert trace.exists()  # it works where it is let in
-    trace.unlink()
-    path.write_bytes(pickle.dumps(Intruder(trace)))
-    untouched(capsys, stopped)
-    torch.save(checkpoint | {"eval_csv": Intruder(trace)}, path)
+    torch.save(ppo.read_state(path) | {"eval_csv": Intruder(trace)}, path)
     untouched(capsys, stopped)
     assert not trace.exists()
-
-
-def test_a_damaged_eval_csv_is_healed(stopped, alone):
-    (stopped / "eval.csv").write_text("an essay")
-    assert not differing(outcome(run("PPO", stopped.parent, **hopper("PPO"))), alone("PPO"))
+    torch.load(path, weights_only=False)
+    assert trace.exists()  # it works where it is let in
 
 
 def test_a_run_with_other_arguments_is_refused_until_overwritten(stopped, alone, capsys):
     line = untouched(capsys, stopped, gamma=0.5, eval_episodes=3)
     assert "gamma 0.99, not 0.5" in line and "eval_episodes 2, not 3" in line
     assert "total_timesteps" not in line and "--exp-name" in line
-    (stopped / "checkpoint.pt").write_bytes(b"damaged")
-    untouched(capsys, stopped)
     free = {"checkpoint_frequency": 90, "torch_threads": 1, "overwrite": True}
     run("PPO", stopped.parent, **hopper("PPO") | free)
     assert not differing(outcome(stopped), alone("PPO"))
@@ -466,28 +439,23 @@ def test_a_new_option_is_another_run_unless_it_has_its_default(stopped, monkeypa
     options = [("layer_norm", bool, False), ("schedule", str, "none"), sizes]
     monkeypatch.setattr(ppo, "Args", make_dataclass("Args", options, bases=(ppo.Args,)))
     assert "layer_norm False, not True" in untouched(capsys, stopped, layer_norm=True)
-    assert "sizes [64, 64], not [32]" in untouched(capsys, stopped, sizes=(32,))
     resumed = {"episodes": 1, "sizes": (64, 64)}  # a tuple and a list of JSON
     run("PPO", stopped.parent, **hopper("PPO") | resumed)
-    shutil.rmtree(stopped)
-    for episodes in (3, 1):  # with a new option from the start
-        run("PPO", stopped.parent, episodes=episodes, **hopper("PPO"), sizes=(32,))
+    run("PPO", stopped.parent, episodes=3, **hopper("PPO"), sizes=(32,), overwrite=True)
     config = read_json(stopped / "config.json")
     assert config["args"]["sizes"] == [32] and config["defaults"]["sizes"] == [64, 64]
-    assert "sizes [32], not [64, 64]" in untouched(capsys, stopped)
-    monkeypatch.undo()  # and the script that lacks it knows its default from that config.json
+    monkeypatch.undo()  # the script that lacks it knows its default from that config.json
     assert "sizes [32], not [64, 64]" in untouched(capsys, stopped)
 
 
-def test_another_text_of_the_script_is_said_and_recorded(stopped, tmp_path, monkeypatch, capsys):
+def test_another_text_of_the_script_is_said_and_recorded(
+    stopped, tmp_path_factory, monkeypatch, capsys
+):
     config = read_json(stopped / "config.json")
-    copy = tmp_path.parent / f"{tmp_path.name}-copy" / "ppo_continuous_noisy.py"
-    copy.parent.mkdir()
+    copy = tmp_path_factory.mktemp("copy") / "ppo_continuous_noisy.py"
     copy.write_text(Path(ppo.__file__).read_text() + "# changed\n")
     kwargs = hopper("PPO") | {"exp_name": config["args"]["exp_name"]}
     said = "the script has changed since the run began; if it matters, use --exp-name\n"
-    run("PPO", stopped.parent, episodes=1, **kwargs)
-    assert said not in capsys.readouterr().out
     monkeypatch.setattr(ppo, "__file__", str(copy))
     monkeypatch.setattr(ppo.torch, "__version__", "99.0")
     run("PPO", stopped.parent, **kwargs)
@@ -505,27 +473,25 @@ def test_another_text_of_the_script_is_said_and_recorded(stopped, tmp_path, monk
 @pytest.mark.slow
 def test_a_second_process_is_refused_while_the_first_one_lives(tmp_path):
     long = {"total_timesteps": 10**9, "eval_frequency": 10**9, "checkpoint_frequency": 1}
-    first = start("SAC", tmp_path, **long | {"learning_starts": 10**9 - 1})
+    long |= {"learning_starts": 10**9 - 1}
+    first = start("SAC", tmp_path, **long)
     while not list(tmp_path.glob("*/checkpoint.pt")):
         assert first.is_alive()
         time.sleep(0.01)
     for overwrite in (False, True):
-        more = {"overwrite": overwrite, "learning_starts": 10**9 - 1}
-        second = command("SAC", tmp_path, (TRAINING_STEP, 30, die), **long | more)
+        second = command("SAC", tmp_path, (TRAINING_STEP, 30, die), **long, overwrite=overwrite)
         assert second.code == 2
-        assert second.err.startswith(f"error: {folder(tmp_path)} is in use by another process")
-        assert second.err.count("\n") == 1
+        assert f"{folder(tmp_path)} is in use by another process" in one_line(second.err)
     assert first.is_alive() and list(tmp_path.glob("*/checkpoint.pt"))
     first.kill()
     assert commands.ended(first).code == -signal.SIGKILL
-    moment = (TRAINING_STEP, 10, send(signal.SIGTERM))
-    third = command("SAC", tmp_path, moment, **long, learning_starts=10**9 - 1)
+    third = command("SAC", tmp_path, (TRAINING_STEP, 10, send(signal.SIGTERM)), **long)
     assert (third.code, third.err) == (143, "")
 
 
 @pytest.mark.slow
 def test_a_full_disk_ends_the_run_and_leaves_whole_files(alone, copy_of_stopped, tmp_path):
-    path = copy_of_stopped("PPO", tmp_path, EXPLORING) / "checkpoint.pt"
+    path = copy_of_stopped("PPO", tmp_path, EARLY) / "checkpoint.pt"
     before = path.read_bytes()
     result = command("PPO", tmp_path, (TRAINING_STEP, 1, fill_disk), **hopper("PPO"))
     assert result.code == 1 and "File too large" in result.err
@@ -552,14 +518,12 @@ def test_a_policy_of_0_3_plays_as_it_did(algorithm):
     np.testing.assert_allclose(results[:, 0], expected, rtol=1e-3)
 
 
-@each_script
-def test_a_run_of_0_3_is_not_resumed(algorithm, tmp_path, capsys):
-    run_dir = tmp_path / OLD_RUNS[algorithm].name
-    shutil.copytree(OLD_RUNS[algorithm], run_dir)
+def test_a_run_of_0_3_is_not_resumed(tmp_path, capsys):
+    run_dir = tmp_path / OLD_RUNS["PPO"].name
+    shutil.copytree(OLD_RUNS["PPO"], run_dir)
     saved = read_json(run_dir / "config.json")["args"]
-    args = SCRIPTS[algorithm].Args(**saved | {"runs_dir": str(tmp_path)})
     before = files(run_dir)
-    line = refused(capsys, SCRIPTS[algorithm].train, args)
+    line = refused(capsys, ppo.train, ppo.Args(**saved | {"runs_dir": str(tmp_path)}))
     assert "a run of version 0.3, whose numbers differ: finish it with that one" in line
     assert "--exp-name" in line and files(run_dir) == before
 
@@ -586,21 +550,17 @@ def test_tools_read_runs_of_0_3(tmp_path):
 MUJOCO = ["HalfCheetah-v5", "Hopper-v5", "Humanoid-v5", "Pusher-v5", "Walker2d-v5"]
 
 
-@pytest.mark.parametrize("env_id", [*MUJOCO, "Ant-v5", "Pendulum-v1"])
+@pytest.mark.parametrize("env_id", MUJOCO)
 def test_between_episodes_an_environment_is_its_random_generator(env_id):
-    used, fresh = gym.make(env_id, max_episode_steps=50), gym.make(env_id, max_episode_steps=50)
+    used, fresh = gym.make(env_id), gym.make(env_id)
     for env in (used, fresh):
         env.reset(seed=1)
     used.action_space.seed(1)
-    over = False
-    while not over:
-        _, _, terminated, truncated, _ = used.step(used.action_space.sample())
-        over = terminated or truncated
+    for _ in range(20):
+        used.step(used.action_space.sample())
     fresh.unwrapped.np_random.bit_generator.state = used.unwrapped.np_random.bit_generator.state
     assert np.array_equal(used.reset()[0], fresh.reset()[0])
-    for _ in range(100):
+    for _ in range(20):
         action = used.action_space.sample()
         (o1, r1, *end1, _), (o2, r2, *end2, _) = used.step(action), fresh.step(action)
         assert o1.tobytes() == o2.tobytes() and r1 == r2 and end1 == end2
-        if any(end1):
-            assert np.array_equal(used.reset()[0], fresh.reset()[0])

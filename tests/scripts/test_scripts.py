@@ -1,16 +1,13 @@
 """The three scripts as a user meets them: runs, run folders, TensorBoard, errors, learning."""
 
 import ast
-import inspect
 import itertools
 import json
 import math
 import os
 import re
 import subprocess
-import sys
-import time
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from unittest import mock
 
@@ -19,9 +16,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-import toy_envs
 from small_runs import (
-    ROOT,
     SCRIPTS,
     arguments,
     command,
@@ -33,7 +28,7 @@ from small_runs import (
     read_json,
     refused,
     run,
-    td3_is_slow,
+    two_scripts,
 )
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams import plugin_data_pb2
@@ -41,7 +36,7 @@ from tensorboard.plugins.hparams import plugin_data_pb2
 import ppo_continuous_noisy as ppo
 import sac_continuous_noisy as sac
 import td3_continuous_noisy as td3
-from noisy_wrappers import NoiseWrapper, NotFiniteError, __version__, signatures
+from noisy_wrappers import NotFiniteError, __version__, signatures
 
 NOISES = ("RandomNormalNoisyReward(0.5)", "RandomEarlyTermination(2, 4)")
 
@@ -69,22 +64,6 @@ def test_what_the_scripts_share_is_word_for_word_the_same():
     assert sac.TEST_SEED == td3.TEST_SEED == ppo.TEST_SEED
 
 
-def test_arguments_that_scripts_share_have_one_meaning():
-    """Defaults and help differ only where CleanRL's defaults do."""
-    pattern = re.compile(r"((?:^    # .+\n)*)^    (\w+): (.+?) = (.+?)(?:  # (.+))?$", re.M)
-    per_algorithm = {"eval_frequency", "learning_starts", "matmul_precision", "policy_frequency"}
-    per_algorithm |= {"total_timesteps", "learning_rate"}
-    meanings = {}
-    for script in SCRIPTS.values():
-        documented = pattern.findall(inspect.getsource(script.Args))
-        assert [name for _, name, *_ in documented] == [f.name for f in fields(script.Args)]
-        for above, name, kind, default, behind in documented:
-            assert above or behind, name
-            above = "" if behind else above  # tyro takes what stands behind, if anything does
-            meanings.setdefault(name, set()).add((kind, default, above, behind))
-    assert {name for name, values in meanings.items() if len(values) > 1} <= per_algorithm
-
-
 CLEANRL = {
     "SAC": "total_timesteps=1000000 buffer_size=1000000 gamma=0.99 tau=0.005 batch_size=256 "
     "learning_starts=5000 policy_lr=0.0003 q_lr=0.001 policy_frequency=2 "
@@ -100,10 +79,8 @@ CLEANRL = {
 
 @each_script
 def test_defaults_are_cleanrls(algorithm):
-    actual, defaults = asdict(SCRIPTS[algorithm].Args()), CLEANRL[algorithm].split()
-    assert [
-        f"{name}={actual[name]}" for name, _, _ in (x.partition("=") for x in defaults)
-    ] == defaults
+    actual = {f"{name}={value}" for name, value in asdict(SCRIPTS[algorithm].Args()).items()}
+    assert set(CLEANRL[algorithm].split()) <= actual
 
 
 # WHAT A RUN LEAVES
@@ -130,9 +107,7 @@ def test_run_folder(tmp_path, capsys):
     bounds = {"low": "-inf", "high": "inf"}
     assert config["observation_space"] == {"shape": [3], **bounds, "dtype": "float64"}
     assert config["action_space"]["low"] == [-1.0, -0.5]
-    assert config["matmul_precision"] in ("highest", "medium")
     versions = {"noisy_wrappers": __version__, "torch": torch.__version__}
-    versions |= {"gymnasium": gym.__version__, "numpy": np.__version__}
     assert versions.items() <= config["versions"].items()
 
     rows = evaluations(run_dir)
@@ -144,13 +119,10 @@ def test_run_folder(tmp_path, capsys):
     assert result["final_return_n"] == 3
     assert result["total_timesteps"] == result["trained_timesteps"] == 60
     assert result["steps_per_second"] == pytest.approx(60 / result["wall_time_seconds"])
-    assert result["processor_seconds"] > 0
-    assert math.isfinite(result["train_return_mean_last_100"])
     applied, counts = result["noise_applied_fraction"], result["noise_applied"]
     names = ["RandomEarlyTermination", "RandomNormalNoisyReward"]
     assert list(applied) == list(counts) == names
     assert counts["RandomNormalNoisyReward"][1] == 60  # steps; of the other, episodes
-    assert 60 / 8 <= counts["RandomEarlyTermination"][1] <= 60
     for name, rate in zip(names, (0.25, 0.5), strict=True):
         assert applied[name] == counts[name][0] / counts[name][1] == pytest.approx(rate, abs=0.3)
 
@@ -165,14 +137,13 @@ def test_run_folder(tmp_path, capsys):
     assert after == before
 
 
-def replayed(script, run_dir, env_id="toy_envs:Tiny-v0", **kwargs):
+def replayed(script, run_dir):
     """Play the last test of a run again, in a clean environment -> [(return, length)]."""
-    env, act, found = gym.make(env_id, **kwargs), script.load_policy(run_dir), []
+    env, act, found = gym.make("toy_envs:Tiny-v0"), script.load_policy(run_dir), []
     for episode in range(3):
         observation, _ = env.reset(seed=1_000_000 + episode)
         total, steps, done = 0.0, 0, False
         while not done:
-            observation = observation.ravel().astype(np.float64)
             observation, reward, terminated, truncated, _ = env.step(act(observation))
             total, steps, done = total + reward, steps + 1, terminated or truncated
         found.append((total, steps))
@@ -181,18 +152,12 @@ def replayed(script, run_dir, env_id="toy_envs:Tiny-v0", **kwargs):
 
 @each_script
 def test_the_test_environment_is_clean_and_policies_play_without_an_environment(
-    algorithm, tmp_path, monkeypatch
+    algorithm, tmp_path
 ):
-    script, envs, play = SCRIPTS[algorithm], [], SCRIPTS[algorithm].noisy.play
+    script = SCRIPTS[algorithm]
     noises = ("RandomEarlyTermination(2)", "RandomNormalNoisyReward(1.0, loc=100)")
     noise = {"noise": (*noises, "RandomUniformNoisyObservation(50, 60)"), "noise_rate": (1.0,)}
-    monkeypatch.setattr(script.noisy, "play", lambda *args: envs.append(args[0]) or play(*args))
     kept = run(algorithm, tmp_path / "kept", keep_policies=True, **noise)
-    assert len(envs) == 3
-    for env in envs:
-        while isinstance(env, gym.Wrapper):
-            assert not isinstance(env, NoiseWrapper)
-            env = env.env
     assert len(list(kept.glob("policy*.pt"))) == 4
     for step in (60, 20, 40):  # policy.pt is that of the last test
         if step != 60:
@@ -210,11 +175,7 @@ def test_noise_of_tests_and_arguments_of_the_environment(tmp_path):
     name = "baseline_s1__toy_envs--Endless-v0_length=5__ppo_continuous_noisy"
     assert run_dir.name == f"{name}__tests_p1.0_EarlyTermination_3"
     config = read_json(run_dir / "config.json")["args"]
-    assert config["env_kwargs"] == ["length:5"]
-    assert (config["test_noise"], config["test_noise_rate"]) == (
-        ["RandomEarlyTermination(3)"],
-        [1.0],
-    )
+    assert (config["env_kwargs"], config["test_noise_rate"]) == (["length:5"], [1.0])
     assert {row[2:] for row in evaluations(run_dir)} == {(3.0, 3)}
     result = read_json(run_dir / "result.json")
     assert result["train_return_mean_last_100"] == 5 and result["noise_applied"] == {}
@@ -222,52 +183,37 @@ def test_noise_of_tests_and_arguments_of_the_environment(tmp_path):
     torch.testing.assert_close(policy(run_dir), policy(plain), rtol=0, atol=0)
 
 
-def test_success_is_an_outcome(tmp_path, capsys):
-    run_dir = run("PPO", tmp_path, env_id="toy_envs:IsSuccess-v0")
+def test_success_is_an_outcome(tmp_path):
+    run_dir = run("PPO", tmp_path / "both", env_id="toy_envs:IsSuccess-v0")
     env, solved = ppo.make_env("toy_envs:IsSuccess-v0"), []
     for episode in range(3):
         env.reset(seed=1_000_000 + episode)
         solved.append(env.unwrapped.solved)
     assert 0 < sum(solved) < 3
-    header, *lines = (run_dir / "eval.csv").read_text().splitlines()
-    assert header == "step,episode,episodic_return,episodic_length,success"
+    _, *lines = (run_dir / "eval.csv").read_text().splitlines()
     assert lines == [f"{s},{i},8.0,8,{solved[i]:d}" for s in (20, 40, 60) for i in range(3)]
     rate = sum(solved) / 3
     assert read_json(run_dir / "result.json")["final_success_rate"] == rate
-    events = EventAccumulator(str(run_dir)).Reload()
-    assert [e.value for e in events.Scalars("eval/success_rate")] == pytest.approx([rate] * 3)
-    training = events.Scalars("charts/success_rate")  # of single episodes
-    assert [e.step for e in training] == list(range(8, 60, 8))
-    assert {e.value for e in training} == {0.0, 1.0}
-
-
-def test_an_environment_may_tell_success_alone(tmp_path):
-    run_dir = run("PPO", tmp_path, env_id="toy_envs:SuccessOnly-v0")
+    found = curves(run_dir)
+    assert [float(value) for _, value in found["eval/success_rate"]] == pytest.approx([rate] * 3)
+    training = found["charts/success_rate"]  # of single episodes
+    assert [step for step, _ in training] == list(range(8, 60, 8))
+    assert {value for _, value in training} == {"0.0", "1.0"}
+    # some environments tell it only where it is solved
+    run_dir = run("PPO", tmp_path / "only", env_id="toy_envs:SuccessOnly-v0")
     table = [line.split(",") for line in (run_dir / "eval.csv").read_text().splitlines()]
     assert [row[4] for row in table] == ["success", "", "", "", "", "1", "1", "", "", ""]
-    found = curves(run_dir)["eval/success_rate"]
-    assert [float(value) for _, value in found] == pytest.approx([2 / 3])
 
 
-@td3_is_slow
-def test_ten_tests_at_least(algorithm, tmp_path):
-    script = SCRIPTS[algorithm]
-    assert (50_000 if algorithm == "PPO" else 10_000) == script.EVAL_FREQUENCY  # at most
-    run_dir = run(algorithm, tmp_path, eval_frequency=None, eval_episodes=1)
-    assert read_json(run_dir / "config.json")["args"]["eval_frequency"] == 6  # a tenth of 60 steps
-    steps = sorted({row[0] for row in evaluations(run_dir)})
-    # PPO tests once in 12 steps, a rollout
-    assert steps == list(range(12, 61, 12) if algorithm == "PPO" else range(6, 61, 6))
-
-
-@pytest.mark.parametrize("algorithm", ["SAC", "PPO"])
+@two_scripts
 def test_overwrite_of_nothing_and_a_short_run(algorithm, tmp_path):
-    short = {"total_timesteps": 5, "eval_frequency": 3, "eval_episodes": 1}
-    short |= {"PPO": {"num_steps": 5, "num_minibatches": 1}, "SAC": {"learning_starts": 4}}[
-        algorithm
-    ]
+    short = {"total_timesteps": 5, "eval_frequency": None, "eval_episodes": 1}
+    of_ppo, of_sac = {"num_steps": 5, "num_minibatches": 1}, {"learning_starts": 4}
+    short |= of_ppo if algorithm == "PPO" else of_sac
     run_dir = run(algorithm, tmp_path, env_id="toy_envs:Count-v0", overwrite=True, **short)
-    assert [row[0] for row in evaluations(run_dir)] == ([5] if algorithm == "PPO" else [3, 5])
+    # ten tests if there are as many steps, but PPO's are at the end of a rollout
+    tests = [5] if algorithm == "PPO" else [1, 2, 3, 4, 5]
+    assert [row[0] for row in evaluations(run_dir)] == tests
     result = read_json(run_dir / "result.json")
     assert result["train_return_mean_last_100"] is None  # no episode ended
     assert result["final_return_std"] == 0
@@ -275,7 +221,7 @@ def test_overwrite_of_nothing_and_a_short_run(algorithm, tmp_path):
 
 def test_ppo_evaluates_at_the_end_of_rollouts_under_the_nominal_step(tmp_path):
     rollouts = {"num_steps": 16, "num_minibatches": 2, "eval_episodes": 1}
-    run_dir = run("PPO", tmp_path / "a", total_timesteps=100, eval_frequency=20, **rollouts)
+    run_dir = run("PPO", tmp_path / "seldom", total_timesteps=100, eval_frequency=20, **rollouts)
     result = read_json(run_dir / "result.json")
     assert (result["total_timesteps"], result["trained_timesteps"]) == (100, 96)
     # rollouts end at 16, 32, ..., 96; 100 is what was asked for
@@ -284,67 +230,26 @@ def test_ppo_evaluates_at_the_end_of_rollouts_under_the_nominal_step(tmp_path):
     assert tests == [32, 48, 64, 80, 96]
     run_dir = run("PPO", tmp_path / "often", total_timesteps=48, eval_frequency=5, **rollouts)
     assert [row[0] for row in evaluations(run_dir)] == [15, 30, 48]
-    run_dir = run("PPO", tmp_path / "seldom", total_timesteps=64, eval_frequency=32, **rollouts)
-    assert [row[0] for row in evaluations(run_dir)] == [32, 64]
 
 
 # ENVIRONMENTS
 
 
-@pytest.mark.parametrize("env_id", ["Square", "DictObservation", "OneHotObservation"])
-def test_observations_become_vectors(env_id, tmp_path):
-    env_id = f"toy_envs:{env_id}-v0"
-    noise = {"noise": ("RandomNormalNoisyObservation(0.5)",), "noise_rate": (0.5,)}
-    run_dir = run("PPO", tmp_path, env_id=env_id, **noise)
-    applied = read_json(run_dir / "result.json")["noise_applied_fraction"]
-    assert 0.3 < applied["RandomNormalNoisyObservation"] < 0.7
-    env = ppo.make_env(env_id)
-    assert env.action_space.contains(ppo.load_policy(run_dir)(env.reset()[0]))
-
-
-def test_time_limits(tmp_path, monkeypatch):
+def test_time_limits(tmp_path):
     limit = {"env_id": "toy_envs:Endless-v0", "max_episode_steps": 5}
-    run_dir = run("PPO", tmp_path / "own", **limit)
+    run_dir = run("PPO", tmp_path, **limit)
     assert {row[2:] for row in evaluations(run_dir)} == {(5.0, 5)}
-    assert read_json(run_dir / "config.json")["args"]["max_episode_steps"] == 5
-    for script in SCRIPTS.values():
-        assert script.make_env("toy_envs:Endless-v0").spec.max_episode_steps == 10_000
-        assert script.make_env("Pendulum-v1").spec.max_episode_steps == 200
-    monkeypatch.setattr(ppo, "STEP_LIMIT", 11)
-    run_dir = run("PPO", tmp_path / "ours", env_id="toy_envs:Endless-v0")
-    assert {row[3] for row in evaluations(run_dir)} == {11}
+    assert ppo.make_env("toy_envs:Endless-v0").spec.max_episode_steps == 10_000
+    assert ppo.make_env("Pendulum-v1").spec.max_episode_steps == 200
 
 
-def test_what_a_constructor_draws_is_the_same_in_the_tests_of_all_runs(tmp_path, monkeypatch):
-    class Goal(toy_envs.Count):
-        def __init__(self):
-            super().__init__()
-            self.goal = np.random.normal()
-
-    gym.register("Goal-v0", Goal, max_episode_steps=8)
-    goals = []
-
-    def learn(args, env, test_env, stop):
-        goals.append((env.unwrapped.goal, test_env.unwrapped.goal))
-
-    monkeypatch.setattr(ppo, "learn", learn)
-    for seed in (1, 2, 1):
-        ppo.train(arguments("PPO", tmp_path, env_id="Goal-v0", seed=seed))
-    (first, test), (second, same), again = goals
-    assert test == same and again == (first, test)
-    assert len({first, second, test}) == 3
-
-
-@td3_is_slow
+@each_script
 def test_a_rate_that_changes_follows_the_steps(algorithm, tmp_path):
     script = SCRIPTS[algorithm]
     noise = {"noise": ("RandomNormalNoisyReward(0.5)",), "noise_rate": ("1:0",)}
     with mock.patch.object(script.noisy, "set_progress", wraps=script.noisy.set_progress) as spy:
         run_dir = run(algorithm, tmp_path, env_id="toy_envs:Count", **noise)
     assert [call.args[1] for call in spy.call_args_list] == [n / 60 for n in range(8, 60, 8)]
-    assert run_dir.name.startswith("p1.0to0.0_s1_NormalNoisyReward_0.5__toy_envs--Count-v0__")
-    args = read_json(run_dir / "config.json")["args"]
-    assert (args["noise_rate"], args["env_id"]) == (["1.0:0.0"], "toy_envs:Count-v0")
     [(applied, of)] = read_json(run_dir / "result.json")["noise_applied"].values()
     p = 1 - np.arange(60) // 8 * 8 / 60
     assert of == 60
@@ -359,31 +264,27 @@ BAD = [  # arguments, what the line names
     ({"env_id": "CartPole-v1"}, "needs Box actions of floats in one dimension; CartPole-v1 has"),
     ({"exp_name": ".."}, "--exp-name must be a name, not '..'"),
     ({"noise": NOISES, "noise_rate": (0.1, 1.1)}, "1.1"),
-    ({"noise": NOISES}, "noise without a noise rate"),
     ({"test_noise": ("RandomNormalNoisyReward(1.0)",), "test_noise_rate": (2.0,)}, "noise_rate"),
     ({"env_kwargs": ("length=5",)}, "env_kwargs: 'length=5' is not name:value"),
     (
-        {
-            "env_id": "toy_envs:OneHotObservation-v0",
-            "noise": ("RandomDropoutObservation(0.5, keys='phase')",),
-            "noise_rate": (0.1,),
-        },
-        "RandomDropoutObservation cannot perturb categories",
+        {"env_id": "toy_envs:Count-v0", "env_kwargs": ("mass:2.0",)},
+        "unexpected keyword argument 'mass'",
     ),
-    ({"max_episode_steps": 0}, "--max-episode-steps must be at least 1, not 0"),
+    ({"env_id": "toy_envs:NoEnv-v0"}, "must inherit from the gymnasium.Env class"),
     ({"seed": -1}, "--seed must be at least 0, not -1\n"),
-    ({"total_timesteps": 0}, "--total-timesteps must be at least 1, not 0\n"),
     ({"gamma": 1.1}, "--gamma must be at most 1, not 1.1\n"),
     ({"gamma": math.nan}, "--gamma must be at least 0, not nan\n"),
     ({"num_steps": 61}, "--num-steps must be from 2 * --num-minibatches (6) to"),
     ({"num_minibatches": 13}, "--num-steps must be from"),
 ]
+BAD += [] if torch.cuda.is_available() else [({"cuda": True}, "--cuda: PyTorch finds no GPU")]
 BAD_OF_OTHERS = [
     ({"env_id": "toy_envs:Unbounded-v0"}, "SAC needs bounded actions", "SAC"),
-    ({"env_id": "toy_envs:Unbounded-v0"}, "TD3 needs bounded actions", "TD3"),
-    ({"q_lr": -1e-3}, "--q-lr must be at least 0, not -0.001", "SAC"),
+    ({"env_id": "toy_envs:FloatMax-v0"}, "TD3 needs bounded actions", "TD3"),
     ({"learning_starts": 60}, "must be below --total-timesteps, 60\n", "SAC"),
     ({"learning_starts": 90}, "must be below --total-timesteps, 60\n", "TD3"),
+    ({"buffer_size": 10**15}, "error: --buffer-size 1000000000000000: ", "SAC"),
+    ({"buffer_size": 10**15}, "error: --buffer-size 1000000000000000: ", "TD3"),
 ]
 
 
@@ -391,36 +292,8 @@ BAD_OF_OTHERS = [
     ("bad", "word", "algorithm"), [*((*case, "PPO") for case in BAD), *BAD_OF_OTHERS]
 )
 def test_bad_input(bad, word, algorithm, tmp_path, capsys):
-    assert word in refused(capsys, run, algorithm, tmp_path / "runs", **bad)
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("algorithm", ["SAC", "TD3"])
-def test_a_buffer_that_needs_more_memory_than_there_is(algorithm, tmp_path, capsys):
-    line = refused(capsys, run, algorithm, tmp_path, buffer_size=10**15)
-    assert line.startswith("error: --buffer-size 1000000000000000: ")
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="has a GPU")
-def test_cuda_without_a_gpu(tmp_path, capsys):
-    assert "--cuda" in refused(capsys, run, "PPO", tmp_path / "runs", cuda=True)
-    assert not (tmp_path / "runs").exists()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("options", "word"),
-    [
-        (["--noise", "RandomUniformScaleReward(0.5)", "--noise-rate", "0.1"], "high"),
-        (["--total-timesteps", "many"], "many"),
-        (["--no-such-option"], "no-such"),
-    ],
-)
-def test_bad_command(options, word, tmp_path):
-    result = command("PPO", *options, cwd=tmp_path)
-    assert result.code == 2
-    assert word in result.err + result.out and "Traceback" not in result.err + result.out
-    assert list(tmp_path.iterdir()) == []
+    assert word in refused(capsys, run, algorithm, tmp_path, **bad)
+    assert not list(tmp_path.glob("*/[!.]*"))  # at most an empty folder with its .lock
 
 
 # DIVERGENCE
@@ -435,17 +308,11 @@ def test_nan_stops_the_run(what, tmp_path):
     assert not list(tmp_path.glob("*/result.json")) + list(tmp_path.glob("*/policy.pt"))
 
 
-@td3_is_slow
+@each_script
 def test_a_loss_that_is_not_finite_stops_the_run(algorithm, tmp_path):
-    rate = {
-        "SAC": {
-            "q_lr": 1e18,
-            "total_timesteps": 22,
-            "learning_starts": 20,
-        },  # before an action is NaN
-        "TD3": {"learning_rate": 1e18, "total_timesteps": 22, "learning_starts": 20},
-        "PPO": {"learning_rate": 1e18},
-    }[algorithm]
+    rate = {"q_lr" if algorithm == "SAC" else "learning_rate": 1e18}
+    if algorithm != "PPO":
+        rate |= {"total_timesteps": 22, "learning_starts": 20}  # before an action is NaN
     with pytest.raises(NotFiniteError, match=r"^step \d+: training diverged.*losses/"):
         run(algorithm, tmp_path, **rate)
     assert not list(tmp_path.glob("*/result.json"))
@@ -464,7 +331,7 @@ CHARTS += "noise/RandomNormalNoisyReward/applied_fraction noise/RandomNormalNois
 CHARTS += "noise/RandomEarlyTermination/applied_fraction noise/RandomEarlyTermination/rate"
 
 
-@td3_is_slow
+@each_script
 def test_curves(algorithm, tmp_path):
     noise = {"noise": NOISES, "noise_rate": (0.5, 0.25), "total_timesteps": 120}
     noise |= {} if algorithm == "PPO" else {"learning_starts": 95}
@@ -474,12 +341,11 @@ def test_curves(algorithm, tmp_path):
     more = {"charts/learning_rate"} if algorithm == "PPO" else set()
     assert set(values) == losses | more | set(CHARTS.split()) | {"text"}
     rows = np.array(evaluations(run_dir)).reshape(-1, 3, 4)
-    for tag, expected in (
-        ("eval/episodic_return_mean", rows[:, :, 2].mean(1)),
-        ("eval/episodic_return_std", rows[:, :, 2].std(1, ddof=1)),
-        ("eval/episodic_length_mean", rows[:, :, 3].mean(1)),
-    ):
-        np.testing.assert_allclose(list(values[tag].values()), expected, rtol=1e-6)
+    expected = {"return_mean": rows[:, :, 2].mean(1), "length_mean": rows[:, :, 3].mean(1)}
+    expected |= {"return_std": rows[:, :, 2].std(1, ddof=1)}
+    for name, of_tests in expected.items():
+        curve = list(values[f"eval/episodic_{name}"].values())
+        np.testing.assert_allclose(curve, of_tests, rtol=1e-6)
     result = read_json(run_dir / "result.json")
     episodes = list(values["charts/episodic_return"].values())
     assert np.mean(episodes[-100:]) == pytest.approx(result["train_return_mean_last_100"])
@@ -488,18 +354,9 @@ def test_curves(algorithm, tmp_path):
     for tag in losses:
         assert list(values[tag]) == ([*range(12, 121, 12)] if algorithm == "PPO" else [100, 120])
     for name, fraction in result["noise_applied_fraction"].items():
-        curve = values[f"noise/{name}/applied_fraction"]
-        assert curve[120] == pytest.approx(fraction)
-    events = EventAccumulator(str(run_dir)).Reload()
-    assert min(event.value for event in events.Scalars("charts/SPS")) > 0
-    assert events.Scalars("charts/SPS")[-1].step == 120
-
-
-def test_alpha_has_a_curve_when_it_is_not_tuned(tmp_path):
-    found = curves(run("SAC", tmp_path, autotune=False, alpha=0.3))
-    values = [float(value) for _, value in found["losses/alpha"]]
-    assert values == pytest.approx([0.3] * len(values)) and len(values) > 0
-    assert "losses/alpha_loss" not in found
+        assert values[f"noise/{name}/applied_fraction"][120] == pytest.approx(fraction)
+    speeds = EventAccumulator(str(run_dir)).Reload().Scalars("charts/SPS")
+    assert min(speed.value for speed in speeds) > 0 and speeds[-1].step == 120
 
 
 def test_tensorboard_knows_the_hyperparameters(tmp_path):
@@ -511,7 +368,7 @@ def test_tensorboard_knows_the_hyperparameters(tmp_path):
     for tag, data in events.PluginTagToContent("hparams").items():
         content[tag.rpartition("/")[2]] = plugin_data_pb2.HParamsPluginData.FromString(data)
     metrics = [info.name.tag for info in content["experiment"].experiment.metric_infos]
-    assert metrics == ["eval/episodic_return_mean", "charts/episodic_return", "eval/success_rate"]
+    assert "eval/episodic_return_mean" in metrics
     shown = content["session_start_info"].session_start_info.hparams
     assert set(shown) == set(asdict(ppo.Args()))
     assert "RandomEarlyTermination(2, 4)" in shown["noise"].string_value
@@ -530,35 +387,34 @@ def test_command_line(tmp_path):
     assert (result.code, result.err) == (0, "")
     [run_dir] = tmp_path.iterdir()
     first, *lines, last, finished, tensorboard = result.out.splitlines()
-    noises = "RandomEarlyTermination(2, 4) at 0.25 + RandomNormalNoisyReward(0.5) at 0.5"
-    assert first == f"PPO on toy_envs:NoLimit-v0, {noises}, seed 1: {run_dir}"
+    assert all(text in first for text in ("PPO", "NoLimit-v0", *NOISES, "0.25", str(run_dir)))
     assert len(lines) == 2  # not a terminal: plain lines, of each test
     mean = read_json(run_dir / "result.json")["final_return_mean"]
     assert re.fullmatch(rf"step=60/60 sps=\d+ eval_return={mean:.2f} eta=00:00", last)
-    assert finished.rstrip() == f"{run_dir} is finished after 60 steps: eval_return={mean:.2f}"
-    assert tensorboard == f"See its curves with: tensorboard --logdir {tmp_path}"
+    assert f"{run_dir} is finished" in finished and str(tmp_path) in tensorboard
     again = command("PPO", *flags(args))
     assert (again.code, again.out, again.err) == (0, f"{run_dir} is finished\n", "")
 
 
+MY_ENVS = """
+from toy_envs import Tiny, register
+
+class Mine(Tiny):
+    def reset(self, **kwargs):
+        import my_physics  # only now
+        return super().reset(**kwargs)
+
+register("Mine", Mine, 8)
+"""
+
+
 @pytest.mark.slow
 def test_a_module_beside_the_caller(tmp_path):
-    (tmp_path / "my_envs.py").write_text(
-        "from toy_envs import Tiny, register\n\n\n"
-        "class Mine(Tiny):\n"
-        "    def reset(self, **kwargs):\n"
-        "        import my_physics  # only now\n\n"
-        "        return super().reset(**kwargs)\n\n\n"
-        "register('Mine', Mine, 8)\n"
-    )
     (tmp_path / "my_physics.py").touch()
-    options = ["--env-id", "my_envs:Mine-v0", "--total-timesteps", "60", "--no-compile"]
-    options += ["--learning-starts=50", "--eval-frequency", "0", "--eval-episodes", "1"]
-    line = [sys.executable, sac.__file__, *options]
-    path = {"PYTHONPATH": str(ROOT / "tests")}
-    subprocess.run(line, cwd=tmp_path, env=os.environ | path, timeout=240, check=True)
-    [run_dir] = (tmp_path / "runs").iterdir()
-    assert read_json(run_dir / "config.json")["args"]["env_id"] == "my_envs:Mine-v0"
+    (tmp_path / "my_envs.py").write_text(MY_ENVS)
+    args = arguments("SAC", tmp_path / "runs", env_id="my_envs:Mine-v0", eval_frequency=0)
+    result = command("SAC", *flags(args), cwd=tmp_path)
+    assert (result.code, result.err) == (0, "")
 
 
 @pytest.mark.slow
@@ -573,30 +429,11 @@ def test_training_goes_on_when_its_reader_has_left(tmp_path):
 
 
 @pytest.mark.slow
-@each_script
-def test_help_has_examples_and_noises(algorithm):
-    result = command(algorithm, "--help")
+def test_help_has_examples_and_noises():
+    result = command("SAC", "--help")
     assert result.code == 0
-    assert f"python {algorithm.lower()}_continuous_noisy.py --env-id HalfCheetah-v5" in result.out
-    for signature in signatures():
-        assert f"  {signature}\n" in result.out
-    groups = ["RUN", "NOISE", "TESTS", "SPEED", "ALGORITHM"]  # on lines of their own
-    options = result.out.partition(" options ")[2]
-    assert re.findall(r" (RUN|NOISE|TESTS|SPEED|ALGORITHM)\W*\n", options) == groups
-
-
-@td3_is_slow
-def test_progress_goes_forward(algorithm, tmp_path, monkeypatch, capsys):
-    clock = itertools.count(step=11)  # a line of progress may be printed every 10 seconds
-    monkeypatch.setattr(time, "monotonic", lambda: float(next(clock)))
-    run(algorithm, tmp_path, env_id="toy_envs:Count-v0", eval_frequency=7)
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("step=")]
-    steps = [int(re.match(r"step=(\d+)/60 sps=\d+ ", line)[1]) for line in lines]
-    assert steps == sorted(steps) and steps[-1] == 60 and len(set(steps)) > 7
-    assert all(re.search(r" eta=(\?|\d\d:\d\d)$", line) for line in lines)
-    assert " eval_return=8.00 " in lines[-1]
-    if algorithm == "PPO":  # the others log their losses, and so know their speed, at the end
-        assert lines[-1].endswith("eta=00:00")
+    assert "python sac_continuous_noisy.py --env-id HalfCheetah-v5" in result.out
+    assert all(f"  {signature}\n" in result.out for signature in signatures())
 
 
 # LEARNING
@@ -625,6 +462,3 @@ def test_learning(algorithm, tmp_path):
     """
     run_dir = run(algorithm, tmp_path, **LEARNERS[algorithm] | MILD, env_id="toy_envs:Push-v0")
     assert np.mean([row[2] for row in evaluations(run_dir)[-30:]]) > -4
-    result = read_json(run_dir / "result.json")
-    for name, rate in zip(result["noise_applied"], MILD["noise_rate"], strict=True):
-        assert result["noise_applied_fraction"][name] == pytest.approx(rate, rel=0.3)

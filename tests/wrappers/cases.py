@@ -7,55 +7,32 @@ import mujoco
 import numpy as np
 from hypothesis import settings
 
-from noisy_wrappers import (
-    WRAPPERS,
-    RandomDropoutObservation,
-    RandomMixupObservation,
-    RandomNormalNoisyObservation,
-    RandomNormalNoisyReward,
-    RandomUniformNoisyObservation,
-    RandomUniformNoisyReward,
-    RandomUniformScaleObservation,
-    RandomUniformScaleReward,
-)
+from noisy_wrappers import WRAPPERS
 
 # Derandomized: a failure in CI is a failure on every machine.
 hypothesis_settings = settings(deadline=None, derandomize=True, max_examples=150)
 
-# wrapper, arguments, keywords, formula(noise generator, o_t, o_(t-1))
-OBSERVATION_CASES = [
-    (RandomNormalNoisyObservation, (0.3,), {}, lambda g, o, _: o + g.normal(0, 0.3, o.shape)),
-    (
-        RandomNormalNoisyObservation,
-        (0.3,),
-        {"loc": -0.5},
-        lambda g, o, _: o + g.normal(-0.5, 0.3, o.shape),
+# a noise, and its formula(noise generator, o_t, o_(t-1)) for three numbers
+OBSERVATION_CASES = {
+    "RandomNormalNoisyObservation(0.3)": lambda g, o, _: o + g.normal(0, 0.3, 3),
+    "RandomNormalNoisyObservation((0.3, 0.0, 2.0), loc=-0.5)": (
+        lambda g, o, _: o + g.normal(-0.5, [0.3, 0.0, 2.0])
     ),
-    (
-        RandomNormalNoisyObservation,
-        ((0.3, 0.0, 2.0),),
-        {},
-        lambda g, o, _: o + g.normal(0, [0.3, 0.0, 2.0]),
+    "RandomUniformNoisyObservation(-0.2, 0.7)": lambda g, o, _: o + g.uniform(-0.2, 0.7, 3),
+    "RandomUniformScaleObservation(0.5, 1.7)": lambda g, o, _: o * g.uniform(0.5, 1.7),
+    "RandomUniformScaleObservation(0.5, 1.7, per_dimension=True)": (
+        lambda g, o, _: o * g.uniform(0.5, 1.7, 3)
     ),
-    (RandomUniformNoisyObservation, (-0.2, 0.7), {}, lambda g, o, _: o + g.uniform(-0.2, 0.7, 3)),
-    (RandomUniformScaleObservation, (0.5, 1.7), {}, lambda g, o, _: o * g.uniform(0.5, 1.7)),
-    (
-        RandomUniformScaleObservation,
-        (0.5, 1.7),
-        {"per_dimension": True},
-        lambda g, o, _: o * g.uniform(0.5, 1.7, o.shape),
-    ),
-    (RandomMixupObservation, (0.3,), {}, lambda g, o, previous: 0.3 * o + 0.7 * previous),
-    (RandomMixupObservation, (0.0,), {}, lambda g, o, previous: previous),
-    (RandomDropoutObservation, (0.3,), {}, lambda g, o, _: (g.random(o.shape) < 0.3) * o),
-]
+    "RandomMixupObservation(0.3)": lambda g, o, previous: 0.3 * o + 0.7 * previous,
+    "RandomMixupObservation(0.0)": lambda g, o, previous: previous,
+    "RandomDropoutObservation(0.3)": lambda g, o, _: (g.random(3) < 0.3) * o,
+}
 
-REWARD_CASES = [
-    (RandomNormalNoisyReward, (0.3,), {}, lambda g, r: r + g.normal(0, 0.3)),
-    (RandomNormalNoisyReward, (0.3,), {"loc": 2.0}, lambda g, r: r + g.normal(2.0, 0.3)),
-    (RandomUniformNoisyReward, (-0.2, 0.7), {}, lambda g, r: r + g.uniform(-0.2, 0.7)),
-    (RandomUniformScaleReward, (0.5, 1.7), {}, lambda g, r: r * g.uniform(0.5, 1.7)),
-]
+REWARD_CASES = {
+    "RandomNormalNoisyReward(0.3, loc=2.0)": lambda g, r: r + g.normal(2.0, 0.3),
+    "RandomUniformNoisyReward(-0.2, 0.7)": lambda g, r: r + g.uniform(-0.2, 0.7),
+    "RandomUniformScaleReward(0.5, 1.7)": lambda g, r: r * g.uniform(0.5, 1.7),
+}
 
 # One configuration per wrapper, and the variants.
 NOISES = [
@@ -89,11 +66,8 @@ BASES = [
     *NOISES[-5:],
 ]
 STEP_BASES = [text for text in BASES if "Normal" in text or "Mixup" in text]
-# Those that are decided when an episode begins.
-EPISODE_NOISES = [text for text in NOISES if "Termination(3" in text or text in NOISES[-4:]]
 
-BOX = gym.spaces.Box(-10.0, 10.0, (3,), np.float64)
-WIDE = gym.spaces.Box(-10.0, 10.0, (30,), np.float64)  # dropout never keeps all of it
+BOX = gym.spaces.Box(-1, 1, (3,), np.float32)
 
 # A cart with a pole, and what mj_setConst computes for: a tendon, a camera, a light, a constraint.
 MODEL = """
@@ -131,8 +105,8 @@ class GenericEnv(gym.Env):
 
     action_space = gym.spaces.Box(-1.0, 1.0, (1,))
 
-    def __init__(self, observation_space=BOX, reset=None, step=None):
-        self.observation_space = observation_space
+    def __init__(self, observation_space=None, reset=None, step=None):
+        self.observation_space = observation_space or gym.spaces.Box(-10, 10, (3,), np.float64)
         self.model = mujoco.MjModel.from_xml_string(MODEL)  # which nothing here simulates
         self._reset = reset or (lambda env: (env.draw(), {}))
         self._step = step or (
@@ -201,7 +175,7 @@ def episodes_env(lengths):
         done = env.t == lengths[env.episode % len(lengths)]
         return env.draw(), 1.0, done, False, {}
 
-    return GenericEnv(WIDE, reset=reset, step=step)
+    return GenericEnv(reset=reset, step=step)
 
 
 def build(text, env, rate):
@@ -220,8 +194,9 @@ def registered(text):
 
 
 def streams(wrapper, seed, position=0):
-    """The documented seeding: the gate's and the noise's generator."""
-    entropy = [seed, zlib.crc32(wrapper.__name__.encode()), position]
+    """The documented seeding of a class, or of a text: the gate's and the noise's generator."""
+    name = wrapper.partition("(")[0] if isinstance(wrapper, str) else wrapper.__name__
+    entropy = [seed, zlib.crc32(name.encode()), position]
     return [np.random.default_rng(child) for child in np.random.SeedSequence(entropy).spawn(2)]
 
 
@@ -287,6 +262,3 @@ def layers(env):
         names.append(type(env).__name__)
         env = env.env
     return names[::-1]
-
-
-BOX = gym.spaces.Box(-1, 1, (3,), np.float32)

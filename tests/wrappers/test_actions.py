@@ -24,43 +24,29 @@ def actions_env(space):
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize(("rate", "loc"), [(0.3, 0.5), (1.0, 0.0)])
 def test_action_golden(rate, loc, dtype):
-    low, high = np.array([-1.0, -0.5]), np.array([1.0, np.inf])
-    bare = actions_env(gym.spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype))
+    low, high = np.array([-1.0, -0.7], dtype), np.array([0.3, np.inf], dtype)
+    bare = actions_env(gym.spaces.Box(low, high, dtype=dtype))
     env = RandomNormalNoisyAction(bare, rate, 0.4, loc=loc)
     gate, noise = streams(RandomNormalNoisyAction, seed=7)
     env.reset(seed=7)
     rng = np.random.default_rng(0)
     clipped = 0
-    for t in range(200):
+    for _ in range(200):
         action = rng.uniform(-1.5, 1.5, 2).astype(dtype)
         given = action.copy()
         action.flags.writeable = False
         info = env.step(action)[4]
         received = bare.received[-1]
-        assert np.array_equal(action, given)
         if gate.random() < rate:
             unclipped = given + noise.normal(loc, 0.4, 2)
             expected = np.clip(unclipped, low, high)
             clipped += np.any(expected != unclipped)
-            assert received.dtype == dtype and received is not action
+            assert received in bare.action_space and received is not action
             np.testing.assert_allclose(received, expected, rtol=4 * np.finfo(dtype).eps)
             assert info == {"noise": ("RandomNormalNoisyAction",)}
         else:
             assert received is action and info == {}
-        assert env.opportunities == t + 1
-    assert 0 < clipped < env.times_applied
-
-
-def test_noisy_actions_stay_in_the_action_space():
-    bare = actions_env(gym.spaces.Box(np.float32([-0.1, 0.3]), np.float32([0.1, 0.7])))
-    env = RandomNormalNoisyAction(bare, 1.0, 1e6)
-    env.reset(seed=0)
-    for _ in range(100):
-        env.step([0.0, 0.5])  # a list is an action, too
-    assert all(action in bare.action_space for action in bare.received)
-    assert {tuple(action) for action in bare.received} == {
-        (low, high) for low in np.float32([-0.1, 0.1]) for high in np.float32([0.3, 0.7])
-    }
+    assert 0 < clipped < env.times_applied and env.opportunities == 200
 
 
 def test_action_noise_needs_a_box_of_floats():
@@ -69,29 +55,23 @@ def test_action_noise_needs_a_box_of_floats():
             RandomNormalNoisyAction(actions_env(space), 0.1, 1.0)
 
 
-ACTIONS = gym.spaces.Discrete(100)
-
-
-def received(delay, count=6):
-    bare = actions_env(ACTIONS)
+@pytest.mark.parametrize(
+    ("delay", "received"),
+    [(0, [0, 1, 2, 3, 4]), (1, [0, 0, 1, 2, 3]), (2, [0, 0, 0, 1, 2]), (10**6, [0, 0, 0, 0, 0])],
+)
+def test_a_delay_by_hand(delay, received):
+    bare = actions_env(gym.spaces.Discrete(100))
     env = RandomActionDelay(bare, 1.0, delay)
     env.reset(seed=0)
-    marks = [env.step(action)[4].get("noise") for action in range(count)]
-    return bare.received, marks, env
-
-
-def test_a_delay_by_hand():
-    name = ("RandomActionDelay",)
-    assert received(2)[:2] == ([0, 0, 0, 1, 2, 3], [None] + 5 * [name])
-    assert received(1)[0] == [0, 0, 1, 2, 3, 4]
-    assert received(0)[:2] == ([0, 1, 2, 3, 4, 5], 6 * [None])
-    assert received(10**6)[0] == 6 * [0]
+    marked = ["noise" in env.step(action)[4] for action in range(5)]
+    assert bare.received == received
+    assert marked == [delay > 0 and t > 0 for t in range(5)]
 
 
 @pytest.mark.parametrize("rate", [0.4, 1.0])
 def test_delays_golden(rate):
     """k is uniform on both ends, drawn for every episode, and no action outlives its episode."""
-    bare = actions_env(ACTIONS)
+    bare = actions_env(gym.spaces.Discrete(100))
     env = RandomActionDelay(bare, rate, 1, 3)
     gate, noise = streams(RandomActionDelay, seed=3)
     seen = []
@@ -108,24 +88,18 @@ def test_delays_golden(rate):
     assert env.times_applied == sum(delay > 0 for delay in seen)
 
 
-def test_a_caller_may_reuse_the_array_of_its_action():
-    bare = actions_env(gym.spaces.Box(-1.0, 1.0, (1,)))
+def test_delayed_actions_may_be_of_any_kind_and_in_arrays_that_are_used_again():
+    bare = actions_env(gym.spaces.Dict(a=gym.spaces.Discrete(9), b=gym.spaces.Box(-1, 1, (1,))))
     env = RandomActionDelay(bare, 1.0, 1)
     env.reset(seed=0)
-    action = np.zeros(1)
+    action = {"a": 0, "b": np.zeros(1)}
     for t in range(4):
-        action[:] = t
+        action["a"] = t
+        action["b"][:] = t
         env.step(action)
-    assert [float(a[0]) for a in bare.received] == [0, 0, 1, 2]
-
-
-def test_actions_of_any_kind():
-    space = gym.spaces.Dict(a=gym.spaces.Discrete(3), b=gym.spaces.Box(-1, 1, (2,)))
-    bare = actions_env(space)
-    env = RandomActionDelay(bare, 1.0, 1)
-    env.reset(seed=0)
-    given = [space.sample() for _ in range(3)]
-    for action in given:
-        env.step(action)
-    for got, wanted in zip(bare.received, [given[0], given[0], given[1]], strict=True):
-        assert got["a"] == wanted["a"] and (got["b"] == wanted["b"]).all()
+    assert [(got["a"], float(got["b"][0])) for got in bare.received] == [
+        (0, 0),
+        (0, 0),
+        (1, 1),
+        (2, 2),
+    ]

@@ -2,16 +2,13 @@
 
 import math
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from cases import NOISES, A, B, C, GenericEnv, build, constant_env, layers, rollout
+from cases import NOISES, A, B, C, build, constant_env, layers, rollout
 
 from noisy_wrappers import (
     BASELINE,
     Configuration,
-    RandomEarlyTermination,
-    RandomNormalNoisyObservation,
     RandomNormalNoisyReward,
     make_noisy,
     noise_statistics,
@@ -28,51 +25,38 @@ from noisy_wrappers import (
 def test_notation_round_trips(text):
     noise = parse_noise(text)
     assert str(noise) == text
-    assert parse_noise(str(noise)) == noise
     assert len({noise, parse_noise(text)}) == 1
     wrapper = noise(constant_env(), 0.5)
-    assert str(wrapper).startswith(f"<{text.split('(')[0]}<")
     assert rollout(wrapper, 0)[-1][1:] == rollout(build(text, constant_env(), 0.5), 0)[-1][1:]
 
 
 SPELLINGS = """
-RandomUniformScaleReward(0.5, 1.5) | RandomUniformScaleReward(.5,1.50)
-RandomUniformScaleReward(0.5, 1.5) | RandomUniformScaleReward( 0.50, high=15e-1 )
-RandomUniformScaleReward(0.5, 1.5) | RandomUniformScaleReward(high=1.5, low=5e-1)
-RandomNormalNoisyReward(1.0) | RandomNormalNoisyReward(+1)
-RandomNormalNoisyReward(0.001) | RandomNormalNoisyReward(1e-3, loc=-0.0)
-RandomNormalNoisyReward(0.001, loc=2.0) | RandomNormalNoisyReward(loc=2,scale=.001)
+RandomUniformScaleReward(0.5, 1.5) | RandomUniformScaleReward( .50, high=15e-1 )
+RandomNormalNoisyReward(0.001, loc=2.0) | RandomNormalNoisyReward(loc=2,scale=1e-3)
 RandomUniformNoisyReward(0.0, 0.5) | RandomUniformNoisyReward(-0.0, .5, relative=False)
 RandomEarlyTermination(50) | RandomEarlyTermination(high=50, low=50)
 RandomEarlyTermination(50) | RandomEarlyTermination(50, None, truncate=False)
-RandomEarlyTermination(each_step=True, truncate=True) | RandomEarlyTermination(truncate=True, each_step=True)
-RandomMixupObservation(0.0) | RandomMixupObservation(0, recursive=False)
 RandomMixupObservation(0.0, recursive=True) | RandomMixupObservation(recursive=True, factor=0)
-"""  # noqa: E501
+RandomDropoutObservation(0.5, keys=('a', 'b')) | RandomDropoutObservation(.5, keys=['b', 'a', 'b'])
+RandomNormalNoisyObservation((0.1, 0.0)) | RandomNormalNoisyObservation(loc=0, scale=(.10, -0.0))
+"""
 
 
 @pytest.mark.parametrize("line", SPELLINGS.strip().split("\n"))
 def test_canonical_spelling(line):
     canonical, text = line.split(" | ")
-    assert str(parse_noise(text)) == canonical
-    assert parse_noise(text) == parse_noise(canonical)
+    assert str(parse_noise(text)) == canonical == str(parse_noise(canonical))
     assert run_name("E", "x", [text], [0.1], 1) == run_name("E", "x", [canonical], [0.10], 1)
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    ["", "1, 2", "-1", "1, sigma=2", "1, noise_rate=0.5", "'1'", "True", "2 * 3", "1e999", "x"]
-    + ["*[1]", "1, **{'loc': 2}", "1, loc=1, loc=2", "{[]: 1}", "1)(2", "__import__('os')", "\x00"],
-)
-def test_bad_arguments(arguments):
-    test_bad_notation(f"RandomNormalNoisyReward({arguments})")
+ARGUMENTS = ["", "1, 2", "-1", "1, sigma=2", "1, noise_rate=0.5", "'1'", "2 * 3", "1e999", "x"]
+ARGUMENTS += ["*[1]", "1, **{'loc': 2}", "1, loc=1, loc=2", "{[]: 1}", "1)(2", "__import__('os')"]
+NOT_NOISES = ["", "Baseline", "RandomNormalNoisyReward", "NoiseWrapper(1)", "dict()", "(" * 500]
+NOT_NOISES += ["RandomNormalNoisyReward(1", "noisy_wrappers.RandomNormalNoisyReward(1)"]
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["", "Baseline", "RandomNormalNoisyReward", "RandomNormalNoisyReward(1", "NoiseWrapper(1)"]
-    + ["dict()", "RandomUniformScaleReward(1.5, 0.5)", "RandomEarlyTermination(5.0)", "(" * 500]
-    + ["noisy_wrappers.RandomNormalNoisyReward(1)", "__import__('os').system('true')"],
+    "text", [*(f"RandomNormalNoisyReward({a})" for a in ARGUMENTS), *NOT_NOISES]
 )
 def test_bad_notation(text):
     with pytest.raises(ValueError) as error:
@@ -92,14 +76,10 @@ def test_canonical_notation():
     names = ["RandomEarlyTermination(9)", "RandomNormalNoisyReward(1.0)"]
     assert canonical([A, C], [0.5]) == (names, [0.5, 0.5])  # dynamics noise comes first
     assert canonical([A, B, C], [0.5, 0, 1]) == (names, [1.0, 0.5])
-    assert canonical([A, B], ["0:0", 0.0]) == ([], [])
+    assert canonical([A, B], ["-0.0:0", 0.0]) == ([], [])
     assert canonical([A, C], ["1:0", "0:.5"]) == (names, ["0.0:0.5", "1.0:0.0"])
-    assert canonical([A], ["-0.0:0"]) == ([], [])
     assert canonical([A], ["0.50:.5"]) == (names[1:], [0.5])
-    assert canonical([A, A], ["1:0"])[1] == ["1.0:0.0", "1.0:0.0"]
-    again = canonical([B, A, C], [0.1, 0.2, 0.3])
-    assert canonical(*again) == again
-    assert {type(rate) for rate in again[1]} == {float}
+    assert canonical(np.array([A, B]), np.array([0.5, 0.0])) == canonical([A, B], [0.5, 0.0])
 
 
 @pytest.mark.parametrize(
@@ -123,21 +103,6 @@ def test_noises_and_rates_are_lists():
         canonical([RandomNormalNoisyReward], [0.5])
 
 
-def test_numbers_and_arrays_of_numpy():
-    assert canonical(np.array([A, B]), np.array([0.5, 0.0])) == canonical([A, B], [0.5, 0.0])
-    for half in (np.float32(0.5), np.array(0.5)):
-        env = RandomNormalNoisyReward(constant_env(), half, half, loc=half)
-        assert (env.noise_rate, env.scale, env.loc) == (0.5, 0.5, 0.5)
-        assert {type(env.noise_rate), type(env.scale), type(env.loc)} == {float}
-    assert type(RandomEarlyTermination(constant_env(), 0.5, np.int64(9)).low) is int
-    env = GenericEnv(gym.spaces.Box(-1, 1, (3,)))
-    scales = RandomNormalNoisyObservation(env, 0.5, np.array([1, 2, 3])).scale
-    assert scales == (1.0, 2.0, 3.0) and {type(scale) for scale in scales} == {float}
-    for bad in (np.array([0.5, 0.5]), np.array(True), np.array(2.0)):
-        with pytest.raises(ValueError, match="noise_rate"):
-            RandomNormalNoisyReward(constant_env(), bad, 0.1)
-
-
 def test_make_noisy_order():
     statistics = "RecordEpisodeStatistics"
     reward, dropout, end = (text.split("(")[0] for text in (A, B, C))
@@ -145,13 +110,12 @@ def test_make_noisy_order():
     assert layers(make_noisy(constant_env(), [A, B], [0.5])) == [statistics, reward, dropout]
     env = make_noisy(constant_env(), [A, "RandomNormalNoisyAction(1)", B, C], ["0:1"])
     assert layers(env) == [end, "RandomNormalNoisyAction", statistics, reward, dropout]
-    assert {wrapper.schedule for wrapper in noise_wrappers(env).values()} == {(0.0, 1.0)}
     env = make_noisy(constant_env(), [B, A, C], [0.1, 0.2, 0.3])
     assert layers(env) == [end, statistics, dropout, reward]
-    rates = {name: wrapper.noise_rate for name, wrapper in noise_wrappers(env).items()}
-    assert list(rates.items()) == [(end, 0.3), (dropout, 0.1), (reward, 0.2)]
-    layers_alone = layers(make_noisy(constant_env(), [A, C], [0.5], record_statistics=False))
-    assert layers_alone == [end, reward]
+    rates = [(name, wrapper.noise_rate) for name, wrapper in noise_wrappers(env).items()]
+    assert rates == [(end, 0.3), (dropout, 0.1), (reward, 0.2)]
+    env = make_noisy(constant_env(), [A, C], [0.5], record_statistics=False)
+    assert layers(env) == [end, reward]
 
 
 def test_noise_statistics():
@@ -199,7 +163,6 @@ def test_it_is_read_and_written(noises, rates, noise, noise_rate):
     assert Configuration.parse(noise, noise_rate) == config
     assert config.texts == (noises, rates)
     assert (config == BASELINE) == (not noises)
-    assert Configuration.parse("", "0.00") == BASELINE == Configuration()
 
 
 def test_it_is_ordered_by_noise_and_by_its_rates_as_numbers():
@@ -211,19 +174,14 @@ def test_it_is_ordered_by_noise_and_by_its_rates_as_numbers():
     assert sorted(texts[::-1], key=rate_order) == texts
 
 
-def test_its_wrappers():
-    config = Configuration.read([ENDING, SCALE], [1.0, 0.5])
-    assert config.wrappers == ["RandomEarlyTermination", "RandomUniformScaleReward"]
-
-
 def test_spellings_of_one_configuration_are_one():
     config = Configuration.read(["RandomUniformScaleReward(.50, high=1.5)", ENDING], ["1:0", 0.05])
     assert config == Configuration.read([ENDING, SCALE], [0.05, "1.0:0.0"])
+    assert config.wrappers == ["RandomEarlyTermination", "RandomUniformScaleReward"]
     assert str(config) == f"{ENDING} + {SCALE} at 0.05 + 1.0 to 0.0"
     assert config.columns == (f"{ENDING} + {SCALE}", "0.05 + 1.0:0.0")
     assert config.slug == "p0.05+1.0to0.0_EarlyTermination_50+UniformScaleReward_0.5_1.5"
     assert (str(BASELINE), BASELINE.slug, BASELINE.columns) == ("no noise", "", ("", "0.0"))
-    assert Configuration.read([SCALE, ENDING], [0.0, "0:0"]) == BASELINE
 
 
 def test_what_a_program_has_stored():
@@ -236,7 +194,7 @@ def test_what_a_program_has_stored():
             Configuration.read([bad], [0.5], stored=True)
 
 
-@pytest.mark.parametrize("text", [f"{SCALE}+{SHIFT}", f" {SCALE} + {SHIFT} "])
-def test_an_entry_is_split_into_its_noises(text):
-    assert split_noises(text) == [SCALE, SHIFT]
+def test_an_entry_is_split_into_its_noises():
+    assert split_noises(f"{SCALE}+{SHIFT}") == split_noises(f" {SCALE} + {SHIFT} ")
     assert split_noises("A(1e+5)@1:0+B()@.5") == ["A(1e+5)@1:0", "B()@.5"]
+    assert split_noises("own:A('x + y()')+B()") == ["own:A('x + y()')", "B()"]

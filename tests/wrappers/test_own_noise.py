@@ -2,17 +2,18 @@
 
 import csv
 import json
+import os
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import commands
 import gymnasium as gym
 import numpy as np
 import pytest
-from cases import GenericEnv, streams
+from cases import GenericEnv
 from gymnasium.utils.env_checker import check_env
-from test_actions import actions_env
 
 from noisy_wrappers import (
     Configuration,
@@ -20,7 +21,6 @@ from noisy_wrappers import (
     make_noisy,
     parse_noise,
     run_name,
-    split_noises,
 )
 
 ROOT = Path(__file__).parents[2]
@@ -39,24 +39,6 @@ def folder(tmp_path, monkeypatch):
     yield tmp_path
     sys.modules.pop("my_noises", None)
     parse_noise.__globals__["_read_noise"].cache_clear()
-
-
-def test_a_sticky_action_by_hand(folder):
-    bare = actions_env(gym.spaces.Discrete(100))
-    env = make_noisy(bare, [TEXT], [0.3], record_statistics=False)
-    gate, noise = streams(sys.modules["my_noises"].StickyAction, seed=5)
-    env.reset(seed=5)
-    expected, left, last, marks = [], 0, None, []
-    for action in range(60):
-        if gate.random() < 0.3:
-            left = noise.integers(1, 3, endpoint=True)
-        sticks = left > 0 and last is not None
-        left, last = left - 1, last if sticks else action
-        expected.append(last)
-        marks.append(("StickyAction",) if sticks else None)
-    assert [env.step(action)[4].get("noise") for action in range(60)] == marks
-    assert bare.received == expected
-    assert 0 < env.times_applied < env.opportunities == 60
 
 
 @pytest.mark.filterwarnings("ignore:.*WARN")
@@ -81,10 +63,6 @@ class Strict(NoiseWrapper):
 
 class Vague(NoiseWrapper): pass
 
-class Child(StickyAction):
-    def __init__(self, *args, **kwargs):
-        super().__init__(*args, **kwargs)
-
 class Degrees(StickyAction):
     def __init__(self, env, noise_rate, longest):
         super().__init__(env, noise_rate, longest / 2)
@@ -97,11 +75,9 @@ class Degrees(StickyAction):
         ("no_such:A(1)", "No module named 'no_such'"),
         ("my_noises:Other(1)", "my_noises has no subclass Other of noisy_wrappers.NoiseWrapper"),
         ("my_noises:StickyAction()", "missing a required argument: 'longest'"),
-        ("my_noises:StickyAction(longest)", "expected Name(number, ..., keyword=value)"),
         ("my_noises:Strict(1)", "x is bad"),
         ("my_noises:Vague(1)", "Vague.kind must be one of"),
-        ("my_noises:Child(2)", "must name its arguments"),
-        ("my_noises:Degrees(90)", "my_noises:Degrees(45.0) would be another noise"),
+        ("my_noises:Degrees(90)", "pass them on as they came; my_noises:Degrees(45.0) would"),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line(folder, text, message):
@@ -113,9 +89,6 @@ def test_what_is_wrong_is_said_in_one_line(folder, text, message):
 
 
 def test_a_bug_keeps_its_traceback(folder):
-    (folder / "my_noises.py").write_text("import no_such_dependency\n")
-    with pytest.raises(ModuleNotFoundError, match="no_such_dependency"):
-        parse_noise(TEXT)
     (folder / "my_noises.py").write_text(MODULE.replace("longest  #", "longest + 'x'  #"))
     with pytest.raises(TypeError, match="unsupported operand"):
         parse_noise(TEXT)
@@ -123,23 +96,22 @@ def test_a_bug_keeps_its_traceback(folder):
 
 @pytest.mark.slow
 def test_a_sweep_and_a_test_from_the_folder_of_the_noise(folder):
-    def run(*words):
-        done = subprocess.run([*map(str, words)], cwd=folder, capture_output=True, text=True)
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout
+    def run(path, *words):
+        done = commands.run(path, words, cwd=folder)
+        assert done.code == 0, done.out + done.err
 
     sweep = "custom --algos ppo --envs InvertedPendulum-v5 --seeds 1 --total-timesteps 512 --jobs 1"
     sweep = [*sweep.split(), "--runs-dir", "runs", "--noises", TEXT, "--noise-rates", "0.5"]
     small = ["--", "--no-compile", "--num-steps", "256", "--eval-episodes", "2"]
-    env = ["env", f"PYTHON={sys.executable}"]
-    run(*env, ROOT / "benchmark.sh", *sweep, *small)
+    env = os.environ | {"PYTHON": sys.executable}
+    subprocess.run([ROOT / "benchmark.sh", *sweep, *small], cwd=folder, env=env, check=True)
     [noisy] = folder.glob("runs/p0.5_s1_my_noises--StickyAction_3__*/result.json")
     assert 0 < json.loads(noisy.read_text())["noise_applied_fraction"]["StickyAction"] < 0.6
     assert len([*folder.glob("runs/*/result.json")]) == 2
     test = ["--noises", TEXT, "--noise-rates", "1", "--episodes", "2"]
-    run(sys.executable, ROOT / "evaluate.py", "runs", *test)
+    run(ROOT / "evaluate.py", "runs", *test)
     (folder / "my_noises.py").unlink()
-    run(sys.executable, ROOT / "analyze.py")  # reads runs without their noise
+    run(ROOT / "analyze.py")  # reads runs without their noise
     tables = (folder / "runs/results/robustness.csv", folder / "runs/results/summary_PPO.csv")
     assert all(TEXT in table.read_text() for table in tables)
     rows = list(csv.DictReader((noisy.parent / "robustness.csv").open()))
@@ -147,45 +119,30 @@ def test_a_sweep_and_a_test_from_the_folder_of_the_noise(folder):
     assert np.isfinite([float(row["episodic_return"]) for row in rows]).all()
 
 
-def test_a_default_before_another_argument_stays(folder):
-    (folder / "my_noises.py").write_text(
-        "from noisy_wrappers import *\n\n\n"
-        "class Between(RewardNoise):\n"
-        "    def __init__(self, env, noise_rate, high=3, low=1, text=''):\n"
-        "        super().__init__(env, noise_rate, high=high, low=low, text=text)\n"
-    )
-    for written, canonical in {
-        "Between(3, 2)": "my_noises:Between(3, 2)",
-        "Between(low=2)": "my_noises:Between(3, 2)",
-        "Between(2, 1)": "my_noises:Between(2)",
-        "Between(3)": "my_noises:Between()",
-        "Between(text='a + b')": "my_noises:Between(3, 1, 'a + b')",
-        "RandomActionDelay(1)": "RandomActionDelay(1)",  # ours has one name, wherever it is from
-    }.items():
-        assert str(parse_noise(f"my_noises:{written}")) == canonical
-    noise = "my_noises:Between(3, 1, 'a + b')"
-    config = Configuration.read([noise], [0.5])
-    assert Configuration.parse(*config.columns) == config
-    assert split_noises(f"{noise}+RandomActionDelay(1)") == [noise, "RandomActionDelay(1)"]
+WALK = """
+import numpy as np
+from noisy_wrappers import RewardNoise
+
+class Walk(RewardNoise):
+    def __init__(self, env, noise_rate):
+        super().__init__(env, noise_rate)
+        self.more, self.at = np.random.default_rng(7), np.zeros(1)
+
+    def _perturb(self, reward):
+        self.at = self.at + self.more.normal(size=1)
+        return reward + self.at.item()
+
+    def state_dict(self):
+        return {**super().state_dict(), "at": self.at}
+
+    def load_state_dict(self, state):
+        super().load_state_dict(state)
+        self.at = np.array(state["at"])
+"""
 
 
 def test_a_noise_with_a_state_of_its_own_resumes(folder):
-    (folder / "my_noises.py").write_text(
-        "import numpy as np\nfrom noisy_wrappers import RewardNoise\n\n\n"
-        "class Walk(RewardNoise):\n"
-        "    def __init__(self, env, noise_rate):\n"
-        "        super().__init__(env, noise_rate)\n"
-        "        self.more = np.random.default_rng(7)\n"
-        "        self.at = np.zeros(1)\n\n"
-        "    def _perturb(self, reward):\n"
-        "        self.at = self.at + self.more.normal(size=1)\n"
-        "        return reward + self.at.item()\n\n"
-        "    def state_dict(self):\n"
-        "        return {**super().state_dict(), 'at': self.at, 'last': self.at[0]}\n\n"
-        "    def load_state_dict(self, state):\n"
-        "        super().load_state_dict(state)\n"
-        "        self.at = np.array(state['at'])\n"
-    )
+    (folder / "my_noises.py").write_text(WALK)
     envs = [make_noisy(GenericEnv(), ["my_noises:Walk()"], [1.0]) for _ in range(2)]
     envs[0].reset(seed=1)
     envs[0].step(0)

@@ -9,10 +9,7 @@ import pytest
 import torch
 from stable_baselines3.common.env_util import make_vec_env
 
-from noisy_wrappers import (
-    RandomEarlyTermination,
-    parse_noise,
-)
+from noisy_wrappers import RandomEarlyTermination, parse_noise
 
 PAGE = Path(__file__).parents[2] / "docs" / "wrappers.md"
 

@@ -4,20 +4,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from cases import BOX, GenericEnv, build, rollout, streams
+from cases import OBSERVATION_CASES, REWARD_CASES, GenericEnv, build, rollout, streams
 from test_actions import actions_env
-from test_nested import GOALS, sampled
 
 from noisy_wrappers import (
     Configuration,
     RandomNormalNoisyAction,
-    RandomNormalNoisyObservation,
-    RandomNormalNoisyReward,
     RandomObservationBias,
-    RandomUniformNoisyObservation,
-    RandomUniformNoisyReward,
-    parse_noise,
-    run_name,
 )
 
 UNITS = np.array([0.001, 1.0, 500.0])
@@ -37,29 +30,24 @@ def units_env():
     )
 
 
+ADDITIVE = {text: f for text, f in (OBSERVATION_CASES | REWARD_CASES).items() if "Noisy" in text}
+
+
 @pytest.mark.parametrize("rate", [0.3, 1.0])
-@pytest.mark.parametrize(
-    ("wrapper", "args", "draw"),
-    [
-        (RandomNormalNoisyObservation, (0.1,), lambda g: g.normal(0, 0.1, 3)),
-        (RandomNormalNoisyObservation, ((0.1, 0.0, 2.0),), lambda g: g.normal(0, [0.1, 0, 2])),
-        (RandomUniformNoisyObservation, (-0.2, 0.1), lambda g: g.uniform(-0.2, 0.1, 3)),
-        (RandomNormalNoisyReward, (0.1,), lambda g: g.normal(0, 0.1)),
-        (RandomUniformNoisyReward, (-0.2, 0.1), lambda g: g.uniform(-0.2, 0.1)),
-    ],
-)
-def test_relative_golden(wrapper, args, draw, rate):
+@pytest.mark.parametrize("text", ADDITIVE)
+def test_relative_golden(text, rate):
     """The gate and the noise draw as otherwise, also while the first 99 samples stay clean."""
-    kind = 1 if "Reward" in wrapper.__name__ else 0
+    kind = 1 if "Reward" in text else 0
     bare = rollout(units_env(), seed=7, steps=300)[kind:]
-    env = wrapper(units_env(), rate, *args, relative=True)
-    gate, noise = streams(wrapper, seed=7)
+    env = build(f"{text[:-1]}, relative=True)", units_env(), rate)
+    gate, noise = streams(text, seed=7)
     received, noisy = [], 0
     for clean, got in zip(bare, rollout(env, seed=7, steps=300)[kind:], strict=True):
         received.append(clean[kind])
         expected, acts = clean[kind], gate.random() < rate
         if acts:
-            drawn = draw(noise)
+            zero = (0.0, None) if kind == 0 else (0.0,)
+            drawn = ADDITIVE[text](noise, *zero)
             if len(received) >= 100:
                 expected = expected + drawn * np.std(received, axis=0, ddof=1)
         np.testing.assert_allclose(got[kind], expected, rtol=1e-12)
@@ -85,21 +73,6 @@ def test_what_it_has_estimated_is_resumed(tmp_path):
         got = rollout(other, steps=50, seed=4)
         np.testing.assert_array_equal([step[0] for step in got], [step[0] for step in expected])
         assert [step[1] for step in got] == [step[1] for step in expected]
-        fresh = rollout(build(text, units_env(), 0.7), steps=50, seed=4)
-        assert not any("noise" in step[4] for step in fresh)
-
-
-def test_dictionaries_are_measured_as_one_vector():
-    env = RandomNormalNoisyObservation(
-        sampled(GOALS)[0], 1.0, 1.0, relative=True, keys=("observation", "desired_goal")
-    )
-    samples = sampled(GOALS)[1]
-    steps = rollout(env, seed=0, steps=150)
-    vectors = [np.concatenate([s["desired_goal"], s["observation"]]) for s in samples]
-    np.testing.assert_allclose(
-        env._spread.deviation, np.std([*vectors, *vectors, *vectors, vectors[0]], axis=0, ddof=1)
-    )
-    assert "noise" not in steps[98][4] and "noise" in steps[99][4]
 
 
 def test_actions_are_perturbed_in_halves_of_their_range():
@@ -119,37 +92,17 @@ def test_actions_are_perturbed_in_halves_of_their_range():
             RandomNormalNoisyAction(actions_env(space), 0.1, 1.0, relative=True)
 
 
-def test_it_is_written_and_named():
-    text = "RandomNormalNoisyObservation(0.01, relative=True)"
-    assert str(parse_noise("RandomNormalNoisyObservation(.01,relative=True, loc=0)")) == text
-    name = "p0.5_s1_NormalNoisyObservation_0.01_relative=True__E__x"
-    assert run_name("E", "x", [text], [0.5], 1) == name
-    assert "relative" not in run_name("E", "x", [text.replace("True", "False")], [0.5], 1)
-    for name in ("NormalNoisyObservation(1", "UniformNoisyReward(0, 1", "NormalNoisyAction(1"):
-        with pytest.raises(ValueError, match="relative must be True or False"):
-            parse_noise(f"Random{name}, relative=1)")
-    env = RandomUniformNoisyObservation(GenericEnv(BOX), 0.1, 0, 1, relative=True)
-    assert np.isinf(env.observation_space.high).all()
-
-
-@pytest.mark.parametrize(
-    ("noises", "rates", "problem"),
-    [
-        (["RandomObservationBias(1.0, relative=True)"], [0.5], "relative=True"),
-        (["RandomUniformNoisyReward(0, 1, relative=True)"], [1.0], "relative=True"),
-        (["RandomDropoutObservation(0.5)", "RandomObservationDelay(2)"], ["1:0", 1], "1.0:0.0"),
-        (["RandomNormalNoisyAction(0.1, relative=True)", "RandomObservationBias(1)"], [1], None),
-        ([], [], None),
-    ],
-)
-def test_what_a_test_may_have(noises, rates, problem):
+def test_what_a_test_may_have():
     """A running scale would depend on the policy; a test has neither beginning nor end."""
-    configuration = Configuration.read(noises, rates)
-    if problem is None:
-        assert configuration.for_tests() is configuration
-        return
-    with pytest.raises(ValueError, match=problem):
-        configuration.for_tests()
+    for noise, rate, problem in [
+        ("RandomObservationBias(1.0, relative=True)", 0.5, "relative=True"),
+        ("RandomUniformNoisyReward(0, 1, relative=True)", 1.0, "relative=True"),
+        ("RandomDropoutObservation(0.5)", "1:0", "1.0:0.0"),
+    ]:
+        with pytest.raises(ValueError, match=problem):
+            Configuration.read([noise], [rate]).for_tests()
+    allowed = Configuration.read(["RandomNormalNoisyAction(0.1, relative=True)"], [0.5])
+    assert allowed.for_tests() is allowed
 
 
 def test_a_relative_bias_is_constant_within_an_episode():
