@@ -108,6 +108,7 @@ stop_parallel() { # HUP: parallel starts no more runs, and waits for those that 
 # -------------------------------------------------------------------------------------------- slurm
 
 array_limit() { # sets array_size, before anything is written
+  unset "${!SQUEUE_@}" "${!SCANCEL_@}" # a user's own, such as SQUEUE_STATES, would hide jobs
   array_size=$(scontrol show config 2>/dev/null | awk '$1 == "MaxArraySize" {print $3; exit}') ||
     true
   [ "${array_size:-0}" -gt 0 ] || [ "$stopped" -ne 0 ] ||

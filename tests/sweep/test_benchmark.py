@@ -395,7 +395,7 @@ def no_slurm(tmp_path, stub):
         "scancel": "",
     }
     for name, command in said.items():
-        told = f'echo {name} "$@" $SLURM_CLUSTERS >>{asked}'
+        told = f'echo {name} "$@" $SLURM_CLUSTERS $SQUEUE_STATES >>{asked}'
         (tools / name).write_text(f"#!/bin/sh\n{told}\n{command}\n")
         (tools / name).chmod(0o755)
     return stub | {"PATH": f"{tools}:{PATH}"}, asked
@@ -405,6 +405,7 @@ def no_slurm(tmp_path, stub):
 def test_slurm_with_several_clusters(no_slurm, tmp_path):
     """Its programs are told which one; what a site prints beside an id is no part of it."""
     env, asked = no_slurm
+    env["SQUEUE_STATES"] = "RUNNING"  # a user's own, which would hide the jobs that wait
     grid = ["baseline", *GRID[1:5], "--seeds", "1-6", "--runs-dir", tmp_path / "runs"]
     grid += ["--executor", "slurm", "--wait", "--slurm-args", "-M big,small"]
     result = run(*grid, env=env)
