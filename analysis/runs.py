@@ -20,7 +20,6 @@ from noisy_wrappers import BASELINE, different_arguments
 STUDY = ["algorithm", "exp_name", "phase", "tested"]  # the columns that name a study: study_name
 KEYS = [*STUDY, "environment", "noise", "noise_rate"]
 LEFT_OUT_COLUMNS = ["status", *KEYS, "seed", "run", "reason"]
-ROBUSTNESS_COLUMNS = ["noise", "noise_rate", "episode", "episodic_return", "episodic_length"]
 MORE_TO_COME = {"missing", "unfinished", "failed"}  # statuses of runs that a sweep still owes
 
 

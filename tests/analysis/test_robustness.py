@@ -11,8 +11,8 @@ import pytest
 from scipy import stats
 from sweeps import row, run, write_run
 
-import analysis.figures
 import analysis.robustness
+from analysis.folders import RETURN
 from analysis.heatmap import heatmaps
 from analysis.matrices import matrices
 from analysis.runs import finished, read_runs
@@ -238,8 +238,8 @@ def test_compressed_damaged_and_unfinished_runs(tmp_path, capsys):
     tables = run(tmp_path)
     assert row(tables["robustness_score"], noise=PUSH)["n"] == 2
     printed = capsys.readouterr().out
-    assert f"{damaged.name}: robustness.csv is left out" in printed
-    assert f"{bad_disk.parent.name}: robustness.csv.gz is left out" in printed
+    assert f"{damaged.name} has no tests of robustness: robustness.csv: " in printed
+    assert f"{bad_disk.parent.name} has no tests of robustness: robustness.csv.gz: " in printed
     for path in (tmp_path / "runs").glob("*baseline*"):
         shutil.rmtree(path)
     assert run(tmp_path)["robustness_score"].empty  # nothing to compare with
@@ -249,9 +249,9 @@ def test_heatmap(tmp_path):
     write_tests(tmp_path, HOPPER, "Hopper-v5")
     found, _ = analysis.robustness.read_robustness(finished(read_runs(tmp_path)))
     tables, _ = analysis.robustness.analyse_robustness(found)
-    [drawing] = analysis.figures.robustness_figures(tables["robustness"].frame)
-    assert drawing.name == "robustness_heatmap_PPO_Hopper-v5"
-    ax = drawing.draw().axes[0]
+    [(label, caption, draw)] = heatmaps(tables["robustness"].frame, RETURN)
+    assert label == "heatmap PPO Hopper-v5"
+    ax = draw().axes[0]
     rows = [label.get_text().replace("\n", "") for label in ax.get_yticklabels()]
     columns = [label.get_text().replace("\n", "") for label in ax.get_xticklabels()]
     assert rows == ["no noise", f"{PUSH}, 1.00", f"{SENSOR}, 0.20"]
@@ -261,7 +261,7 @@ def test_heatmap(tmp_path):
     assert numbers[columns.index("clean"), 2] == "+10"
     dots = {tuple(np.round(line.get_xydata()[0] + (-0.36, 0.28)).astype(int)) for line in ax.lines}
     same = {(columns.index(f"{PUSH}, 1.00"), 1), (columns.index(f"{SENSOR}, 0.20"), 2)}
-    assert dots == same and "A dot marks" in drawing.caption
+    assert dots == same and "A dot marks" in caption
 
 
 def test_robustness_of_another_experiment_is_apart(tmp_path):
@@ -357,7 +357,7 @@ def test_heatmap_of_a_matrix(tmp_path):
     tables = run(tmp_path, drawn=True)
     names = {path.stem for path in (tmp_path / "results").glob("*.svg")}
     assert any("matrix_PPO_on_Hopper-v5_RandomDynamics_x_x" in name for name in names)
-    [(_, caption, draw)] = heatmaps(tables["robustness"].fillna({"test_noise": ""}))
+    _, (_, caption, draw) = heatmaps(tables["robustness"].fillna({"test_noise": ""}), RETURN)
     assert "(seeds: 2): mean return" in caption
     *panels, _ = draw(6.75).axes
     assert [ax.get_title().replace("\n", "") for ax in panels] == [
