@@ -142,7 +142,8 @@ def forest_panel(ax, study, rows, lines):
             ends = row.difference_low, row.difference_high
             ax.hlines(y, *ends, color=mark.get_color(), linewidth=1.1)
         if few:
-            shift = detectable_shift(max(4, row.n), max(4, row.n_baseline)) * row.pooled_std
+            numbers = (max(4, int(n)) for n in (row.n, row.n_baseline))
+            shift = detectable_shift(*numbers) * row.pooled_std
             ax.hlines(y, -shift, shift, color="0.88", linewidth=6, zorder=0.5)
             rates = row.noise_rate.split(", ")
             same = [c for c in study.finals if c.noise == row.noise and c.noise_rate in rates]
