@@ -37,14 +37,7 @@ from analysis.robustness import analyse_robustness, read_robustness
 from analysis.runs import KEYS, MORE_TO_COME, finished, in_short, left_out, read_runs
 from analysis.studies import make_studies, version_notes
 from analysis.style import COLUMN, PAGE
-from analysis.tables import (
-    all_equal_notes,
-    family_notes,
-    lopsided_notes,
-    make_tables,
-    success_table,
-    table_of,
-)
+from analysis.tables import lopsided_notes, make_tables, success_table, table_of
 from analysis.verdicts import POINTS, clear_first, headlines, in_sentences, tally
 
 MOST_ROWS = 15  # of the first table in a terminal; the report has all
@@ -229,8 +222,6 @@ def analyse(args, entries, choice):
         problems=f"Runs left out: {number.sum():,} ({counts})." if len(number) else "",
         notes=[
             *incomplete_note(number),
-            *all_equal_notes(studies),
-            *family_notes(compared.noises),
             *lopsided_notes(compared),
             *notes,
             *unreadable,
