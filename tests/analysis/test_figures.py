@@ -228,6 +228,14 @@ def test_parameters_of_a_search_show_no_baseline(tmp_path):
     assert texts(figure.legends[0].get_texts()) == noises and "dotted" not in drawing.caption
 
 
+def test_figures_of_experiments_with_similar_names_have_names_of_their_own(tmp_path):
+    for name, seed in product(("lr 1", "lr_1"), (1, 2)):
+        more = {"seed": seed, "exp_name": name}
+        write_run(tmp_path, [10], folder=f"{name}-{seed}", **more)
+        write_run(tmp_path, [9], folder=f"{name}-{seed}-p", noise=SCALE, rate=0.1, **more)
+    assert {"effects_SAC_lr_1", "effects_SAC_lr_1_again"} <= drawn_of(tmp_path).keys()
+
+
 def test_committed_figures_are_those_that_a_page_shows():
     pages = [RESULTS.parent / "README.md", *RESULTS.glob("*.md"), *RESULTS.parent.glob("docs/*.md")]
     shown = re.findall(r"!\[[^]]*\]\([^)]*figures/([^)]*)\)", "".join(p.read_text() for p in pages))

@@ -166,24 +166,17 @@ def test_the_counts_at_the_top_are_those_of_the_list(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("improvements", "p_luck", "tried", "expected"),
+    ("improvements", "p_luck", "expected"),
     [
-        ([-5, 0], [0.9, 1], [3, 3], "Nothing that was tried has a higher mean than no noise."),
-        ([5], [0.3], [1], "The best noise looks no better than one useless noise might."),
-        ([5, 9], [0.3, 0.01], [3, 4], "On Hopper-v5 (p = 0.02) the best noise looks"),  # Holm's
-        (
-            [5, 9],
-            [0.3, 0.04],
-            [3, 3],
-            "each environment looks no better than the best of 3 useless",
-        ),
-        ([NAN], [NAN], [3], ""),
-        # too few seeds on the first
-        ([100, -5], [NAN, 0.7], [1, 1], "The best noise on Hopper-v5 looks no better than one"),
+        ([-5, 0], [0.9, 1], "Nothing that was tried has a higher mean than no noise."),
+        ([5, 9], [0.3, 0.01], "On Hopper-v5 (p = 0.02) the best noise looks better than"),  # Holm's
+        ([5, 9], [0.3, 0.04], "On Ant-v5 and Hopper-v5 the best noise looks no better than"),
+        ([100, -5], [NAN, 0.7], "On Hopper-v5 the best noise looks no better"),  # too few seeds
+        ([NAN, NAN], [NAN, NAN], ""),
     ],
 )
-def test_luck_is_said_in_one_sentence(improvements, p_luck, tried, expected):
-    best = {"environment": ["Ant-v5", "Hopper-v5"][: len(tried)], "chosen_from": tried}
+def test_luck_is_said_in_one_sentence(improvements, p_luck, expected):
+    best = {"environment": ["Ant-v5", "Hopper-v5"]}
     best |= {"difference": improvements, "p_luck": p_luck}
     said = analysis.verdicts.luck_sentence(pd.DataFrame(best))
     assert expected in said and bool(said) == bool(expected)
