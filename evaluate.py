@@ -25,6 +25,7 @@ import itertools
 import multiprocessing
 import os
 import signal
+import subprocess
 import sys
 import threading
 from concurrent.futures import ProcessPoolExecutor
@@ -420,8 +421,9 @@ def mean_return(played, episodes):
 
 
 def has_display():
-    """Tell whether there is a screen; macOS always has one."""
-    return sys.platform == "darwin" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
+    """Tell whether there is a screen, in a process of its own, which may crash."""
+    line = [sys.executable, "-c", "import glfw; assert glfw.init() and glfw.get_primary_monitor()"]
+    return not subprocess.run(line, capture_output=True).returncode
 
 
 def check_args(args):
