@@ -28,7 +28,7 @@ import tyro
 from analysis.choice import read_choice
 from analysis.comparisons import as_chosen, compare_all
 from analysis.errors import fail, take_over_terminal
-from analysis.figures import COLUMN_END, INTERVAL, figures, write_figure
+from analysis.figures import INTERVAL, figures, write_figure
 from analysis.folders import CONFIRMATION, RETURN, SUCCESS, is_phase, is_run
 from analysis.formatting import WHOLE_WORDS, in_markdown, shown, text_table
 from analysis.latex import latex_table
@@ -37,14 +37,7 @@ from analysis.robustness import analyse_robustness, read_robustness
 from analysis.runs import KEYS, MORE_TO_COME, finished, in_short, left_out, read_runs
 from analysis.studies import make_studies, version_notes
 from analysis.style import COLUMN, PAGE
-from analysis.tables import (
-    all_equal_notes,
-    family_notes,
-    lopsided_notes,
-    make_tables,
-    success_table,
-    table_of,
-)
+from analysis.tables import lopsided_notes, make_tables, success_table, table_of
 from analysis.verdicts import POINTS, clear_first, headlines, in_sentences, tally
 
 MOST_ROWS = 15  # of the first table in a terminal; the report has all
@@ -77,9 +70,8 @@ class Args:
 
 def no_finished_run(runs_dir):
     """End with an error that says where there are finished runs, if that is below `runs_dir`."""
-    paths = [*runs_dir.glob("*/*/result.json"), *runs_dir.glob("*/*/*/result.json")]
-    parents = {path.parent.parent for path in paths if is_run(path.parent)}
-    folders = sorted({str(folder.parent if is_phase(folder) else folder) for folder in parents})
+    folders = {path.parents[1] for path in runs_dir.glob("*/**/result.json") if is_run(path.parent)}
+    folders = sorted({str(path.parent if is_phase(path) else path) for path in folders})
     where = f"; there are some in {', '.join(folders)}: name it with --runs-dir" if folders else ""
     fail(f"no finished run in {runs_dir}{where}")
 
@@ -101,14 +93,13 @@ def verdicts_in_short(results):
 
 def overview_of(entries, studies):
     """Say in words what was analysed."""
-    overview = f"Finished runs: {len(finished(entries)):,}."
-    for study in studies:
-        overview += (
-            f" {study.name}: {study.steps[-1]:,} steps, seeds: {len(study.seeds)}, "
-            f"environments: {len(study.environments)}, "
-            f"noise configurations: {len(study.finals) - 1}."
-        )
-    return overview
+    parts = [f"Finished runs: {len(finished(entries)):,}."]
+    parts += [
+        f"{study.name}: {study.steps[-1]:,} steps, seeds: {len(study.seeds)}, "
+        f"environments: {len(study.environments)}, noise configurations: {len(study.finals) - 1}."
+        for study in studies
+    ]
+    return " ".join(parts)
 
 
 def write_table(out, table, latex, inches):
@@ -122,7 +113,7 @@ def write_table(out, table, latex, inches):
 
 
 def write_results(out, results, args):
-    """Write all tables, all figures and the report; note which others there are in `out`."""
+    """Write all tables, all figures and the report."""
     out.mkdir(parents=True, exist_ok=True)
     for table in results.tables.values():
         write_table(out, table, args.latex, args.figure_width)
@@ -130,15 +121,6 @@ def write_results(out, results, args):
     for drawing in drawn:
         write_figure(out, drawing, args.latex, args.figure_width)
     write_report(out, results, drawn)
-    ends = [".csv", ".svg", *([".tex", ".pdf"] if args.latex else [])]
-    names = [*results.tables]
-    names += [drawing.name + end for drawing in drawn for end in ("", COLUMN_END)]
-    written = {name + end for name in names for end in ends}
-    kinds = {".csv", ".svg", ".tex", ".pdf"}
-    old = {path.name for path in out.iterdir() if path.suffix in kinds} - written
-    if old := sorted(old):
-        told = f"{out} also holds files that this analysis did not write: {', '.join(old)}"
-        results.notes.append(told)
 
 
 def terminal_width():
@@ -148,8 +130,7 @@ def terminal_width():
 
 def print_left_out(missing, width):
     """Print the first of the runs that were left out."""
-    view = missing.view[MISSING_IN_SHORT][:20]
-    print(text_table(replace(missing, view=view), width))
+    print(text_table(replace(missing, view=missing.view[MISSING_IN_SHORT][:20]), width))
 
 
 def print_results(out, results):
@@ -166,7 +147,7 @@ def print_results(out, results):
     if 0 < len(first.frame) <= MOST_ROWS:
         say("Does a noise help at all? Its rates together, against no noise:")
         print(f"\n{text_table(first, width)}\n")
-    if len(tables["best"].frame):
+    if len(tables["best"].frame) and "best" not in results.repeated:
         say("The best noise in each environment, which may still be worse than no noise:")
         print(f"\n{text_table(tables['best'], width)}\n")
     say(results.overview)
@@ -183,7 +164,8 @@ def print_results(out, results):
 def analyse(args, entries, choice):
     """Compute everything that is told of the runs of a folder (read_runs); see main."""
     metric = args.metric
-    missing = missing_table(left_out(entries))
+    left = left_out(entries)
+    missing = table_of("missing", left, view=in_short(left))
     studies, notes = make_studies(entries, metric)
     if not studies and finished(entries):
         fail("--metric success_rate: no environment here tells it, in `is_success` or `success`")
@@ -215,28 +197,31 @@ def analyse(args, entries, choice):
             "times, at levels of its own; one that it has not judged yet has none"
         )
     unit = POINTS if metric == SUCCESS else ""
-    of_noises = pd.concat([compared.noises_together, compared.noises])
-    said = [
-        in_sentences(rows, unit, args.smallest_gain)
-        for rows in (compared.noises_together, compared.noises)
-    ]
-    clear, others = clear_first(pd.concat(said, ignore_index=True))
-    number = missing.frame["status"].value_counts(sort=False)
+
+    def said(*parts):
+        found = [in_sentences(rows, unit, args.smallest_gain) for rows in parts]
+        return pd.concat(found, ignore_index=True)
+
+    clear, others = clear_first(said(compared.noises_together, compared.noises))
+    number = left["status"].value_counts(sort=False)
     counts = ", ".join(f"{n:,} {status}" for status, n in number.items())
     return Results(
         studies=studies,
         tables=tables,
-        headlines=headlines(of_noises, tables["best"].frame),
+        headlines=headlines(
+            pd.concat([compared.noises_together, compared.noises]), tables["best"].frame
+        ),
         clear=clear,
         others=others,
-        rates=sentences_on_rates(compared, unit, args.smallest_gain),
+        rates=said(
+            not_alone(compared.rates_together, compared.noises_together),
+            not_alone(compared.rates, compared.noises),
+        ),
         robustness=robustness,
         overview=overview_of(entries, studies),
         problems=f"Runs left out: {number.sum():,} ({counts})." if len(number) else "",
         notes=[
             *incomplete_note(number),
-            *all_equal_notes(studies),
-            *family_notes(compared.noises),
             *lopsided_notes(compared),
             *notes,
             *unreadable,
@@ -245,21 +230,10 @@ def analyse(args, entries, choice):
     )
 
 
-def missing_table(missing):
-    """Return the table of all runs that were left out, which people read in short."""
-    return table_of("missing", missing, view=in_short(missing))
-
-
-def sentences_on_rates(compared, unit, smallest_gain):
-    """Return the sentences on single rates, but on those of noises that have no other."""
-    parts = []
-    for rates, noises in (
-        (compared.rates_together, compared.noises_together),
-        (compared.rates, compared.noises),
-    ):
-        alone = pd.MultiIndex.from_frame(rates[KEYS]).isin(pd.MultiIndex.from_frame(noises[KEYS]))
-        parts.append(in_sentences(rates[~alone], unit, smallest_gain))
-    return pd.concat(parts, ignore_index=True)
+def not_alone(rates, noises):
+    """Return the comparisons of rates that are not, with one rate, those of noises, too."""
+    keys = pd.MultiIndex.from_frame(noises[KEYS])
+    return rates[~pd.MultiIndex.from_frame(rates[KEYS]).isin(keys)]
 
 
 def incomplete_note(number):
@@ -278,11 +252,11 @@ def main(args):
 
     Return the exit status: 1 where a run's files are damaged.
     """
-    paths = {name: getattr(args, name) for name in ("runs_dir", "out")}
     args = replace(
-        args, **{name: path and Path(os.path.expanduser(path)) for name, path in paths.items()}
+        args,
+        runs_dir=Path(os.path.expanduser(args.runs_dir)),
+        metric=args.metric.replace("_", " "),
     )
-    args = replace(args, metric=args.metric.replace("_", " "))
     if args.smallest_gain is not None and not args.smallest_gain > 0:
         fail(f"--smallest-gain must be above 0, not {args.smallest_gain}")
     if not COLUMN <= args.figure_width <= 20:
@@ -296,7 +270,7 @@ def main(args):
         choice = read_choice(args.runs_dir, args.metric)
     except ValueError as error:
         fail(error)
-    out = args.out or args.runs_dir / "results"
+    out = Path(os.path.expanduser(args.out or args.runs_dir / "results"))
     if out.resolve() == args.runs_dir.resolve() or is_run(out):  # where other tables may be
         fail("--out must be a folder of its own, not that of the runs or of one of them")
     entries = read_runs(args.runs_dir)

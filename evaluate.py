@@ -19,54 +19,39 @@ as in my_envs:MyEnv-v0, are imported from your own path, never from a folder of 
 cannot be tested are listed; the exit status is 1 then, and 2 if there are no others.
 """
 
-import csv
-import gzip
 import hashlib
 import importlib.util
 import itertools
 import multiprocessing
 import os
-import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
-import warnings
-import zlib
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib.machinery import PathFinder
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import tyro
-from gymnasium.wrappers import RecordVideo
+from gymnasium.wrappers import RenderCollection
 from tabulate import tabulate
 from tqdm import tqdm
 
 import noisy_wrappers as noisy
 from analysis import folders
+from analysis.episodes import read_episodes, store_episodes
 from analysis.errors import fail, in_words, take_over_terminal, with_place
 from analysis.folders import NOT_SETTINGS, PHASES, DamageError
 from analysis.formatting import DASH, rounded, slug
 from analysis.matrices import matrices
-from analysis.runs import (
-    ROBUSTNESS_COLUMNS,
-    study_name,
-    study_of,
-    usual_config,
-    where_tested,
-)
+from analysis.runs import study_name, study_of, usual_config, where_tested
 from analysis.statistics import mean_std
 
 PROJECT = Path(__file__).resolve().parent
 SCRIPTS = {}  # path -> the module, and the SHA-256 of its text
-BAD_FILES = (csv.Error, zlib.error)  # which are no ValueErrors
-UNFINISHED_VIDEOS = set()  # folders that an end of the program deletes
-DISPLAY = "import glfw; assert glfw.init() and glfw.get_primary_monitor()"
 
 
 @dataclass
@@ -80,7 +65,8 @@ class Args:
     noise_rates: tuple[float | str, ...] = (1.0,)
     """noise rates; every noise is tested at every rate"""
     env_id: str | None = None
-    """another environment to test in, with the same spaces; by default that of the training"""
+    """another environment to test in, with the same spaces and without the training's --env-kwargs;
+    by default that of the training"""
     episodes: int = 100
     """test episodes per policy and condition"""
     seed: int = 2_000_000
@@ -125,9 +111,9 @@ class Player:
         folder = self.folder.resolve().parent
         return folder.parent if folder.name in PHASES else folder
 
-    def key(self, condition):
-        """Return what names a condition in robustness.csv: see read_stored."""
-        return *condition.columns, self.elsewhere
+    def name(self, condition):
+        """Name a condition for people and files."""
+        return "__".join(filter(None, [condition.slug or "clean", slug(self.elsewhere)]))
 
 
 def find_players(paths):
@@ -223,9 +209,8 @@ def load(player, render_mode=None):
     with script.make_env(player.environment, **steps, **own, **drawn) as env:
         if run.release != "0.3":
             check_spaces(player, noisy.Spaces(run.config), env)
-        elif player.elsewhere:  # config.json does not tell the spaces of the training
-            with script.make_env(run.environment, **steps, **kwargs) as trained_in:
-                check_spaces(player, trained_in, env)
+        elif player.elsewhere:
+            raise ValueError("a run of 0.3 does not tell its spaces: it is tested at home alone")
         try:
             policy = script.load_policy(player.folder, env if run.release == "0.3" else None)
         except Exception as error:  # a damaged file may raise anything
@@ -271,38 +256,32 @@ def refuse_foreign_module(player, name):
 
 
 def check_players(players, conditions, bad, args):
-    """Return {player: what is stored of it} of those that can play.
-
-    Add the others to `bad`, {run folder: why}.
+    """Return {player: its stored episodes} of those that can play; add the others to `bad`.
 
     The policy must fit its environment, and every noise must be able to act on it.
+    bad: {run folder: why}.
     """
-    stored, told = {}, {}
+    stored, changed = {}, set()
     for player in players:
         try:
             refuse_foreign_module(player, player.run.environment)
-            script, is_same = import_script(player)
-            if not is_same:
-                text = f"{player.run.script} has changed since some of these runs were trained"
-                told[f"{text}: what plays may differ from what was trained"] = None
-            with load(player) as (env, _), warnings.catch_warnings(record=True) as notes:
-                if args.drawing and args.drawing not in env.metadata.get("render_modes", []):
-                    modes = env.metadata.get("render_modes", [])
+            if not import_script(player)[1]:
+                changed.add(player.run.script)
+            with load(player) as (env, _):
+                modes = env.metadata.get("render_modes", [])
+                if args.drawing and args.drawing not in modes:
                     raise ValueError(f"{args.drawing} is not among its render_modes, {modes}")
                 for condition in conditions:
                     condition.wrap(env)
-            told |= dict.fromkeys(str(note.message) for note in notes)
-            if player.elsewhere and (kwargs := player.run.args.get("env_kwargs")):
-                text = f"{player.elsewhere} is made without the training's --env-kwargs"
-                told[f"{text}: {' '.join(kwargs)}"] = None
             if not player.run.finished:
                 step = step_of(player)
                 print(f"{player.folder.name} is not finished: its policy of step {step} is tested")
-            stored[player] = read_stored(player) if args.stores(player) else {}
+            stored[player] = read_episodes(player.folder) if args.stores(player) else {}
         except Exception as error:  # any but a ValueError is of the user's environment
             bad[player.folder] = with_place(error, ValueError)
-    for note in told:
-        print(note, file=sys.stderr)
+    for script in sorted(changed):
+        text = f"{script} has changed since some of these runs were trained"
+        print(f"{text}: what plays may differ from what was trained", file=sys.stderr)
     return stored
 
 
@@ -317,57 +296,31 @@ def tell(bad):
 
 
 def play(player, condition, args):
-    """Play episodes, and store them; or draw one. Return [(return, length, success), ...].
-
-    Success is 1 or 0, or NaN where the environment does not tell it.
-    """
+    """Play episodes, and store them; or draw one. Return them as read_episodes does."""
     with load(player, args.drawing) as (env, policy):
-        with warnings.catch_warnings(action="ignore"):  # check_players has told them
-            noisy_env = condition.wrap(env)
+        env = condition.wrap(env)
         if args.video:
-            place = f"__{slug(player.elsewhere)}" if player.elsewhere else ""
-            name = f"{player.folder.name}__{condition.slug or 'clean'}{place}.mp4"
-            return record(noisy_env, policy, args.seed, args.video / name)
-        results = played(noisy_env, policy, 1 if args.render else args.episodes, args.seed)
+            name = f"{player.folder.name}__{player.name(condition)}.mp4"
+            return record(env, policy, args.seed, args.video / name)
+        episodes = noisy.play(env, policy, 1 if args.render else args.episodes, args.seed)
     if args.stores(player):
-        store(player, player.key(condition), results)
-    return results
+        try:
+            store_episodes(player.folder, (condition, player.elsewhere), episodes)
+        except (OSError, DamageError) as error:
+            fail(f"cannot write to {player.folder}: {error}", code=1)
+    return episodes
 
 
 def record(env, policy, seed, path):
-    """Play an episode into a video; return what `play` does."""
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".") as temporary:
-        UNFINISHED_VIDEOS.add(temporary)
-        folder = Path(temporary, "video")  # a new one: RecordVideo warns of one that exists
-        video = RecordVideo(env, str(folder))  # of the first episode
-        try:
-            results = played(video, policy, 1, seed)
-        finally:
-            if video.recorded_frames:  # an episode that failed, or was stopped
-                video.stop_recording()
-        (folder / "rl-video-episode-0.mp4").replace(path)
-    UNFINISHED_VIDEOS.discard(temporary)
-    return results
+    """Play an episode into a video; return it as `play` does."""
+    from moviepy import ImageSequenceClip  # imports much
 
-
-def played(env, policy, episodes, seed):
-    """Return what `play` does of some episodes."""
-    results = noisy.play(env, policy, episodes, seed).tolist()
-    return [(value, int(length), success) for value, length, success in results]
-
-
-def exit_now(status):
-    """End at once: an ordinary exit would wait for what the processes of --jobs play."""
-    for folder in UNFINISHED_VIDEOS:
-        shutil.rmtree(folder, ignore_errors=True)
-    os._exit(status)
-
-
-def exit_at_signals():
-    """End at once when this process is terminated or its terminal is closed."""
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) != signal.SIG_IGN:  # as nohup has it
-            signal.signal(number, lambda number, frame: exit_now(128 + number))
+    frames = RenderCollection(env)
+    episodes = noisy.play(frames, policy, 1, seed)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    clip = ImageSequenceClip(frames.render(), fps=env.metadata.get("render_fps", 30))
+    clip.write_videofile(str(path), logger=None)
+    return episodes
 
 
 def attempt(task, args):
@@ -398,58 +351,10 @@ def end_with_program():
 
     def wait():
         multiprocessing.parent_process().join()
-        exit_now(1)
+        os._exit(1)
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    exit_at_signals()
     threading.Thread(target=wait, daemon=True).start()
-
-
-def read_stored(player):
-    """Read robustness.csv: {(noise, noise rate, environment): (return, length, success) of each}.
-
-    It may be compressed, as analyze.py reads it, too. The environment is empty for that of the
-    training. Raises DamageError.
-    """
-    path = player.folder / "robustness.csv"
-    packed = path.with_suffix(".csv.gz")
-    stored = {}
-    try:
-        text = path.read_text("utf-8") if path.exists() else ""
-        if packed.exists() and not path.exists():
-            path = packed
-            text = gzip.decompress(packed.read_bytes()).decode("utf-8")
-        for row in csv.DictReader(text.splitlines()):
-            success = float(row.get("success") or "nan")
-            result = float(row["episodic_return"]), int(row["episodic_length"]), success
-            key = row["noise"], row["noise_rate"], row.get("environment") or ""
-            episodes = stored.setdefault(key, [])
-            if int(row["episode"]) != len(episodes):
-                raise ValueError(f"episode {len(episodes)} is not where it belongs")
-            episodes.append(result)
-    except (OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, *BAD_FILES) as error:
-        text = f"{path.name}: {in_words(error)}; delete that file to play everything again"
-        raise DamageError(text) from None
-    return stored
-
-
-def store(player, key, results):
-    """Add a condition to robustness.csv, beside what other processes have stored meanwhile."""
-    path = player.folder / "robustness.csv"
-    try:
-        with folders.rewritten(path) as file:
-            stored = read_stored(player)
-            stored[key] = max(stored.get(key, []), results, key=len)
-            rows = [
-                (*condition, i, *result, environment or None)
-                for (*condition, environment), played in stored.items()
-                for i, result in enumerate(played)
-            ]
-            table = pd.DataFrame(rows, columns=[*ROBUSTNESS_COLUMNS, "success", "environment"])
-            table = table.astype({"success": "Int64"}).dropna(axis="columns", how="all")
-            table.to_csv(file, index=False)
-    except (OSError, DamageError) as error:
-        fail(f"cannot write {path}: {error}", code=1)
 
 
 def names_of(players):
@@ -479,7 +384,7 @@ def print_table(players, conditions, stored, episodes):
         trained.setdefault(row, []).append(player)
 
     def cell(seeds, condition):
-        return mean_return([stored[one][one.key(condition)] for one in seeds], episodes)
+        return mean_return([stored[one][condition, one.elsewhere] for one in seeds], episodes)
 
     found = matrices(conditions)
     arranged = {one for matrix in found for one in matrix.cells.values()} - {noisy.BASELINE}
@@ -506,7 +411,7 @@ def print_table(players, conditions, stored, episodes):
 def mean_return(played, episodes):
     """Return the text of a cell: the mean return, its standard deviation, the rate of success.
 
-    played: (return, length, success) of each episode, for each run.
+    played: the episodes of each run, as read_episodes has them.
     """
     results = np.array([results[:episodes] for results in played])
     mean, spread, n = mean_std(results[..., 0].mean(axis=1))
@@ -517,107 +422,90 @@ def mean_return(played, episodes):
     return text if np.isnan(success).all() else f"{text}, {100 * (success > 0).mean():.0f} % solved"
 
 
-def works(code):
-    """Tell whether Python can run some code, in a process of its own, for it may crash."""
-    return not subprocess.run([sys.executable, "-c", code], capture_output=True).returncode
+def has_display():
+    """Tell whether there is a screen, in a process of its own, which may crash."""
+    line = [sys.executable, "-c", "import glfw; assert glfw.init() and glfw.get_primary_monitor()"]
+    return not subprocess.run(line, capture_output=True).returncode
 
 
-def draw_without_display():
-    """Let MuJoCo draw without a display, with the first library that works.
+def check_args(args):
+    """End with an error where the options make no sense."""
+    if args.render and args.video:
+        fail("--render and --video exclude each other")
+    if args.render and not has_display():
+        fail("--render needs a display; --video FOLDER makes videos without one")
+    for name, least in {"episodes": 1, "jobs": 1, "seed": 0}.items():
+        if getattr(args, name) < least:
+            fail(f"--{name} must be at least {least}, not {getattr(args, name)}")
+    if args.noise_rates != Args.noise_rates and not args.noises:
+        fail("--noise-rates without --noises: name a noise, or leave the rates out")
 
-    dm_control reads MUJOCO_GL when it is imported, so this comes before any environment.
+
+def players_of(args):
+    """Return the players, {run folder: why it cannot play}, and the conditions; see main.
+
+    Modules may be imported from the current folder then, unless it is one of runs.
     """
-    if os.environ.get("MUJOCO_GL") or works(DISPLAY):
-        return
-    for library in ("egl", "osmesa"):
-        os.environ["MUJOCO_GL"] = library
-        if works(f"from mujoco.{library} import GLContext; GLContext(64, 64).make_current()"):
-            return
-    fail(
-        "--video needs a display, or a library to draw without one: on Debian or Ubuntu, "
-        "apt install libegl1 libgl1, or libosmesa6"
-    )
+    players, bad = find_players(args.runs)
+    noises = [name for text in args.noises for name in noisy.split_noises(text)]
+    for player, name in itertools.product(players, [*noises, args.env_id or ""]):
+        refuse_foreign_module(player, name)
+    conditions = read_conditions(args)
+    here = Path.cwd()  # for what the module of my_envs:MyEnv-v0 imports
+    if not any(here.is_relative_to(player.runs_dir) for player in players):
+        sys.path.append(str(here))
+    if args.env_id:
+        env_id = noisy.canonical_env_id(args.env_id)
+        players = [
+            player if env_id == player.run.environment else replace(player, elsewhere=env_id)
+            for player in players
+        ]
+    return players, bad, conditions
 
 
 def main(args):
     """Check everything, play what is not stored, print the table; return the exit status."""
-    if args.render and args.video:
-        fail("--render and --video exclude each other")
-    if args.render and not works(DISPLAY):
-        fail("--render needs a display; --video FOLDER makes videos without one")
+    check_args(args)
     os.environ["OMP_NUM_THREADS"] = "1"  # before the scripts import PyTorch; processes inherit it
-    try:
-        for name in ("episodes", "jobs"):
-            if getattr(args, name) < 1:
-                raise ValueError(f"--{name} must be at least 1, not {getattr(args, name)}")
-        if args.seed < 0:
-            raise ValueError(f"--seed must be at least 0, not {args.seed}")
-        players, bad = find_players(args.runs)
-        named = [name for text in args.noises for name in noisy.split_noises(text)]
-        for player, name in itertools.product(players, [*named, args.env_id or ""]):
-            refuse_foreign_module(player, name)
-        conditions = read_conditions(args)
-    except ValueError as error:
-        fail(error)
-    here = Path.cwd()  # for what the module of my_envs:MyEnv-v0 imports
-    if not any(here.is_relative_to(player.runs_dir) for player in players):
-        sys.path.append(str(here))
     if args.video:
         args.video = Path(os.path.expanduser(args.video))
-        if len({player.folder.name for player in players}) < len(players):
-            fail("--video: two of these runs have the same name, and so would their videos")
-        draw_without_display()
-    if args.env_id:
-        try:
-            env_id = noisy.canonical_env_id(args.env_id)
-        except ValueError as error:
-            fail(f"--env-id: {error}")
-        for i, player in enumerate(players):
-            if env_id != player.run.environment:
-                players[i] = replace(player, elsewhere=env_id)
+        if not has_display():  # before any environment: dm_control reads it when it is imported
+            os.environ.setdefault("MUJOCO_GL", "egl")
+    try:
+        players, bad, conditions = players_of(args)
+    except ValueError as error:
+        fail(error)
+    if args.video and len({player.folder.name for player in players}) < len(players):
+        fail("--video: two of these runs have the same name, and so would their videos")
     stored = check_players(players, conditions, bad, args)
-    players = list(stored)
     tell(bad)
-    if not players:
+    if not stored:
         return 2 if bad else fail(f"there is no finished run in {', '.join(map(str, args.runs))}")
-    if args.video:
-        try:
-            args.video.mkdir(parents=True, exist_ok=True)
-            tempfile.TemporaryFile(dir=args.video).close()
-        except OSError as error:
-            fail(f"--video: cannot write to {args.video}: {error}")
     if args.seed != Args.seed and not args.drawing:
         print(f"--seed {args.seed} is not the default: everything is played, nothing is stored")
     tasks = [
         (player, condition)
-        for player, condition in itertools.product(players, conditions)
-        if args.drawing or len(stored[player].get(player.key(condition), [])) < args.episodes
+        for player, condition in itertools.product(stored, conditions)
+        if len(stored[player].get((condition, player.elsewhere), [])) < args.episodes
     ]
     failed = {}
-    for (player, condition), results in play_all(tasks, args):
-        name = condition.slug or "clean"
-        stored[player][player.key(condition)] = results
-        if isinstance(results, str):
-            failed[player.folder] = f"{name}: {results}"
-            if args.drawing:
-                text = f"cannot draw {player.folder.name}, {failed[player.folder]}"
-                print(f"error: {text}", file=sys.stderr)
+    for (player, condition), result in play_all(tasks, args):
+        name = player.name(condition)
+        stored[player][condition, player.elsewhere] = result
+        if isinstance(result, str):
+            failed[player.folder] = f"{name}: {result}"
         elif args.drawing:
-            [(drawn, steps, _)] = results
-            print(f"{player.folder.name}, {name}: return {rounded(drawn)}, {steps} steps")
-    if args.video and failed:
-        with suppress(OSError):  # there are other videos in it
-            args.video.rmdir()
-    if not args.drawing:
-        tell(failed)
-        if players := [player for player in players if player.folder not in failed]:
-            print_table(players, conditions, stored, args.episodes)
+            [(drawn, steps, _)] = result
+            print(f"{player.folder.name}, {name}: return {rounded(drawn)}, {steps:.0f} steps")
+    tell(failed)
+    players = [player for player in stored if player.folder not in failed]
+    if players and not args.drawing:
+        print_table(players, conditions, stored, args.episodes)
     return bool(bad or failed)
 
 
 if __name__ == "__main__":
     take_over_terminal()
-    exit_at_signals()
     try:
         sys.exit(main(tyro.cli(Args, description=__doc__)))
     except KeyboardInterrupt:

@@ -174,17 +174,14 @@ def as_chosen(compared, choice):
     look more. One that it has not judged yet has no verdict. choice: of read_choice, or None.
     """
     helped = {}
-    for row in () if choice is None else choice.itertuples():
-        if row.phase == CONFIRMATION and row.noise:
-            helped[row.algorithm, row.environment, row.noise, row.noise_rate] = (
-                row.survives == "yes"
-            )
+    if choice is not None:
+        for row in choice[choice["phase"] == CONFIRMATION].itertuples():
+            key = row.algorithm, row.environment, row.noise, row.noise_rate
+            helped[key] = row.survives == "yes"
 
     def verdict(row):
-        if row["phase"] != CONFIRMATION or row["verdict"] not in (
-            *verdicts.CLEAR,
-            verdicts.UNCLEAR,
-        ):
+        tested = row["verdict"] in (*verdicts.CLEAR, verdicts.UNCLEAR)
+        if row["phase"] != CONFIRMATION or not tested:
             return row["verdict"]
         key = row["algorithm"], row["environment"], row["noise"], row["noise_rate"]
         if key not in helped:

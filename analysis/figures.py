@@ -11,12 +11,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from scipy import special
 
-from analysis import style
-from analysis.effects import effects_caption, effects_figure, heatmap
+from analysis import effects, style
 from analysis.folders import RETURN, SUCCESS
-from analysis.formatting import percent, rounded, seeds_between, seeds_of, slug
+from analysis.formatting import seeds_between, seeds_of, slug
 from analysis.heatmap import heatmaps
-from analysis.runs import KEYS, STUDY, rows_of, study_name
+from analysis.runs import KEYS, rows_of
 from analysis.statistics import SEEDS_FOR_INTERVAL
 from noisy_wrappers import BASELINE, rate_order
 
@@ -30,6 +29,7 @@ LABELS = {RETURN: "test return", SUCCESS: "test success rate (%)"}
 PLACE = {"least": 1.28, "left": style.LINE + 0.05}  # of panels, in inches
 BESIDE = 0.4  # for their tick labels
 DUE = "training steps when tests were due"
+COMPARED = ("noises", "statistics", "best")  # tables that figures draw
 
 
 @dataclass
@@ -51,18 +51,16 @@ def figures(studies, tables, band=INTERVAL):
     """Return a Drawing for every figure, in the order of the report; each has another name."""
     drawings, used = [], set()
     for study in studies:
-        best = tables["best"].frame
-        drawings += comparison_figures(study, tables["statistics"].frame, best, band)
+        drawings += comparison_figures(study, {name: tables[name].frame for name in COMPARED}, band)
         for noise in study.noises or [""]:
             title = f"{study.name}, {noise or 'no noise'}"
             caption = f"{title}: learning curves, mean over n seeds; shaded: {BANDS[band]}."
-            draw = partial(curves_figure, study, noise, band)
+            draw = partial(noise_figure, study, noise, band)
             drawings.append(Drawing("curves", title, caption, draw))
         drawings += parameter_figures(study, band)
     if "robustness" in tables:
-        drawings += robustness_figures(tables["robustness"].frame, studies[0].metric)
-        matrices = heatmaps(tables["robustness"].frame, studies[0].metric)
-        drawings += [Drawing("robustness", *matrix) for matrix in matrices]
+        tested = heatmaps(tables["robustness"].frame, studies[0].metric)
+        drawings += [Drawing("robustness", *heatmap) for heatmap in tested]
     for drawing in drawings:
         while drawing.name in used:  # of "lr 1" and "lr_1", say, which are one name of a file
             drawing.label += " again"
@@ -70,20 +68,25 @@ def figures(studies, tables, band=INTERVAL):
     return drawings
 
 
-def comparison_figures(study, statistics, best, band):
-    """Yield the Drawing of a study's effects, and that of the curves of its best noises."""
-    has_comparison = statistics["difference"].notna()
-    compared = statistics[rows_of(statistics, study.key) & has_comparison]
-    if len(compared):
-        draw = partial(effects_figure, study, compared)
-        yield Drawing("effects", study.name, effects_caption(study, compared), draw)
-    if len(compared) and len(study.finals) > 2:
+def comparison_figures(study, tables, band):
+    """Yield the Drawing of a study's effects, and that of the curves of its best noises.
+
+    tables: {name: frame} of the tables COMPARED.
+    """
+    rows = {name: frame[rows_of(frame, study.key)] for name, frame in tables.items()}
+    rates = rows["statistics"][rows["statistics"]["difference"].notna()]
+    if rates.empty:
+        return
+    compared = rates if len(effects.configurations(rates)) <= effects.MOST_RATES else rows["noises"]
+    draw = partial(effects.effects_figure, study, compared)
+    yield Drawing("effects", study.name, effects.effects_caption(study, compared), draw)
+    if len(study.finals) > 2:
         caption = (
             f"{study.name}: test {study.metric} without noise and with the best noise of each "
             f"environment, mean over n seeds; shaded: {BANDS[band]}. "
             "The best of many looks better than it is."
         )
-        draw = partial(best_curves_figure, study, best[KEYS].merge(compared), band)
+        draw = partial(best_figure, study, rows["best"][KEYS].merge(rates), band)
         yield Drawing("best_curves", study.name, caption, draw)
 
 
@@ -104,16 +107,6 @@ def panels(study, titles, width, below, legend, **more):
     middle = np.mean([ax.get_position().intervaly.mean() for ax in axes])
     fig.text(0.03 / width, middle, LABELS[study.metric], rotation=90, va="center", ha="left")
     return fig, axes
-
-
-def curve_panels(study, titles, width, legend):
-    """Make panels for learning curves; return their steps, too."""
-    unit, word = (1e6, "millions") if study.steps[-1] >= 1e6 else (1e3, "thousands")
-    fig, axes = panels(study, titles, width, f"{DUE} ({word})", legend)
-    for ax in axes:
-        ax.set_xlim(0, study.steps[-1] / unit)
-        style.set_ticks(ax, "x", 5)
-    return fig, axes, study.steps / unit
 
 
 def spread(runs, band):
@@ -141,65 +134,69 @@ def curve(ax, x, runs, band, **look):
         ax.plot(x, runs, linewidth=0.4, alpha=0.7, **look)
 
 
-def best_curves_figure(study, best, band, width=None):
+def best_figure(study, best, band, width=None):
     """Draw no noise against the best noise of each environment.
 
     best: the rows of statistics of these noises.
     """
-    width = width or style.PAGE
     configs = {(config.noise, config.noise_rate): config for config in study.finals}
-    chosen = [configs[row.noise, row.noise_rate] for row in best.itertuples()]
-    shown = dict.fromkeys(chosen)
-    colors = {BASELINE: "black"} | dict(zip(shown, style.hues(len(shown)), strict=True))
-    labels = {config: rate_named(config.noise, config.noise_rate, width) for config in colors}
-    titles = []
+    panels = []
     for row in best.itertuples():
         verdict = row.verdict if isinstance(row.verdict, str) else "not judged"
-        seeds = seeds_of(row.n, row.n_baseline)
-        titles.append([style.short(row.environment), verdict, f"n = {seeds}"])
-    height = style.legend_columns(list(labels.values()), width)[1]
-    fig, axes, steps = curve_panels(study, titles, width, height)
-    for ax, row, config in zip(axes, best.itertuples(), chosen, strict=True):
-        e = study.environments.index(row.environment)
-        for one in (BASELINE, config):
-            curve(ax, steps, study.curves[one][..., e], band, color=colors[one])
-        style.set_ticks(ax, "y", 4)
-    handles = [Line2D([], [], color=color) for color in colors.values()]
-    style.add_legend(fig, handles, list(labels.values()))
-    return fig
+        lines = [verdict, f"n = {seeds_of(row.n, row.n_baseline)}"]
+        shown = [BASELINE, configs[row.noise, row.noise_rate]]
+        panels.append((study.environments.index(row.environment), shown, lines))
+    return curves_figure(study, panels, band, width)
 
 
-def rate_named(noise, rate, width):
-    """Return a configuration as a label of a legend."""
-    return style.fitted(f"{noise} at rate {rate}", width - 0.6) if noise else "no noise"
-
-
-def curves_figure(study, noise, band=INTERVAL, width=None):
-    """Draw learning curves: one line per noise rate, and one without noise.
+def noise_figure(study, noise, band=INTERVAL, width=None):
+    """Draw one line per noise rate, and one without noise.
 
     There is a panel for each environment in which this noise was tried.
     """
-    width = width or style.PAGE
     configs = [config for config in study.finals if config.noise in ("", noise)]
-    places = range(len(study.environments))
-    seeds = {config: [len(study.sample(config, e)) for e in places] for config in configs}
-    tried = [e for e in places if any(seeds[c][e] for c in configs if c.noise == noise)]
-    configs = [c for c in configs if any(seeds[c][e] for e in tried)]  # a search has no baseline
-    noisy = [config for config in configs if config != BASELINE]
+    panels = []
+    for e in range(len(study.environments)):
+        shown = [config for config in configs if len(study.sample(config, e))]
+        if any(config.noise == noise for config in shown):
+            panels.append((e, shown, [seeds_in(study, shown, e)]))
+    return curves_figure(study, panels, band, width, noise)
+
+
+def curves_figure(study, curves, band, width=None, noise=None):
+    """Draw learning curves: a panel for each (environment's number, configurations, title below).
+
+    noise: that of all curves, if it is one; then the legend has it as a title.
+    """
+    width = width or style.PAGE
+    used = {config for _, shown, _ in curves for config in shown}
+    shown = [config for config in study.finals if config in used]
+    noisy = [config for config in shown if config != BASELINE]
     colors = dict(zip(noisy, style.hues(len(noisy)), strict=True)) | {BASELINE: "black"}
-    labels = ["no noise" if c == BASELINE else f"rate {c.noise_rate}" for c in configs]
-    titles = [[style.short(study.environments[e]), seeds_in(study, configs, e)] for e in tried]
-    title = style.fitted(noise, width - 0.3)
+    labels = [rate_label(config, noise, width) for config in shown]
+    title = style.fitted(noise, width - 0.3) if noise else ""
+    titles = [[style.short(study.environments[e]), *lines] for e, _, lines in curves]
     height = style.legend_columns(labels, width, title)[1]
-    fig, axes, steps = curve_panels(study, titles, width, height)
-    for ax, e in zip(axes, tried, strict=True):
+    unit, word = (1e6, "millions") if study.steps[-1] >= 1e6 else (1e3, "thousands")
+    fig, axes = panels(study, titles, width, f"{DUE} ({word})", height)
+    for ax, (e, configs, _) in zip(axes, curves, strict=True):
         for config in configs:
-            if seeds[config][e]:
-                curve(ax, steps, study.curves[config][..., e], band, color=colors[config])
+            runs = study.curves[config][..., e]
+            curve(ax, study.steps / unit, runs, band, color=colors[config])
+        ax.set_xlim(0, study.steps[-1] / unit)
+        style.set_ticks(ax, "x", 5)
         style.set_ticks(ax, "y", 4)
-    handles = [Line2D([], [], color=colors[config]) for config in configs]
+    handles = [Line2D([], [], color=colors[config]) for config in shown]
     style.add_legend(fig, handles, labels, title)
     return fig
+
+
+def rate_label(config, noise, width):
+    """Return a configuration as a label of a legend, which may have its noise as a title."""
+    if config == BASELINE:
+        return "no noise"
+    rate = f"rate {config.noise_rate}"
+    return rate if noise else style.fitted(f"{config.noise} at {rate}", width - 0.6)
 
 
 def parameter_figures(study, band):
@@ -264,78 +261,6 @@ def point(ax, x, sample, band, color):
         ax.plot(np.full(len(sample), x), sample, ".", markersize=2.5, color=color, alpha=0.6)
     yerr = 0 if half is None else half
     ax.errorbar(x, sample.mean(), yerr, marker="o", markersize=3, linewidth=0.9, color=color)
-
-
-def robustness_figures(table, metric=RETURN):
-    """Yield a heatmap of robustness for every environment of a study."""
-    for (*study, environment), rows in table.groupby([*STUDY, "environment"]):
-        clean = rows[(rows["noise"] == "") & (rows["test_noise"] == "")]["mean"]
-        if len(clean) and len(rows) > 1:
-            yield robustness_heatmap(study_name(*study), environment, rows, clean.iloc[0], metric)
-
-
-def robustness_heatmap(algorithm, environment, rows, clean, metric):
-    """Draw training configuration x test condition: the score of every cell.
-
-    That is 100 (R - C) / |C|, or R - C where the clean return C has no percentages.
-    """
-    in_percent = rows["score_percent"].notna().all()
-    unit = "percent of that"
-    if not in_percent:
-        unit = "percentage points" if metric == SUCCESS else "units of the return"
-    values = rows["score_percent"] if in_percent else rows["mean"] - clean
-    trained = names_of(rows["noise"], rows["noise_rate"], "no noise")
-    tested = names_of(rows["test_noise"], rows["test_rate"], "clean")
-    grid = pd.DataFrame({"trained with": trained, "tested with": tested, "value": values})
-    grid["dot"] = rows["tested_on"] == "the same noise"
-    grid = grid.pivot(index="trained with", columns="tested with").loc[trained.unique()]
-    values, dots = (grid[name][tested.unique()] for name in ("value", "dot"))
-    # of percent, small ones are pale
-    ends = {"most": 100, "least": 10} if in_percent else {}
-    limit = style.color_limit(values, **ends)
-    name = f"{algorithm} on {environment}"
-    low, high = rows["n"].min(), rows["n"].max()
-    seeds = f"{low:.0f}" if low == high else f"{low:.0f} to {high:.0f}"
-    caption = (
-        f"{name} (seeds: {seeds}): mean {metric} of policies by training and test, as "
-        f"its difference from the clean {metric} of policies trained without noise, in {unit}. "
-        f"A dot marks a test on the noise of training. The colours end at \u00b1 {limit:.3g}."
-    )
-    form = (lambda value: percent(value).removesuffix(" %")) if in_percent else rounded
-    draw = partial(heatmap_figure, name, values.astype(float), dots.eq(True), limit, form)
-    return Drawing("robustness", f"heatmap {algorithm} {environment}", caption, draw)
-
-
-def names_of(noises, rates, none):
-    """Name configurations in training, or conditions of a test; `none` is that without noise."""
-    return (noises + ", " + rates).where(noises != "", none)
-
-
-def heatmap_figure(name, grid, dots, limit, form, width=None):
-    """Draw a figure of one heatmap: see effects.heatmap. In a column its longer side is down."""
-    width = width or style.PAGE
-    if width <= style.COLUMN and grid.shape[1] > grid.shape[0]:
-        grid, dots = grid.T, dots.T
-    lines = [style.fitted(label, min(2.1, 0.5 * width)) for label in grid.index]
-    columns = [style.fitted(label, 1.6) for label in grid.columns]
-    left = max(map(style.inches_of, lines)) + 2 * style.LINE
-    most = max(label.count("\n") for label in (*lines, *columns)) + 1
-    fig, [ax] = style.panels(
-        [[name]],
-        width,
-        [len(lines) * (most * style.LINE + 0.05)],
-        least=1,
-        left=0,
-        beside=left,
-        below=grid.columns.name,
-        ticks=max(map(style.inches_of, columns)) + 0.15,
-    )
-    heatmap(ax, grid, limit, form, dots)
-    ax.set_xticks(range(len(columns)), columns, rotation=90)
-    ax.set_yticks(range(len(lines)), lines)
-    middle = ax.get_position().intervaly.mean()
-    fig.text(0.03 / width, middle, grid.index.name, rotation=90, va="center", ha="left")
-    return fig
 
 
 def write_figure(out, drawing, latex=False, width=style.PAGE):

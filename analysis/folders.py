@@ -9,6 +9,7 @@ import json
 import math
 import os
 import re
+import zlib
 from collections.abc import Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -26,6 +27,8 @@ RETURN, SUCCESS = "return", "success rate"  # the metrics: what runs are compare
 NOT_SETTINGS = {"env_id", "exp_name", "seed", "noise", "noise_rate"} | MAY_DIFFER_IN_A_TABLE
 ENV_ID = re.compile(r"(?:\w+(?:\.\w+)*:)?[\w./-]+")  # a module, and what Gymnasium takes for an id
 ALGORITHM = re.compile(r"[\w .+()-]+")  # it names files
+# What reading a damaged file raises, compressed or not
+BAD_FILES = (OSError, ValueError, OverflowError, RecursionError, EOFError, zlib.error)
 EVAL_COLUMNS = ["step", "episode", "episodic_return", "episodic_length"]
 
 
@@ -152,8 +155,8 @@ def naming(path):
     """Turn what reading a file raises into a DamageError that begins with the file's name."""
     try:
         yield
-    except (OSError, ValueError, OverflowError, RecursionError) as error:
-        reason = error.strerror if isinstance(error, OSError) else " ".join(str(error).split())
+    except BAD_FILES as error:
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
         raise DamageError(f"{path.name}: {reason}") from None
 
 

@@ -18,7 +18,7 @@ CHARACTER, BETWEEN = 3.7, 7.0  # points at \footnotesize: of a character, and be
 MOST_OF_NAMES, MOST_OF_WORDS = 24, 12
 KEPT = ("environment", "noise", "noise rate", "steps millions", "algorithm, environment")
 SECONDARY = ("P(improvement)", "IQM change %", "effect size", "chosen from")  # left out first
-MOST_LINES = 48  # of a table; what is left has a table of its own
+MOST_ROWS = 30  # of a table, where a name may take two lines; the others have tables of their own
 NUMBER = re.compile(r"((?:< ?)?[-+]?(?:[0-9]|inf)[^ ]*) ?(.*)")
 TWO_PARTS = "r@{~}l"
 NUMBERS = {"r": 1, TWO_PARTS: 2}  # forms of columns of numbers: how many columns each is
@@ -33,32 +33,24 @@ class Column:
     form: str  # as in \begin{tabular}{...}
     cells: list
     width: float  # in points, about
-    lines: list  # how many each cell takes
 
 
 def escaped(text):
-    """Escape a text, with real minus signs and powers of ten."""
+    """Escape a text, with real minus signs."""
     text = re.sub(r"(?<![\w.)])-(?=[0-9]|inf)", "\u2212", str(text))
-    text = "".join(SPECIAL.get(character, character) for character in text)
-    return re.sub(r"(?<=[0-9])e([-+]?)\+?0*([0-9]+)", power_of_ten, text)
+    return "".join(SPECIAL.get(character, character) for character in text)
 
 
-def power_of_ten(found):
-    """Write the exponent that a regular expression has found."""
-    sign, digits = found.groups()
-    return rf"$\cdot10^{{{sign.strip('+')}{digits}}}$"
-
-
-def headed(name, form, cells, characters, lines=None):
+def headed(name, form, cells, characters):
     """Make a Column whose head is broken to be about as wide as its cells."""
     words = textwrap.wrap(name, max(9, characters), break_long_words=False)
     width = CHARACTER * max(characters, *map(len, words)) + BETWEEN
-    head = escaped(words[0])
+    head = r"\\".join(map(escaped, words))
     if len(words) > 1:
-        head = "\\shortstack{" + r"\\".join(map(escaped, words)) + "}"
+        head = rf"\shortstack{{{head}}}"
     if form in NUMBERS:
         head = rf"\multicolumn{{{NUMBERS[form]}}}{{c}}{{{head}}}"
-    return Column(head, form, cells, width, lines or [1] * len(cells))
+    return Column(head, form, cells, width)
 
 
 def number_column(name, values):
@@ -80,9 +72,8 @@ def text_column(name, values):
         return headed(name, "l", list(map(escaped, values)), longest)
     pieces = [re.split(r"(?<=[a-z0-9])(?=[A-Z(])", value) for value in values]
     cells = [r"\allowbreak{}".join(map(escaped, parts)) for parts in pieces]
-    lines = [-(-len(value) // (3 * most // 4)) for value in values]
     form = rf">{{\raggedright\arraybackslash}}p{{{CHARACTER * most:.0f}pt}}"
-    return headed(name, form, cells, most, lines)
+    return headed(name, form, cells, most)
 
 
 def is_number(name, values):
@@ -127,7 +118,7 @@ def latex_table(table, text, inches):
     lines = []
     if left_out:
         lines.append(f"% no room for: {', '.join(left_out)} (see {table.name}.csv)")
-    for start, end in parts_of(columns, len(text)):
+    for start in range(0, max(1, len(text)), MOST_ROWS):
         continued = " (continued)" if start else ""
         lines += [
             r"\begin{table*}[t]",
@@ -140,7 +131,7 @@ def latex_table(table, text, inches):
             r"\toprule",
             " & ".join(column.head for column in columns) + r" \\",
             r"\midrule",
-            *rows_of(columns, start, end),
+            *rows_of(columns, start, min(start + MOST_ROWS, len(text))),
             r"\bottomrule",
             r"\end{tabular}}",
             r"\end{table*}",
@@ -148,27 +139,11 @@ def latex_table(table, text, inches):
     return "\n".join(lines) + "\n"
 
 
-def parts_of(columns, number):
-    """Yield the first row and the end of each part of a table that is as long as a page."""
-    start = lines = 0
-    for i in range(number):
-        height = max(column.lines[i] for column in columns)
-        if lines and lines + height > MOST_LINES:
-            yield start, i
-            start, lines = i, 0
-        lines += height
-    yield start, number
-
-
 def rows_of(columns, start, end):
     """Yield the rows of a table; a text that the row above has, too, is left out."""
     for i in range(start, end):
         cells, same = [], i > start
         for column in columns:
-            is_text = column.form not in NUMBERS
-            same = same and is_text and column.cells[i] == column.cells[i - 1]
+            same = same and column.form not in NUMBERS and column.cells[i] == column.cells[i - 1]
             cells.append("" if same else column.cells[i])
-        first = columns[0].cells
-        if i > start and first[i] != first[i - 1] and first[i] in first[i + 1 : i + 2]:
-            yield r"\addlinespace"
         yield " & ".join(cells) + r" \\"

@@ -91,10 +91,21 @@ class Results:
     notes: list
     versions: list  # notes on versions of code and libraries, which change no verdict
 
+    @property
+    def repeated(self):
+        """The names of tables that say nothing but what the first one says, too."""
+        names = set() if len(self.rates) else {"statistics", "statistics_together"}
+        return names if (self.tables["best"].frame["chosen_from"] > 1).any() else names | {"best"}
+
+
+def is_number(text):
+    """Tell whether a cell begins with a number."""
+    return bool(re.match("(< )?[-+]?([0-9]|inf)", text))
+
 
 def breakable(text):
     """Mark where a browser may break a cell: a noise between its words, but never a number."""
-    if re.match("(< )?[-+]?[0-9]", text):
+    if is_number(text):
         for sign in (" \u00b1 ", ", ", "< "):
             text = text.replace(sign, sign.replace(" ", "\u00a0"))
         whole = Markup('<span class="whole">{}</span>')  # a browser would break "1e-05"
@@ -111,7 +122,7 @@ def write_report(out, results, drawn):
     tables, figures, folded = defaultdict(list), defaultdict(list), defaultdict(list)
     for table in results.tables.values():
         text = shown(table)
-        if len(text):
+        if len(text) and table.name not in results.repeated:
             text = text.loc[:, (text != DASH).any()]  # a column of dashes says nothing
             tables[table.section].append((table, text))
     number = Counter(drawing.kind for drawing in drawn)
@@ -130,6 +141,7 @@ def write_report(out, results, drawn):
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True
     )
     pages.filters |= {"breakable": breakable, "embedded": embedded, "tally": tally}
+    pages.tests["numeric"] = is_number
     used = {name for texts in tables.values() for _, text in texts for name in text}
     used |= {title(name) for table in results.tables.values() for name in table.frame}
     for frame in (results.clear, results.others, results.rates):

@@ -9,20 +9,20 @@ verdicts, with Holm's correction; docs/statistics.md has the details. All of thi
 of success instead of the return, in percentage points.
 """
 
-import zlib
 from itertools import zip_longest
 
 import numpy as np
 import pandas as pd
 
 from analysis import verdicts
-from analysis.folders import RETURN, SUCCESS
+from analysis.episodes import read_episodes
+from analysis.folders import RETURN, SUCCESS, DamageError
 from analysis.formatting import p_value, percent
-from analysis.runs import KEYS, ROBUSTNESS_COLUMNS, STUDY, study_name, study_of, where_tested
+from analysis.runs import KEYS, STUDY, study_name, study_of, where_tested
 from analysis.statistics import compare, holm, mean_std, percent_of
 from analysis.tables import table_of
 from analysis.words import counted
-from noisy_wrappers import BASELINE, WRAPPERS, Configuration
+from noisy_wrappers import BASELINE
 
 EPISODES = 100  # of a condition, as evaluate.py plays by default
 CLEAN = BASELINE  # a condition of a test is a Configuration, too
@@ -36,37 +36,37 @@ SCORE_COLUMNS = [*STUDY, *SCORE_COLUMNS.split()]
 
 
 def read_robustness(runs, metric=RETURN):
-    """Read robustness.csv (or .csv.gz) of runs that count: one row per run and condition.
+    """Read robustness.csv of runs that count: one row per run and condition.
 
     metric: what `mean` is of; of success (in percent), only conditions in which the environment
-    tells it, to some run; the others had none there. Return the frame (RUN_COLUMNS) and notes on
-    the files that could not be read.
+    tells it, to some run; the others had none there. Return the frame (RUN_COLUMNS) and notes.
     """
     rows, notes = [], []
     for run in runs:
-        path = run.folder / "robustness.csv"
-        if not path.exists():
-            path = path.with_suffix(".csv.gz")
-        if not path.exists():
-            continue
         try:
-            tests = read_episodes(path, metric)
-        except (OSError, ValueError, EOFError, zlib.error) as error:
-            notes.append(
-                f"{run.folder.name}: {path.name} is left out: {' '.join(str(error).split())}"
-            )
+            tests = read_episodes(run.folder)
+        except DamageError as error:
+            notes.append(f"{run.folder.name} has no tests of robustness: {error}")
             continue
         row = dict(zip(STUDY, study_of(run), strict=True))
         row |= {"configuration": run.configuration, "seed": run.seed}
-        for (condition, elsewhere), results in tests.items():
+        for (condition, elsewhere), episodes in tests.items():
             row |= {"condition": condition, "elsewhere": elsewhere}
             row["environment"] = where_tested(run.environment, elsewhere)
-            rows.append(row | {"mean": results})
+            rows.append(row | {"mean": results_of(episodes, metric)})
     table = pd.DataFrame(rows, columns=RUN_COLUMNS)
     place = [table["environment"], table["condition"]]
     told = table["mean"].map(np.mean).notna().groupby(place).transform("any")
     table, more = shortened(table[told])
-    return table.fillna({"mean": 0.0}), notes + more + incomplete_notes(table)
+    return table.fillna({"mean": 0.0}), notes + more
+
+
+def results_of(episodes, metric):
+    """Return the returns of episodes, or their success: 100 or 0, NaN where none tells it."""
+    if metric == RETURN:
+        return episodes[:, 0]
+    success = 100 * episodes[:, 2]
+    return success if np.isnan(success).all() else np.nan_to_num(success)
 
 
 def shortened(table):
@@ -75,63 +75,29 @@ def shortened(table):
     Episode i begins in the same state in all tests of an environment, so the tests are compared
     over the episodes that all of them have.
     """
-    place = [table[name] for name in (*STUDY, "environment")]
-    played = table["mean"].map(len).groupby(place)
-    least = played.transform("min")
+    places = [*STUDY, "environment"]
+    number = table["mean"].map(len)
+    least = number.groupby([table[name] for name in places]).transform("min")
     means = [results[:n].mean() for results, n in zip(table["mean"], least, strict=True)]
+    table = table.assign(mean=np.array(means, float), number=number)
     notes = []
-    for (*study, environment), numbers in played:
-        if numbers.min() < numbers.max():
+    for (*study, environment), group in table.groupby(places):
+        few, many = group["number"].min(), group["number"].max()
+        if few < many:
             notes.append(
-                f"{study_name(*study)} on {environment}: tests have {numbers.min()} to "
-                f"{numbers.max()} episodes; the first {numbers.min()} count, which begin alike "
-                f"(evaluate.py --episodes {numbers.max()} plays the others)"
+                f"{study_name(*study)} on {environment}: tests have {few} to {many} episodes; the "
+                f"first {few} count, which begin alike (evaluate.py --episodes {many} plays the "
+                "others)"
             )
-    return table.assign(mean=np.array(means, float)), notes
-
-
-def incomplete_notes(runs):
-    """Say where runs were not tested under all conditions, as when evaluate.py was interrupted."""
-    notes = []
-    for (*study, environment), group in runs.groupby([*STUDY, "environment"]):
+        conditions = group["condition"].nunique()
         played = group.groupby(["configuration", "seed"])["condition"].nunique()
-        number = group["condition"].nunique()
-        if few := (played < number).sum():
+        if lacking := (played < conditions).sum():
             notes.append(
-                f"{study_name(*study)} on {environment}: {few} of {len(played)} tested runs lack "
-                f"some of the {number} test conditions; a condition counts where all runs that are "
-                "compared have it"
+                f"{study_name(*study)} on {environment}: {lacking} of {len(played)} tested runs "
+                f"lack some of the {conditions} test conditions; a condition counts where all runs "
+                "that are compared have it"
             )
-    return notes
-
-
-def read_episodes(path, metric=RETURN):
-    """Read one file: {(Configuration, environment): results of its episodes}.
-
-    The environment is empty for that of the training. A result is a return, or of success 100 or 0,
-    NaN where no episode of the condition tells it. Raises ValueError.
-    """
-    keys = ["noise", "noise_rate", "environment"]
-    table = pd.read_csv(path, dtype=dict.fromkeys(keys, str)).fillna(dict.fromkeys(keys, ""))
-    if [name for name in table if name not in ("success", "environment")] != ROBUSTNESS_COLUMNS:
-        raise ValueError("unexpected header")
-    results = pd.to_numeric(table["episodic_return"])
-    if not np.isfinite(results).all() or not len(results):
-        raise ValueError("no episodes, or a return that is not finite")
-    if metric == SUCCESS:
-        results = 100 * pd.to_numeric(table.get("success", np.nan))
-    table = table.assign(environment=table.get("environment", ""), result=results)
-    found = {}
-    for (noise, rate, environment), rows in table.groupby(keys, sort=False):
-        condition, group = Configuration.parse(noise, rate), rows["result"]
-        if rows["episode"].tolist() != list(range(len(rows))):  # episode i begins alike everywhere
-            raise ValueError(f"episodes under {condition} are lost, repeated or out of order")
-        unknown = [name for name in condition.wrappers if name not in WRAPPERS and ":" not in name]
-        if unknown:  # and none of the user's own
-            raise ValueError(f"unknown noise {unknown[0]!r}")
-        told = group.notna().any()
-        found[condition, environment] = group.fillna(0 if told else np.nan).to_numpy(float)
-    return found
+    return table, notes
 
 
 def tested_on(condition, config):

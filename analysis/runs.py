@@ -20,7 +20,6 @@ from noisy_wrappers import BASELINE, different_arguments
 STUDY = ["algorithm", "exp_name", "phase", "tested"]  # the columns that name a study: study_name
 KEYS = [*STUDY, "environment", "noise", "noise_rate"]
 LEFT_OUT_COLUMNS = ["status", *KEYS, "seed", "run", "reason"]
-ROBUSTNESS_COLUMNS = ["noise", "noise_rate", "episode", "episodic_return", "episodic_length"]
 MORE_TO_COME = {"missing", "unfinished", "failed"}  # statuses of runs that a sweep still owes
 
 
@@ -114,16 +113,12 @@ def leave_out_different(entries):
             )
         same = [entry for entry in group if entry.run.release == release]
         reference = usual_config([entry.run.config for entry in same])
-        reasons = {}  # most runs have one of a few sets of arguments
         for entry in same:
-            text = json.dumps(settings_of(entry.run.config), sort_keys=True)
-            if text not in reasons:
-                reasons[text] = what_differs(entry.run.config, reference)
-            if reasons[text]:
+            if difference := what_differs(entry.run.config, reference):
                 entry.status = "different"
                 entry.reason = (
-                    f"{reasons[text]} as in the runs of {exp_name} that count: give such runs "
-                    "another --exp-name"
+                    f"{difference} as in the runs of {exp_name} that count: give such runs another "
+                    "--exp-name"
                 )
 
 

@@ -73,7 +73,7 @@ def make_studies(entries, metric=RETURN):
     for environment in sorted(silent.keys() & telling):
         notes.append(
             f"runs on {environment} that never tell success, as others do, count as 0 %: "
-            f"{silent[environment]} (version 0.2 noted no success: leave its runs out)"
+            f"{silent[environment]}"
         )
     for run in runs:
         if values[run] is None:
@@ -118,7 +118,6 @@ def shared_steps(runs):
 def notes_on(study, runs):
     """Say what to know of a study: runs that were cut, and what it lacks."""
     notes = []
-    longest = max(len(run.curve.steps) for run in runs)
     ended = [run for run in runs if run.curve.steps[-1] < run.total_timesteps]
     if ended:
         last = [run.curve.steps[-1] for run in ended]
@@ -126,11 +125,6 @@ def notes_on(study, runs):
             f"{study.name}: runs that ended by themselves before their "
             f"{runs[0].total_timesteps:,} steps: {len(ended)} of {len(runs)}, at step "
             f"{min(last):,} to {max(last):,}; they count with their own last tests"
-        )
-    if len(study.steps) < longest:
-        notes.append(
-            f"{study.name}: runs differ in their evaluation steps; curves are cut to "
-            f"those that all share, {len(study.steps)} of up to {longest}"
         )
     for e, env in enumerate(study.environments):
         if study.phase != SEARCH and len(study.sample(BASELINE, e)) == 0:

@@ -40,7 +40,7 @@ matplotlib.rcParams.update(STYLE)
 # Colour-blind readers tell these apart (Okabe and Ito, 2008); report.html.jinja has them, too.
 BETTER, WORSE, UNCLEAR = "#0072B2", "#D55E00", "#AA4499"
 COLORS = {"better": BETTER, "worse": WORSE}  # of verdicts; all others are UNCLEAR
-DIVERGING = LinearSegmentedColormap.from_list("effects", [WORSE, "white", BETTER])
+DIVERGING = LinearSegmentedColormap.from_list("diverging", [WORSE, "white", BETTER])
 HUES = ["#4477AA", "#EE6677", "#228833", "#CCBB44", "#AA3377", "#66CCEE"]  # Paul Tol's "bright"
 
 
@@ -49,13 +49,6 @@ def hues(number):
     if number <= len(HUES):
         return HUES[:number]
     return list(matplotlib.colormaps["turbo"](np.linspace(0.05, 0.95, number)))
-
-
-def color_limit(values, most=np.inf, least=0.0):
-    """Return where the colours of a heatmap end: at its largest number, from `least` to `most`."""
-    sizes = np.abs(np.asarray(values, float))
-    limit = min(most, sizes[np.isfinite(sizes)].max(initial=least)) or 1.0
-    return float(np.ceil(limit)) if most == 100 else limit
 
 
 # ---------------------------------------------------------------------------------------- text

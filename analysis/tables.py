@@ -8,12 +8,10 @@ import pandas as pd
 from analysis import statistics, verdicts
 from analysis.comparisons import IQM, IQM_CHANGE, PROBABILITY, compare_all, results
 from analysis.folders import SEARCH, SUCCESS
-from analysis.formatting import Table, listed, p_text, seeds_of, slug
+from analysis.formatting import Table, listed, seeds_of, slug
 from analysis.luck import add_luck, luck_of_studies
-from analysis.power import LEVEL
 from analysis.runs import KEYS, STUDY, study_name
 from analysis.verdicts import ALL_EQUAL
-from analysis.words import counted
 from noisy_wrappers import BASELINE
 
 CONSISTENT_PERCENT = 80  # of the environments, as in the paper
@@ -120,31 +118,6 @@ def split_consistency(consistency):
     return good, bad
 
 
-def family_notes(noises):
-    """Say where there are too few seeds for a difference that is significant, if corrected.
-
-    noises: the comparisons of noises in one environment.
-    """
-    notes = []
-    compared = noises[noises["verdict"].notna() & (noises["verdict"] != ALL_EQUAL)]
-    best = compared.sort_values("smallest_p", kind="stable")
-    best = best.drop_duplicates([*STUDY, "environment"]).sort_index()
-    keys = [*STUDY, "comparisons", "smallest_p"]
-    for (*study, size, smallest), same in best.groupby(keys, sort=False, dropna=False):
-        seeds = counted(same[["n", "n_baseline"]].min(axis=None), "seed")
-        start = f"{study_name(*study)}, {', '.join(same['environment'])}: with {seeds}"
-        possible = f"smallest possible p: {p_text(smallest)}"
-        if smallest > LEVEL:
-            notes.append(f"{start} no difference can be significant ({possible}).")
-        elif round(size * smallest, 9) > LEVEL:
-            corrected = p_text(min(1, size * smallest))
-            notes.append(
-                f"{start} and {size:.0f} comparisons no difference alone can be significant "
-                f"after the correction ({possible}, corrected {corrected})."
-            )
-    return notes
-
-
 def lopsided_notes(compared):
     """Say where verdicts may be wrong too often, because one side has few of all seeds."""
     pairs = zip(compared.noises["n"], compared.noises["n_baseline"], strict=True)
@@ -162,16 +135,6 @@ def lopsided_notes(compared):
                 f"{listed(seeds)} seeds with and without noise {said}"
             )
     return notes
-
-
-def all_equal_notes(studies):
-    """Say where all tests of all runs have the same result, so that comparisons say nothing."""
-    return [
-        f"{study.name} on {environment}: {verdicts.what_all_runs_do(value, study.metric)} in "
-        f"{study.steps[-1]:,} steps, so they say nothing about noise."
-        for study in studies
-        for environment, value in study.all_equal().items()
-    ]
 
 
 def success_table(studies):

@@ -231,21 +231,14 @@ def luck_sentence(best):
         return ""
     if not (best["difference"] > 0).any():
         return "Nothing that was tried has a higher mean than no noise."
-    tried = set(judged["chosen_from"])
-    number = "as many" if len(tried) > 1 else f"{max(tried):.0f}"
-    rivals = f"the best of {number} useless noises would"
-    if tried == {1}:
-        rivals = "one useless noise might"
     judged = judged.assign(p_luck=holm(judged["p_luck"].to_numpy(float)))  # over environments
+    rivals = "the best of as many useless noises would"
     beyond = judged[judged["p_luck"] <= LEVEL]
     if beyond.empty:
-        where = " in each environment" if len(judged) > 1 else ""
-        if len(judged) < len(best):
-            where = f" on {listed(list(judged['environment']))}"
-        return f"The best noise{where} looks no better than {rivals}."
+        where = listed(list(judged["environment"]))
+        return f"On {where} the best noise looks no better than {rivals}."
     where = [f"{row.environment} (p {p_value(row.p_luck)})" for row in beyond.itertuples()]
-    elsewhere = "; elsewhere it does not" if len(beyond) < len(judged) else ""
-    return f"On {listed(where)} the best noise looks better than {rivals}{elsewhere}."
+    return f"On {listed(where)} the best noise looks better than {rivals}."
 
 
 def headlines(by_noise, best):

@@ -8,7 +8,6 @@ import math
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -26,9 +25,9 @@ import evaluate
 import ppo_continuous_noisy as ppo
 import sac_continuous_noisy as sac
 import td3_continuous_noisy as td3
+from analysis.episodes import read_episodes, store_episodes
 from analysis.folders import DamageError, Run
 from analysis.formatting import rounded
-from analysis.robustness import read_episodes
 from evaluate import Args, main
 from noisy_wrappers import BASELINE, Configuration
 
@@ -37,6 +36,7 @@ SCRIPTS = {"SAC": sac, "TD3": td3, "PPO": ppo}
 OBSERVATION, ACTION = "RandomNormalNoisyObservation(0.1)", "RandomNormalNoisyAction(0.5)"
 RATES = (0, 0.5, 1.0)
 SEED = 2_000_000  # of the first episode, unless --seed says otherwise
+CLEAN = BASELINE, ""  # a condition, and no other environment
 COMBINED = "RandomUniformScaleReward(-3, 5)+RandomEarlyTermination(6)"
 
 
@@ -104,7 +104,7 @@ def test_clean_returns_are_those_of_the_last_evaluation(runs, algorithm):
     with open(run_dir / "eval.csv", newline="") as file:
         last = list(csv.DictReader(file))[-10:]
     rows = [(float(row["episodic_return"]), int(row["episodic_length"])) for row in last]
-    assert [result[:2] for result in played] == rows
+    assert [(value, length) for value, length, _ in played] == rows
     assert len(set(rows)) > 1
 
 
@@ -164,36 +164,24 @@ def test_the_time_limit_of_training_holds(runs):
 # What is stored
 
 
-def test_what_is_stored_is_not_played_again(runs, monkeypatch, capsys):
-    args = Args((runs,), noises=(OBSERVATION,), noise_rates=(0.5, 1.0), episodes=4)
+def test_only_what_is_not_stored_is_played(runs, monkeypatch, capsys):
+    args = Args((runs,), noises=(OBSERVATION,), noise_rates=(0.5, 1.0), episodes=2)
     main(args)
-    table, before = capsys.readouterr().out, files(runs)
-    monkeypatch.setattr(evaluate, "play", None)
-    main(args)
-    assert capsys.readouterr().out == table
-    again = Args((runs,), (" RandomNormalNoisyObservation(.1)",), (1, 0.5, 0.50, 0.0), episodes=2)
-    main(again)
+    table, before, first = capsys.readouterr().out, files(runs), stored(one(runs, "PPO"))
+    with monkeypatch.context() as patch:
+        patch.setattr(evaluate, "play", None)
+        main(args)
+        assert capsys.readouterr().out == table
+        spelled = (" RandomNormalNoisyObservation(.1)",)
+        main(Args((runs,), spelled, (1, 0.5, 0.50, 0.0), episodes=1))
     assert files(runs) == before
-    means = {}
-    for run_dir in runs.iterdir():
-        first = [row for row in stored(run_dir) if int(row["episode"]) < 2 and not row["noise"]]
-        means[run_dir] = np.mean([float(row["episodic_return"]) for row in first])
-    assert f" {rounded(means[one(runs, 'TD3')])} " in capsys.readouterr().out  # of the first two
-
-
-def test_more_episodes_replay_only_the_conditions_that_have_fewer(runs):
-    run_dir = one(runs, "PPO")
-    main(Args((run_dir,), noises=(OBSERVATION,), noise_rates=(0.5, 1.0), episodes=2))
-    first = stored(run_dir)
-    main(Args((run_dir,), noises=(OBSERVATION, ACTION), noise_rates=(0.5,), episodes=3))
-    again = stored(run_dir)
+    mean = float(stored(one(runs, "TD3"))[0]["episodic_return"])  # of the first episode
+    assert f" {rounded(mean)} " in capsys.readouterr().out
+    main(Args((one(runs, "PPO"),), (OBSERVATION, ACTION), (0.5,), episodes=3))
+    again = stored(one(runs, "PPO"))
     counts = Counter((row["noise"], row["noise_rate"]) for row in again)
-    assert counts == {
-        ("", "0.0"): 3,
-        (OBSERVATION, "0.5"): 3,
-        (OBSERVATION, "1.0"): 2,
-        (ACTION, "0.5"): 3,
-    }
+    more = {("", "0.0"): 3, (OBSERVATION, "0.5"): 3, (ACTION, "0.5"): 3}
+    assert counts == more | {(OBSERVATION, "1.0"): 2}
     assert [row for row in again if row["episode"] != "2" and row["noise"] != ACTION] == first
 
 
@@ -201,40 +189,19 @@ def test_another_seed_plays_everything_and_stores_nothing(runs, capsys):
     """What is stored would do for two of the three conditions."""
     run_dir = one(runs, "PPO")
     main(Args((run_dir,), (OBSERVATION,), (0.5,), episodes=3))
-    before, default = files(runs), capsys.readouterr().out
+    before = files(runs)
     args = Args((run_dir,), (OBSERVATION,), RATES[1:], episodes=3, seed=7)
+    capsys.readouterr()
     main(args)
     said, *table = capsys.readouterr().out.splitlines()
     assert "nothing is stored" in said and files(runs) == before
     [finished], _ = evaluate.find_players([run_dir])
     played = [evaluate.play(finished, Configuration.read([OBSERVATION], [r]), args) for r in RATES]
-    means = [rounded(np.mean(results, axis=0)[0]) for results in played]
-    assert table[-1].split()[-3:] == means and means[0] != default.split()[-2]
+    assert table[-1].split()[-3:] == [rounded(results[:, 0].mean()) for results in played]
 
 
 @pytest.mark.slow
-def test_a_kill_leaves_whole_conditions_and_the_same_command_goes_on(runs):
-    run_dir = one(runs, "PPO")
-    options = ["--noises", OBSERVATION, ACTION, "--noise-rates", "0.3", "0.6", "--episodes", "30"]
-    process = commands.start(evaluate.__file__, [run_dir, *options])
-    while not (run_dir / "robustness.csv").exists():
-        assert process.is_alive()
-        time.sleep(0.01)
-    process.kill()
-    commands.ended(process)
-    rows = stored(run_dir)
-    assert [int(row["episode"]) for row in rows] == [*range(30)] * (len(rows) // 30)
-    main(Args((run_dir,), (OBSERVATION, ACTION), (0.3, 0.6), episodes=30))
-    conditions = Counter((row["noise"], row["noise_rate"]) for row in stored(run_dir))
-    assert len(conditions) == 5 and set(conditions.values()) == {30}
-    assert stored(run_dir)[: len(rows)] == rows
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "number, code", [(signal.SIGTERM, 128 + signal.SIGTERM), (signal.SIGKILL, -signal.SIGKILL)]
-)
-def test_a_killed_program_leaves_no_process_behind(runs, number, code):
+def test_a_killed_program_leaves_no_process_behind(runs):
     """Its processes end by themselves, also one that was just started and still imports."""
     options = ["--noises", OBSERVATION, ACTION, "--episodes", 20_000, "--jobs", 2]
     process = subprocess.Popen(**command(one(runs, "PPO"), *options), start_new_session=True)
@@ -246,8 +213,8 @@ def test_a_killed_program_leaves_no_process_behind(runs, number, code):
     while processes() < 2:
         assert process.poll() is None
         time.sleep(0.1)
-    process.send_signal(number)
-    assert process.wait(timeout=100) == code
+    process.kill()
+    process.wait(timeout=100)
     deadline = time.time() + 60
     while processes() and time.time() < deadline:
         time.sleep(0.1)
@@ -282,58 +249,40 @@ def test_two_processes_on_one_run_lose_nothing(runs):
     assert [path.name for path in run_dir.glob(".robustness*")] == [".robustness.lock"]
 
 
-def test_a_run_is_found_once_by_whatever_path(runs, tmp_path):
-    folder = one(runs, "PPO")
-    (tmp_path / "link").symlink_to(runs)
-    paths = [folder, runs, tmp_path / "link", folder / ".." / folder.name]
-    found, _ = evaluate.find_players(paths)
-    assert [run.folder for run in found].count(folder) == 1
-    assert len(found) == len({run.folder.resolve() for run in found})
-
-
-def test_what_is_played_is_stored_by_the_process_that_plays_and_the_longer_result_is_kept(runs):
-    """So nothing waits for an earlier condition that still plays in another process."""
-    [finished], _ = evaluate.find_players([one(runs, "PPO")])
-    evaluate.play(finished, Configuration.read([OBSERVATION], [0.5]), Args((), episodes=2))
-    assert [row["noise"] for row in stored(finished.folder)] == [OBSERVATION] * 2
+def test_the_longer_of_two_results_is_kept_also_of_a_compressed_file(tmp_path):
     short, long = [(1.0, 1, 1.0)], [(1.0, 1, 1.0), (2.0, 2, 0.0)]
+    path = tmp_path / "robustness.csv"
     for results in (short, long, short):
-        evaluate.store(finished, ("", "0.0", ""), results)
-    assert evaluate.read_stored(finished)["", "0.0", ""] == long
+        store_episodes(tmp_path, CLEAN, results)
+        Path(f"{path}.gz").write_bytes(gzip.compress(path.read_bytes()))
+        path.unlink()
+    assert read_episodes(tmp_path)[CLEAN].tolist() == [list(result) for result in long]
 
 
-def test_what_is_stored_in_a_compressed_file_is_kept(runs):
-    """Or analyze.py, which takes the file that is not compressed, would lose it."""
-    run_dir = one(runs, "PPO")
-    main(Args((run_dir,), (OBSERVATION,), episodes=2))
-    before = stored(run_dir)
-    (run_dir / "robustness.csv.gz").write_bytes(
-        gzip.compress((run_dir / "robustness.csv").read_bytes())
-    )
-    (run_dir / "robustness.csv").unlink()
-    main(Args((run_dir,), (ACTION,), episodes=2))
-    assert stored(run_dir)[:4] == before and len(stored(run_dir)) == 6
+DAMAGE = {
+    "lost, repeated": lambda text: text.replace(",0.0,0,1.0,1,1\n", ""),
+    "repeated or out": lambda text: text + ",0.0,1,2.0,2,0\n",
+    "not finite": lambda text: text.replace("2.0", "inf"),
+    "unexpected header": lambda text: text.replace("episode,", "number,"),
+    "or no episodes": lambda text: text.partition("\n")[0],
+    "unknown noise 'RandomX'": lambda text: text + "RandomX(1),0.5,0,1.0,1,1\n",
+}
 
 
-@pytest.mark.parametrize("change", [lambda rows: rows[1:], lambda rows: rows + rows])
-def test_episodes_that_are_lost_or_repeated_are_damage(runs, change):
-    """Or the others would count as episodes that begin in other states."""
-    [finished], _ = evaluate.find_players([one(runs, "PPO")])
-    evaluate.store(finished, ("", "0.0", ""), [(1.0, 1, 1.0), (2.0, 2, 0.0)])
-    path = finished.folder / "robustness.csv"
-    header, *rows = path.read_text().splitlines()
-    path.write_text("\n".join([header, *change(rows)]) + "\n")
-    with pytest.raises(DamageError, match="delete that file"):
-        evaluate.read_stored(finished)
-    with pytest.raises(ValueError, match="episodes under no noise"):
-        read_episodes(path)
+@pytest.mark.parametrize("said", DAMAGE)
+def test_damaged_episodes_are_told(said, tmp_path):
+    """Or others would count as episodes that begin in the same states."""
+    store_episodes(tmp_path, CLEAN, [(1.0, 1, 1.0), (2.0, 2, 0.0)])
+    path = tmp_path / "robustness.csv"
+    path.write_text(DAMAGE[said](path.read_text()))
+    with pytest.raises(DamageError, match=rf"^robustness.csv: .*{said}"):
+        read_episodes(tmp_path)
 
 
-def test_success_that_some_conditions_do_not_tell_is_empty_there(runs):
-    [finished], _ = evaluate.find_players([one(runs, "PPO")])
-    evaluate.store(finished, ("", "0.0", ""), [(0.1 + 0.2, 1, math.nan)])
-    evaluate.store(finished, ("", "0.0", "Heavy-v0"), [(2.0, 2, 1.0), (-3.0, 3, 0.0)])
-    assert (finished.folder / "robustness.csv").read_text().splitlines() == [
+def test_success_that_some_conditions_do_not_tell_is_empty_there(tmp_path):
+    store_episodes(tmp_path, CLEAN, [(0.1 + 0.2, 1, math.nan)])
+    store_episodes(tmp_path, (BASELINE, "Heavy-v0"), [(2.0, 2, 1.0), (-3.0, 3, 0.0)])
+    assert (tmp_path / "robustness.csv").read_text().splitlines() == [
         "noise,noise_rate,episode,episodic_return,episodic_length,success,environment",
         ",0.0,0,0.30000000000000004,1,,",
         ",0.0,0,2.0,2,1,Heavy-v0",
@@ -357,45 +306,35 @@ def test_a_full_disk_leaves_the_previous_file(runs, monkeypatch, capsys):
     assert files(runs) == before
 
 
-def test_a_copy_of_a_script_plays_its_own_policy(tmp_path, monkeypatch, capsys):
-    """Its environment and its network are its own: the returns are those of its last test."""
-    script = (ROOT / "ppo_continuous_noisy.py").read_text()
-    flat = "    return noisy.make_flat(env, STEP_LIMIT)"
-    changed = (
-        "    return noisy.make_flat(gym.wrappers.TransformReward(env, lambda r: 2 * r + 1), 500)"
-    )
-    script = script.replace("64), nn.Linear(64, outputs)", "32), nn.Linear(32, outputs)")
-    assert flat in script and "nn.Linear(32, outputs)" in script
-    (tmp_path / "wide_continuous_noisy.py").write_text(script.replace(flat, changed))
-    monkeypatch.chdir(tmp_path)
-    options = "--env-id InvertedPendulum-v5 --total-timesteps 256 --num-steps 128 --no-compile"
-    line = [sys.executable, "wide_continuous_noisy.py", *options.split(), "--eval-episodes", "3"]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    subprocess.run(line, check=True, capture_output=True, env=environment)
-    [run_dir] = [path for path in Path("runs").iterdir() if path.is_dir()]
-    last = np.loadtxt(run_dir / "eval.csv", delimiter=",", skiprows=1, usecols=2)[-3:]
-    assert main(Args((run_dir,), episodes=3, seed=1_000_000)) == 0
-    assert capsys.readouterr().out.split()[-1] == rounded(last.mean())
-    (tmp_path / "wide_continuous_noisy.py").unlink()
-    assert main(Args((run_dir,), episodes=3)) == 2
+def test_a_script_that_is_not_there_or_has_changed_is_told(runs, capsys):
+    run_dir = one(runs, "PPO")
+    edit_config(run_dir, script_sha256=64 * "0")
+    assert main(Args((run_dir,), episodes=1)) == 0
+    assert "ppo_continuous_noisy.py has changed" in capsys.readouterr().err
+    edit_config(run_dir, script="wide_continuous_noisy.py")
+    assert main(Args((run_dir,), episodes=1)) == 2
     assert "its script wide_continuous_noisy.py is neither" in capsys.readouterr().err
 
 
-def test_an_unfinished_run_plays_if_it_is_named_and_stores_nothing(runs, capsys):
+def test_an_unfinished_run_plays_only_if_it_is_named_and_stores_nothing(runs, capsys):
     run_dir = one(runs, "PPO")
     (run_dir / "result.json").unlink()
     before = files(run_dir)
     assert main(Args((run_dir,), episodes=2)) == 0
     assert "its policy of step 256 is tested" in capsys.readouterr().out
     assert files(run_dir) == before
-    main(Args((runs,), episodes=1))
-    assert "unfinished runs are left out: 1" in capsys.readouterr().out
+    runs = runs.rename(runs.parent / "two__words")  # which is no run's name here
+    (runs / "report.html").touch()  # analyze.py --out may be the same folder
+    main(Args((runs, one(runs, "TD3")), episodes=1))
+    assert "unfinished runs are left out: 1\n" in capsys.readouterr().out
+    assert sum((run_dir / "robustness.csv").exists() for run_dir in runs.glob("*Inv*")) == 3
 
 
 # The table
 
 
 def test_the_table_of_known_returns(capsys):
+    conditions = [BASELINE, Configuration.parse("A(1) + B(2)", "0.1 + 0.1")]
     seen = {}
     for noise, rate, clean, noisy in [
         ("", "0.00", [10, 30], [1, 2]),  # means 20 and 1.5
@@ -408,10 +347,9 @@ def test_the_table_of_known_returns(capsys):
         run = Run(folder, "", {"args": {}}, *names, BASELINE, 1, 1, "0.4")
         # A third episode is stored and not asked for; the second number is the length.
         seen[evaluate.Player(run)] = {
-            ("", "0.0", ""): [(value, 1, math.nan) for value in (*clean, 1000)],
-            ("A(1) + B(2)", "0.1 + 0.1", ""): [(value, 1, math.nan) for value in (*noisy, 1000)],
+            (condition, ""): np.array([(value, 1, math.nan) for value in (*values, 1000)])
+            for condition, values in zip(conditions, (clean, noisy), strict=True)
         }
-    conditions = [BASELINE, Configuration.parse("A(1) + B(2)", "0.1 + 0.1")]
     evaluate.print_table(list(seen), conditions, seen, episodes=2)
     lines = [re.split(r" {2,}", line.strip()) for line in capsys.readouterr().out.splitlines()]
     # sd of (20, 30, 50): sqrt((13.33^2 + 3.33^2 + 16.67^2) / 2); of (1.5, 3.5, -2.5) about 0.833
@@ -462,34 +400,12 @@ def test_other_settings_and_phases_of_a_choice_are_other_rows_of_the_table(runs,
     }
 
 
-def test_what_a_noise_warns_of_is_said_once_in_a_line(runs, capsys):
-    main(Args((runs,), noises=("RandomEarlyTermination(5000)",), episodes=1))
-    lines = [line for line in capsys.readouterr().err.splitlines() if "never acts" in line]
-    assert len(lines) == 1
-
-
-def test_a_folder_stands_for_its_finished_runs(runs, capsys):
-    (one(runs, "SAC") / "result.json").unlink()
-    runs = runs.rename(runs.parent / "two__words")  # which is no run's name here
-    (runs / "report.html").touch()  # analyze.py --out may be the same folder
-    main(Args((runs, one(runs, "TD3")), episodes=1))
-    assert "unfinished runs are left out: 1\n" in capsys.readouterr().out
-    assert sum((run_dir / "robustness.csv").exists() for run_dir in runs.glob("*Inv*")) == 3
-
-
-def test_an_environment_that_takes_no_arguments(tmp_path):
-    short = {"total_timesteps": 64, "num_steps": 32, "num_minibatches": 2, "compile": False}
-    ppo.train(ppo.Args(env_id="toy_envs:Tiny-v0", runs_dir=str(tmp_path), **short))
-    [run_dir] = tmp_path.iterdir()
-    main(Args((run_dir,), episodes=3))
-    assert len(stored(run_dir)) == 3
-
-
 # Videos
 
 
 @pytest.mark.slow
 def test_videos(runs, tmp_path):
+    """Without a display."""
     run_dir = one(runs, "PPO")
     before = files(runs)
     options = ["--noises", ACTION, "--noise-rates", "1.0", "--video", tmp_path / "a" / "b"]
@@ -534,81 +450,27 @@ gym.register("Blind-v0", lambda **given: Blind(gym.make("InvertedPendulum-v5", *
     videos = tmp_path / "videos"
     result = run(first, second, "--video", videos, "--jobs", 2, cwd=tmp_path)
     assert result.returncode == 1
-    told = rf"error: cannot draw {re.escape(first.name)}.*nothing to see \(.*blind.py, line \d+\)\n"
+    told = rf"error: .*{re.escape(first.name)}: clean: .*nothing to see \(.*blind.py, line \d+\)\n"
     assert re.fullmatch(told, result.stderr)
     assert list(videos.iterdir()) == [videos / f"{second.name}__clean.mp4"]
     none = tmp_path / "none"
     assert run(first, "--video", none, cwd=tmp_path).returncode == 1 and not none.exists()
 
 
-ENDLESS = """
-import time
-import numpy as np
-
-class Endless(gym.Wrapper):
-    def step(self, action):
-        time.sleep(0.01)
-        return self.env.reset()[0], 0.0, False, False, {}
-
-    def render(self):
-        return np.zeros((64, 64, 3), np.uint8)
-
-gym.register("Endless-v0", lambda **given: Endless(gym.make("InvertedPendulum-v5", **given)))
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number, jobs", [(signal.SIGTERM, 1), (signal.SIGHUP, 2)])
-def test_a_killed_video_leaves_no_hidden_folder(runs, tmp_path, number, jobs):
-    """A terminal that is closed tells all processes at once."""
-    register(tmp_path, "endless", ENDLESS)
-    other_environment(one(runs, "PPO"), "endless:Endless-v0")
-    videos = tmp_path / "videos"
-    options = command(one(runs, "PPO"), "--video", videos, "--jobs", jobs, MUJOCO_GL="egl")
-    process = subprocess.Popen(cwd=tmp_path, start_new_session=True, **options)
-    while not list(videos.glob(".*/video")):
-        assert process.poll() is None
-        time.sleep(0.1)
-    os.killpg(process.pid, number)
-    assert process.wait(timeout=60) == 128 + number
-    deadline = time.time() + 60  # the processes of --jobs end by themselves
-    while list(videos.iterdir()) and time.time() < deadline:
-        time.sleep(0.1)
-    assert list(videos.iterdir()) == []
-
-
-@pytest.mark.slow
-def test_without_an_opengl_library(runs, tmp_path):
-    run_dir = one(runs, "PPO")
-    result = run(run_dir, "--video", tmp_path / "videos", PYOPENGL_PLATFORM="none")
-    assert result.returncode == 2 and not result.stdout
-    assert "apt install libegl1" in result.stderr and result.stderr.count("\n") == 1
-    assert not (tmp_path / "videos").exists()
-
-
-@pytest.mark.slow
-def test_a_window_needs_a_display(runs):
-    result = run(one(runs, "PPO"), "--render")
-    assert (result.returncode, result.stdout) == (2, "")
-    assert result.stderr.startswith("error: --render needs a display")
-
-
 def test_a_window_shows_one_episode_of_each_condition(runs, monkeypatch, capsys):
     """The window itself is replaced."""
-    modes = []
-    make_env = gym.make
+    modes, make_env = [], gym.make
 
     def make(env_id, render_mode=None, **kwargs):
         modes.append(render_mode)
         return make_env(env_id, **kwargs)
 
-    monkeypatch.setattr(evaluate, "works", lambda code: True)
+    monkeypatch.setattr(evaluate, "has_display", lambda: True)
     monkeypatch.setattr(gym, "make", make)
     before = files(runs)
     main(Args((one(runs, "PPO"),), (ACTION,), (1.0,), render=True, jobs=2))
     assert modes == [None, "human", "human"]  # the first is the check
-    assert files(runs) == before
-    assert len(capsys.readouterr().out.splitlines()) == 2
+    assert files(runs) == before and capsys.readouterr().out.count("\n") == 2
 
 
 # Bad input
@@ -629,7 +491,7 @@ BAD_RUNS = {
     "policy.pt is not a policy for InvertedPendulum-v5": lambda run_dir: (
         run_dir / "policy.pt"
     ).write_bytes(b"x"),
-    "delete that file": lambda run_dir: (run_dir / "robustness.csv").write_text("a,b\n1,2\n"),
+    "robustness.csv: ": lambda run_dir: (run_dir / "robustness.csv").write_text("a,b\n1,2\n"),
     "RuntimeError: not today .*broken.py, line 2": lambda run_dir: other_environment(
         run_dir, "broken:Mine-v0"
     ),
@@ -647,12 +509,6 @@ def test_a_bad_run_is_named_and_the_others_are_tested(runs, capsys, message, mon
     assert err.count("\n") == 1 and re.match(f"error: {run_dir}: .*{message}", err), err
     assert (", line " in err) == (", line " in message)  # only a user's own error has a place
     assert len(stored(one(runs, "TD3"))) == 1 and "TD3" in out and "PPO" not in out
-
-
-def test_one_reason_of_many_runs_is_one_line(runs, capsys):
-    for run_dir in runs.iterdir():
-        other_environment(run_dir, "Nothing-v0")
-    refused(Args((runs,)), "/[^/]* and 3 more: there is no environment", runs, capsys)
 
 
 # A downloaded folder of runs, with its own modules: where they lie in it, and the id in config.json
@@ -722,17 +578,19 @@ def test_a_module_of_ones_own_is_imported(runs_dir, trained, tmp_path, monkeypat
         ({"noises": ("Nothing(1)",), "noise_rates": (1.0,)}, "unknown name"),
         ({"noises": (ACTION,), "noise_rates": ("1:0",)}, "constant rates"),
         ({"noise_rates": (0.5,)}, "--noise-rates without --noises"),
-        ({"env_id": "Nowhere-v0"}, "--env-id: there is no environment"),
+        ({"env_id": "Nowhere-v0"}, "there is no environment"),
         ({"noises": (f"{OBSERVATION[:-4]}(1, 2))",), "noise_rates": (1.0,)}, "has 2 numbers"),
         ({"episodes": 0}, "--episodes must be at least 1, not 0"),
         ({"seed": -1}, "--seed"),
         ({"render": True, "video": Path("v")}, "exclude each other"),
-        ({"video": Path(__file__, "v")}, "cannot write to"),
+        ({"render": True}, "--render needs a display"),
         ({"runs": ()}, "name the runs"),
         ({"runs": (ROOT / "docs",)}, "is neither a run nor a folder of runs"),
     ],
 )
-def test_bad_arguments(runs, capsys, options, message):
+def test_bad_arguments(runs, capsys, options, message, monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
     refused(Args(**({"runs": (runs,)} | options)), message, runs, capsys)
 
 
@@ -780,11 +638,6 @@ def test_another_environment(runs, capsys):
     table = capsys.readouterr().out.splitlines()[-1]
     assert f"{home}, tested in Heavy-v0" in table
     refused(Args((run_dir,), env_id="Pendulum-v1"), "its observation space is Box", runs, capsys)
-    args = json.loads((run_dir / "config.json").read_text())["args"]
-    edit_config(run_dir, args=args | {"env_kwargs": ["frame_skip:3"]})
-    main(Args((run_dir,), env_id="Heavy-v0", episodes=2))
-    told = "Heavy-v0 is made without the training's --env-kwargs: frame_skip:3\n"
-    assert capsys.readouterr().err == told
 
 
 def refused(args, message, runs, capsys):

@@ -10,6 +10,7 @@ from sweeps import ENDING, NAN, RESULTS, SCALE, drawn_of, small_sweep, write_pai
 
 import analysis.effects
 import analysis.figures
+import analysis.heatmap
 import analysis.style
 from analysis.runs import read_runs
 from analysis.studies import make_studies
@@ -74,11 +75,13 @@ def test_all_text_has_eight_points_and_room(width, five):
 
 
 @pytest.mark.parametrize("width", [3.25, 6.75])
-def test_a_heatmap_of_robustness_has_room(width):
+def test_a_heatmap_has_room(width):
     tested = ["clean", *(f"{noise}, {rate}" for noise in (SCALE, OTHER) for rate in (0.1, 0.5, 1))]
     grid = pd.DataFrame(-12.5, index=["no noise", f"{SCALE}, 1.00"], columns=tested)
     grid = grid.rename_axis(index="trained with", columns="tested with")
-    figure = analysis.figures.heatmap_figure("PPO", grid, grid > 0, 20, "{:.0f}".format, width)
+    panels = {"PPO": (grid, grid.astype(str), grid > 0)}
+    look = {"cmap": "viridis", "vmin": -20, "vmax": 0}
+    figure = analysis.heatmap.heatmap_figure(panels, look, "tested with", width)
     check_room(figure, "robustness")
     assert len(figure.axes[0].texts) == 14
 
@@ -127,28 +130,17 @@ def test_few_seeds_are_shown_with_room_for_what_could_be_found(seeds, reach, tmp
     assert low < -reach and high > reach
 
 
-def test_effects_of_many_configurations_are_a_heatmap(tmp_path):
-    rates = [0.01 * i for i in range(1, analysis.effects.MOST_IN_FOREST + 2)]
+def test_effects_of_many_configurations_have_a_line_a_noise(tmp_path):
+    rates = [0.01 * i for i in range(1, analysis.effects.MOST_RATES + 2)]
     for seed in range(1, 8):
-        write_run(tmp_path, [100], seed=seed)
-        for i, rate in enumerate(rates):
-            effect = {0: 30 + seed, 1: -30 - seed}.get(i, 0)
-            write_run(tmp_path, [100 + effect], seed=seed, noise=SCALE, rate=rate)
-    drawing = drawn_of(tmp_path)["effects_SAC"]
-    figure = drawing.draw()
-    [image] = figure.axes[0].images
-    assert image.get_array().shape == (1, len(rates)) and image.get_clim() == (-34, 34)
-    assert image.cmap(0.5)[:3] == pytest.approx((1, 1, 1), abs=0.01)  # white at zero
-    assert "end at \u00b1 34 %" in drawing.caption
-    dots = [line.get_xdata()[0] for line in figure.axes[0].lines]
-    assert [round(x - 0.36) for x in dots] == [0, 1]  # better, worse
-
-
-def test_an_infinite_effect_has_the_strongest_colour():
-    ax, grid = analysis.figures.Figure().subplots(), pd.DataFrame([[np.inf, 1.0], [NAN, -2.0]])
-    image = analysis.effects.heatmap(ax, grid, 2.0, "{:+.1f}".format, grid.isna() & False)
-    assert image.get_array().tolist() == [[2.0, 1.0], [None, -2.0]]
-    assert texts(ax.texts) == ["+inf", "+1.0", "-2.0"]
+        write_run(tmp_path, [100 + seed], seed=seed)
+    for seed, rate in enumerate(rates):
+        write_run(tmp_path, [150 + seed % 7], seed=seed, noise=SCALE, rate=rate)
+    [ax] = drawn_of(tmp_path)["effects_SAC"].draw().axes
+    assert texts(ax.get_yticklabels()) == [f"{len(rates)} rates"]
+    [mark] = [line for line in ax.lines if line.get_marker() == "o"]
+    assert mark.get_xdata()[0] == pytest.approx(49, abs=0.5)
+    assert mark.get_markerfacecolor() == analysis.style.BETTER
 
 
 def test_a_long_name_is_broken_between_its_words_or_anywhere():
@@ -180,11 +172,11 @@ def test_curves_have_the_noise_units_and_n(tmp_path):
     [study], _ = make_studies(read_runs(tmp_path))
     for config in study.finals:  # an environment without this noise has no panel
         study.finals[config][:, 0] = NAN if config.noise == ENDING else 1.0
-    assert titles(analysis.figures.curves_figure(study, ENDING)) == ["Pusher-v5\nn = 4"]
+    assert titles(analysis.figures.noise_figure(study, ENDING)) == ["Pusher-v5\nn = 4"]
     # nor has a rate that was not tried, or the baseline of a search, a line
     study.finals[Configuration.parse(SCALE, 0.05)][:, 0] = NAN
     study.finals[BASELINE][:] = NAN
-    figure = analysis.figures.curves_figure(study, SCALE)
+    figure = analysis.figures.noise_figure(study, SCALE)
     assert texts(figure.legends[0].get_texts()) == lines[1:] and len(figure.axes) == 2
 
 
@@ -196,7 +188,7 @@ def test_a_band_is_the_interval_of_the_mean_or_each_seed(band, tmp_path):
             write_run(tmp_path / str(seeds), [value, value], seed=seed)
     for seeds, values in finals.items():
         [study], _ = make_studies(read_runs(tmp_path / str(seeds)))
-        [ax] = analysis.figures.curves_figure(study, "", band).axes
+        [ax] = analysis.figures.noise_figure(study, "", band).axes
         if band == "interval" and seeds == 4:
             assert not ax.collections and len(ax.lines) == 1 + seeds
             continue
@@ -242,19 +234,6 @@ def test_figures_of_experiments_with_similar_names_have_names_of_their_own(tmp_p
         write_run(tmp_path, [10], folder=f"{name}-{seed}", **more)
         write_run(tmp_path, [9], folder=f"{name}-{seed}-p", noise=SCALE, rate=0.1, **more)
     assert {"effects_SAC_lr_1", "effects_SAC_lr_1_again"} <= drawn_of(tmp_path).keys()
-
-
-def test_changing_rates_and_combinations_have_lines(tmp_path):
-    for rate in (1.0, "1.0:0.0"):
-        write_run(tmp_path, [11], noise=SCALE, rate=rate)
-    write_run(tmp_path, [10])
-    write_run(tmp_path, [20], noise=(ENDING, SCALE), rate=(0.5, "1.0:0.0"))
-    drawn = drawn_of(tmp_path)
-    ax = drawn["effects_SAC"].draw().axes[0]
-    assert "0.50 + 1.00 to 0.00" in texts(ax.get_yticklabels())
-    assert f"{ENDING} +{SCALE}" in [text.replace("\n", "") for text in texts(ax.texts)]
-    legend = drawn["curves_SAC_RandomUniformScaleReward_0.5_1.5"].draw().legends[0]
-    assert texts(legend.get_texts()) == ["no noise", "rate 1.00 to 0.00", "rate 1.00"]
 
 
 def test_committed_figures_are_those_that_a_page_shows():

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 import simulate_choose
 from scipy import stats
-from sweeps import FINALS, NAN, ROOT, row, run, small_sweep
+from sweeps import NAN, ROOT
 
 import analysis.luck
 import analysis.statistics
@@ -32,13 +32,6 @@ def make_study(baseline, noisy):
 def luck_of_study(study):
     """Return {environment: the highest differences of useless sweeps}."""
     return {key[-1]: draws for key, draws in analysis.luck.luck_of_studies([study]).items()}
-
-
-def luck_of_one_environment(baseline, noisy):
-    """Return p_luck of the best: baseline (seeds,), noisy (configs x seeds)."""
-    study = make_study(baseline[:, None], noisy[..., None])
-    best = noisy.mean(axis=1).max() - baseline.mean()
-    return analysis.luck.p_of_luck(luck_of_study(study)["Env0-v0"], best)
 
 
 # ------------------------------------------------------------------------------- a known answer
@@ -155,19 +148,3 @@ def p_of_the_best(n, gain, draw, studies=200):
         [p] = paper.add_luck_of_paper(pd.DataFrame([row]), {"PPO": n})["p_luck"]
         theirs += p <= analysis.statistics.LEVEL
     return 100 * own / studies, 100 * theirs / studies
-
-
-# -------------------------------------------------------------------------------------- tables
-
-
-@pytest.mark.slow
-def test_luck_stands_beside_the_best(tmp_path):
-    small_sweep(tmp_path / "runs")
-    tables = run(tmp_path)
-    pusher = row(tables["best"], environment="Pusher-v5")
-    finals = [values for key, values in FINALS.items() if key[0] == "Pusher-v5"]
-    baseline, noisy = np.array(finals[0], float), np.array(finals[1:], float)
-    assert pusher["p_luck"] == pytest.approx(luck_of_one_environment(baseline, noisy), abs=0.005)
-    assert pusher["luck_median"] < pusher["luck_95"] < pusher["difference"]
-    page = (tmp_path / "results/report.html").read_text()
-    assert "luck 95 % (p)" in page

@@ -7,15 +7,16 @@ import shutil
 import subprocess
 import tempfile
 from html import escape, unescape
+from itertools import product
 
+import numpy as np
 import pandas as pd
 import pytest
-from fabricated import fabricate
-from sweeps import NAN, RESULTS, SCALE, main, run, small_sweep, write_pairs, write_run
+from sweeps import NAN, main, run, small_sweep, write_pairs, write_run
 
 import analysis.verdicts
 import analyze
-from sweep.grid import NOISES
+from sweep.grid import ENVS, NOISES, RATES
 
 
 @pytest.fixture(scope="module")
@@ -27,25 +28,23 @@ def results(tmp_path_factory):
     return path / "results"
 
 
-LONG_NAMES = sorted(NOISES, key=len)[-5:]
-
-
 @pytest.fixture(scope="module")
 def large_results(tmp_path_factory):
-    """Return those of PPO with the five of the paper's noises that have the longest names."""
-    path = tmp_path_factory.mktemp("grid")
-    fabricate(path / "runs", seeds=range(1, 4), noises=LONG_NAMES)
+    """Return those of the paper's noises that have the longest names, in its environments."""
+    path, rng = tmp_path_factory.mktemp("grid"), np.random.default_rng(0)
+    configs = [((), ()), *product(sorted(NOISES, key=len)[-5:], RATES)]
+    levels = dict(zip(ENVS, (9500, 2900, 4500, -25, 4500), strict=True))
+    for (env, level), (noise, rate), seed in product(levels.items(), configs, (1, 2, 3)):
+        final = level + 0.1 * abs(level) * rng.normal()
+        more = {"noise": noise, "rate": float(rate)} if noise else {}
+        write_run(path / "runs", [0.5 * final, final], "PPO", env, seed=seed, every=500_000, **more)
     main(analyze.Args(path / "runs", path / "results"), drawn=True)
     return path / "results"
 
 
 def browser():
     """Path of Chromium: without it the tests of the report skip, or fail under CI."""
-    found = (
-        shutil.which("chromium")
-        or shutil.which("chromium-browser")
-        or shutil.which("google-chrome")
-    )
+    found = shutil.which("chromium") or shutil.which("google-chrome")
     if not found and os.environ.get("CI"):
         pytest.fail("chromium is missing, and CI must have it")
     if not found:
@@ -74,32 +73,8 @@ def in_browser(page, script, width, tmp_path):
     return json.loads(unescape(re.search(r'<pre id="answer">(.*?)</pre>', dom, re.DOTALL)[1]))
 
 
-@pytest.mark.slow
-def test_report_sorts_in_a_browser(results, tmp_path):
-    script = """
-        const table = document.getElementById("table-summary_SAC");
-        const heads = [...table.tHead.rows[0].cells];
-        const column = name => heads.findIndex(head => head.textContent === name);
-        const read = name => [...table.tBodies[0].rows].map(r => r.cells[column(name)].textContent);
-        const click = name => { heads[column(name)].querySelector("button").click();
-          return [heads[column(name)].getAttribute("aria-sort"), read(name)]; };
-        return [number("-1,234.5 \u00b1 6"), click("mean"), click("mean"), click("difference %"),
-          click("noise")];"""
-    answer = in_browser(results / "report.html", script, 1280, tmp_path)
-    value, (_, first), (_, second), (state, improvements), (_, noises) = answer
-    assert value == -1234.5
-    means = [float(text.split()[0]) for text in (*first, *second)]
-    values = [-80, -55, -40, -25, 25, 115, 115, 145]
-    assert means == [*reversed(values), *values]  # numbers: the highest first
-    assert improvements[-2:] == ["\u2013", "\u2013"]  # the baselines' dashes come last
-    numbers = [float(text) for text in improvements[:-2]]
-    assert numbers == sorted(numbers, reverse=state == "descending")
-    assert noises == sorted(noises, key=str.lower)
-
-
 FIRST_SCREEN = """
     document.querySelectorAll("details").forEach(details => details.open = true);
-    hint();
     const images = [...document.images], inside = images.filter(i => i.src.startsWith("data:"));
     const sentence = document.querySelector("#verdict li"), nav = document.querySelector("nav");
     const top = node => node.getBoundingClientRect().top;
@@ -132,7 +107,7 @@ def test_first_screen(width, end, results, tmp_path):
         f"curves_SAC_{noise}{end}.svg"
         for noise in ("RandomEarlyTermination_50", "RandomUniformScaleReward_0.5_1.5")
     }
-    assert (page["hints"] == 0) == (width == 1280) and page["hints"] <= page["tables"]
+    assert page["hints"] == (page["tables"] if width == 420 else 0)
     assert page["links"] and all(link.startswith("#") for link in page["links"])
 
 
@@ -146,11 +121,7 @@ def test_the_report_explains_its_words(results):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["fabricated", "committed"])
-def test_no_table_of_a_large_report_scrolls_or_cuts_a_number(kind, large_results, tmp_path):
-    if kind == "committed":
-        large_results = tmp_path
-        main(analyze.Args(RESULTS / "data/runs", tmp_path))
+def test_no_table_of_a_large_report_scrolls_or_cuts_a_number(large_results, tmp_path):
     script = """
         document.querySelectorAll("details").forEach(details => details.open = true);
         const cells = [...document.querySelectorAll("td")];
@@ -170,17 +141,17 @@ def test_no_table_of_a_large_report_scrolls_or_cuts_a_number(kind, large_results
     assert width <= 1280 and scrolling == outside == broken == 0 and cells > 500 and columns == 9
 
 
-def test_an_empty_section_is_left_out(tmp_path):
-    for seed in range(3):
-        write_run(tmp_path / "runs", [10 + seed], seed=seed)
-        write_run(tmp_path / "runs", [20 + seed], seed=seed, noise=SCALE, rate=0.5)
-    run(tmp_path)
-    page = (tmp_path / "results/report.html").read_text()
-    assert 'id="best"' in page and 'id="statistics"' in page
-    assert page.index('id="noises"') < page.index('id="best"') < page.index('id="statistics"')
-    for name in ("consistent", "consistently_worse", "missing", "robustness"):
-        assert f'id="{name}"' not in page and f'href="#{name}"' not in page
-    assert "None." not in page
+def test_a_section_that_is_empty_or_says_nothing_new_is_left_out(tmp_path):
+    def sections():
+        run(tmp_path)
+        return re.findall('<section id="(.*?)">', (tmp_path / "results/report.html").read_text())
+
+    write_pairs(tmp_path / "runs", [10, 11, 12], [20, 21, 22], rate=0.5)
+    first = ["noises", "early_performance", "summary"]
+    assert sections() == ["verdict", *first, "how"]  # one comparison is told once
+    write_pairs(tmp_path / "runs", [], [21, 22, 23], rate=0.2)
+    first[1:1], first[-1:-1] = ["best"], ["statistics"]
+    assert sections() == ["verdict", *first, "how"]
 
 
 def test_the_counts_at_the_top_are_those_of_the_list(tmp_path):
@@ -194,37 +165,18 @@ def test_the_counts_at_the_top_are_those_of_the_list(tmp_path):
     assert "3 better" in top and listed.split("</ul>")[0].count("<li>") == 3
 
 
-def test_of_many_versions_is_said_at_the_end(tmp_path):
-    for seed in (1, 2):
-        write_run(
-            tmp_path / "runs", [seed], seed=seed, config={"versions": {"mujoco": f"3.{seed}.0"}}
-        )
-        write_run(tmp_path / "runs", [seed], seed=seed, noise=SCALE, rate=0.5)
-    run(tmp_path)
-    page = (tmp_path / "results/report.html").read_text()
-    limit = page.index("with 2 seeds no difference can be significant")
-    assert limit < page.index('id="best"') < page.index("runs with different mujoco")
-
-
 @pytest.mark.parametrize(
-    ("improvements", "p_luck", "tried", "expected"),
+    ("improvements", "p_luck", "expected"),
     [
-        ([-5, 0], [0.9, 1], [3, 3], "Nothing that was tried has a higher mean than no noise."),
-        ([5], [0.3], [1], "The best noise looks no better than one useless noise might."),
-        ([5, 9], [0.3, 0.01], [3, 4], "On Hopper-v5 (p = 0.02) the best noise looks"),  # Holm's
-        (
-            [5, 9],
-            [0.3, 0.04],
-            [3, 3],
-            "each environment looks no better than the best of 3 useless",
-        ),
-        ([NAN], [NAN], [3], ""),
-        # too few seeds on the first
-        ([100, -5], [NAN, 0.7], [1, 1], "The best noise on Hopper-v5 looks no better than one"),
+        ([-5, 0], [0.9, 1], "Nothing that was tried has a higher mean than no noise."),
+        ([5, 9], [0.3, 0.01], "On Hopper-v5 (p = 0.02) the best noise looks better than"),  # Holm's
+        ([5, 9], [0.3, 0.04], "On Ant-v5 and Hopper-v5 the best noise looks no better than"),
+        ([100, -5], [NAN, 0.7], "On Hopper-v5 the best noise looks no better"),  # too few seeds
+        ([NAN, NAN], [NAN, NAN], ""),
     ],
 )
-def test_luck_is_said_in_one_sentence(improvements, p_luck, tried, expected):
-    best = {"environment": ["Ant-v5", "Hopper-v5"][: len(tried)], "chosen_from": tried}
+def test_luck_is_said_in_one_sentence(improvements, p_luck, expected):
+    best = {"environment": ["Ant-v5", "Hopper-v5"]}
     best |= {"difference": improvements, "p_luck": p_luck}
     said = analysis.verdicts.luck_sentence(pd.DataFrame(best))
     assert expected in said and bool(said) == bool(expected)
