@@ -11,15 +11,11 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from analysis.permutation import (  # noqa: F401  tools/simulate_choose.py takes some from here
+from analysis.permutation import (
     columns,
-    partitions,
     permutation_t,
-    random_partitions,
-    tails,
-    welch_t,
 )
-from analysis.power import LEVEL, POWER, detectable_shift  # noqa: F401
+from analysis.power import LEVEL, detectable_shift
 
 normal_quantile = NormalDist().inv_cdf
 # With fewer there is no interval. That of a difference of means would say something else than p in

@@ -318,10 +318,12 @@ def test_a_curve_reaches_a_target_with_the_runs_that_are_there():
 def test_the_detectable_shift_is_found_in_80_percent_of_the_cases(n, m):
     rng = np.random.default_rng(3)
     exact = n + m <= 10
-    chosen = statistics.partitions(n, m) if exact else statistics.random_partitions(n, m, 999, rng)
+    chosen = (
+        permutation.partitions(n, m) if exact else permutation.random_partitions(n, m, 999, rng)
+    )
     values = rng.standard_normal((n + m, 1500))
     values[:n] += statistics.detectable_shift(n, m)
-    above, _ = statistics.tails(statistics.welch_t(values, chosen))
+    above, _ = permutation.tails(permutation.welch_t(values, chosen))
     assert (2 * above <= 0.05 + 1e-12).mean() == pytest.approx(0.8, abs=0.035)
 
 
@@ -363,8 +365,8 @@ def simulated(n, m, draw, spread, draws=2000):
     rng = np.random.default_rng(n)
     values = np.concatenate([spread * draw(rng, (n, draws)), draw(rng, (m, draws))])
     few = n + m <= 10
-    chosen = permutation.partitions(n, m) if few else statistics.random_partitions(n, m, 999, rng)
-    shares = statistics.tails(statistics.welch_t(values, chosen))
+    chosen = permutation.partitions(n, m) if few else permutation.random_partitions(n, m, 999, rng)
+    shares = permutation.tails(permutation.welch_t(values, chosen))
     x, y = values[:n], values[n:]
     variances = [z.var(axis=0, ddof=1) / len(z) for z in (x, y)]
     _, half = statistics.satterthwaite(variances, np.array([[n], [m]]))
