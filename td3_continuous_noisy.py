@@ -458,8 +458,9 @@ class Run:
         self.folder = noisy.run_folder(asdict(args))
         if self.folder.is_symlink():
             fail(f"{self.folder} is a link: remove it, or choose another --exp-name or --runs-dir")
-        self.folder.mkdir(parents=True, exist_ok=True)
-        self.lock = (self.folder / ".lock").open("a")
+        with fail_on(OSError, f"--runs-dir {args.runs_dir}"):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self.lock = (self.folder / ".lock").open("a")
         with fail_on(BlockingIOError, f"{self.folder} is in use by another process"):
             fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
         if args.overwrite:

@@ -34,7 +34,7 @@ def acts(trial):
         run = trial.train("mean_actions")  # in training, too
     check(run.gaps, "no action follows a test within an episode: see TEST in learn()")
     gap, policy = max(run.gaps), run.script.load_policy(run.folder)
-    advice = "act alike in both, and draw noise by torch.randn (other noise cannot be checked)"
+    advice = "act alike in both (or test another policy on purpose), draw noise by torch.randn"
     check(gap < 1e-4, f"actions in training are {gap:.2g} from those of load_policy(): {advice}")
     gaps = watched_run.gaps_in_losses(run, policy)
     check(gaps, "policy.pt has no network that an update learns: give log_test() that one")
@@ -47,8 +47,8 @@ def learns(trial):
     """The learned networks have a gradient, and change."""
     for update in trial.run.updates:
         for name, parameter in update.parameters.items():
-            where, gradient = f"{name} in {update.name}()", parameter.grad
-            check(gradient is not None and gradient.any(), f"no gradient of {where}: use it there")
+            where = f"{name} in {update.name}()"
+            check(id(parameter) in trial.run.with_gradient, f"no gradient of {where}: use it there")
             changes = not parameter.equal(update.before[name])
             check(changes, f"{where} never changes: give the optimizer this network's parameters")
 
@@ -77,7 +77,7 @@ def compiles(trial):
     """Compiled and not, the first updates agree."""
     run = trial.train("compiled", episodes=3, compile=True)
     if "not compiled" in run.said:
-        reason = run.said[run.said.index("not compiled") :]
+        reason = run.said[run.said.index("not compiled") :].partition("\n")[0]
         check("InvalidCxxCompiler" in reason, f"write losses in PyTorch alone: {reason}")
         return " (skipped: no C++ compiler)"
     for update, other in zip(trial.run.updates, run.updates, strict=False):
@@ -100,7 +100,7 @@ def sweeps(trial):
     """The sweep knows the script."""
     words = ["custom", "--algos", trial.algorithm, "--envs", "Pendulum-v1", "--seeds", "1"]
     words += ["--total-timesteps", "150", "--runs-dir", trial.folder / "swept", "--dry-run"]
-    words += ["--", *trial.options] if trial.options else []
+    words += ["--", *trial.own_options] if trial.own_options else []
     out = trial.command(ROOT / "benchmark.sh", *words)
     check(trial.path.name in out, "benchmark.sh --dry-run shows no command with this script")
 
@@ -125,8 +125,9 @@ PROMISES += [sweeps, evaluates, analyses]
 
 def main(path="", *options):
     """Print a line for each promise; return the exit status."""
-    if not Path(path).is_file():
-        print(f"error: there is no script {path!r}\n\n{__doc__}" if path[:1] != "-" else __doc__)
+    if not (Path(path).name.endswith("_continuous_noisy.py") and Path(path).is_file()):
+        wrong = f"error: {path!r} is no script NAME_continuous_noisy.py\n\n"
+        print(__doc__ if path[:1] == "-" else wrong + __doc__)
         return 2
     kept = True
     with tempfile.TemporaryDirectory() as folder:

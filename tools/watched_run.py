@@ -5,8 +5,8 @@ import copy
 import functools
 import importlib.util
 import io
-import itertools
 import os
+import re
 import subprocess
 import sys
 from dataclasses import asdict, replace
@@ -49,6 +49,9 @@ class Trial:
     def __init__(self, path, options, folder):
         self.path, self.options, self.folder = path, options, folder
         self.algorithm = path.name.removesuffix("_continuous_noisy.py").lower()
+        steps = options.index("--total-timesteps") if "--total-timesteps" in options else None
+        # without what belongs to the grid of a sweep
+        self.own_options = options if steps is None else options[:steps] + options[steps + 2 :]
 
     def train(self, name, **kwargs):
         """Return a short run, watched, in a folder of runs."""
@@ -69,9 +72,12 @@ class Trial:
 
     @functools.cached_property
     def resumed(self):
-        """The same run, stopped and resumed."""
+        """The same run, stopped early and late, and resumed."""
         stopped = self.train("resumed", episodes=4)
         check(not stopped.finished, "it did not stop at the end of an episode: ask stop() there")
+        late = 3 * self.run.episodes // 4 - stopped.episodes
+        if late > 0:  # what changes late is in the state, too
+            self.train("resumed", episodes=late)
         return self.train("resumed")
 
     def read(self, run, name):
@@ -91,17 +97,19 @@ def train(path, options, runs_dir, episodes=0, **changed):
 
     It is stopped when it has learned with each of its updates, and after a number of episodes.
     Return what was seen: `updates`, for each loss the network that it learns, its parameters before
-    the first update, the curves and the gradient of the first and the inputs of the last; `gaps`,
+    the first update, the curves and the gradient of the first, the inputs of the last;
+    `with_gradient`, the ids of parameters that had one in any; `episodes`, how many ended; `gaps`,
     how far the first action after each test was from that of load_policy(); and `networks`, those
     of the state that resumes, {name: (network, its state_dict at the start)}.
     """
     spec = importlib.util.spec_from_file_location(path.stem, path)
     sys.modules[path.stem] = script = importlib.util.module_from_spec(spec)
     seen = SimpleNamespace(script=script, updaters=0, updates=[], gaps=[], observations=set())
-    said, ended = io.StringIO(), itertools.count(1)
+    seen.episodes, seen.with_gradient, said = 0, set(), io.StringIO()
 
     def stop():
-        return next(ended) >= episodes > 0 and len(seen.updates) == seen.updaters
+        seen.episodes += 1
+        return seen.episodes >= episodes > 0 and len(seen.updates) == seen.updaters
 
     if str(path.parent) not in sys.path:
         sys.path.append(str(path.parent))  # for what it imports
@@ -118,7 +126,9 @@ def train(path, options, runs_dir, episodes=0, **changed):
             script.Run.resume = watch_networks(script.Run.resume, seen)
             seen.finished = script.train(seen.args, stop)
         except SystemExit as error:
-            raise BrokenError(said.getvalue().strip().rpartition("\n")[2]) from error
+            lines = re.sub("[╭─╮│╰╯]+", "", said.getvalue()).strip().splitlines()
+            ours = [line for line in lines if line.startswith("error: ")]
+            raise BrokenError(ours[-1] if ours else " ".join(lines)) from error
     seen.said = said.getvalue()
     return seen
 
@@ -143,6 +153,8 @@ def watch_updates(updater, seen):
 
         def watched(*inputs):
             curves, own.inputs = update(*inputs), inputs
+            moved = {id(p) for p in parameters.values() if p.grad is not None and p.grad.any()}
+            seen.with_gradient |= moved
             if not hasattr(own, "first"):
                 seen.updates.append(own)
                 own.before = before

@@ -1,11 +1,13 @@
 """tools/check_script.py: each of its lines turns red where a script is broken for it."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import check_script
 import pytest
 import torch
 import torch._inductor.config
+import watched_run
 from check_script import BrokenError, Trial
 
 ROOT = Path(__file__).parents[2]
@@ -74,6 +76,14 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
         before("            curves = update_critic(", "critic.scale += 0.01"),
     ],
     ("resumes", "td3", MISSING): [('state |= {"target_actor": target_actor, ', "state |= {")],
+    ("resumes", "sac", MISSING): [  # which changes after the first stop
+        before("    target_entropy = -", "scale = 1.0"),
+        before("        # STEP\n", "scale = 2.0 if global_step == 90 else scale"),
+        (
+            "action = actor.policy(observation, eps)",
+            "action = actor.policy(observation, scale * eps)",
+        ),
+    ],
     ("resumes", "ppo", "ask stop()"): [("stopping = stop()", "stopping = 0")],
     ("tests", "sac", "play in test_env"): [("noisy.play(test_env, ", "noisy.play(env, ")],
     ("compiles", "td3", "of actor_loss() by"): [
@@ -150,10 +160,36 @@ def test_a_line_for_each_promise(tmp_path, capsys, monkeypatch):
     assert check_script.main(path) == 0
     capsys.readouterr()
     assert check_script.main("no.py") == check_script.main("--help") == check_script.main() == 2
-    assert "error: there is no script 'no.py'\n" in capsys.readouterr().out
+    assert "error: 'no.py' is no script NAME_continuous_noisy.py\n" in capsys.readouterr().out
 
 
 def test_no_more_than_a_line_where_it_does_not_train(tmp_path, capsys):
     old = "    # SETUP\n"
     assert check_script.main(broken(tmp_path, "ppo", (old, "    fail('no', 1)\n" + old)).path) == 1
     assert capsys.readouterr().out == "FAILED  It trains: error: no\n"
+
+
+def test_an_option_that_the_script_does_not_have_is_named(tmp_path):
+    trial = broken(tmp_path, "ppo")
+    trial.options = ["--hidden", "64"]
+    assert "--hidden" in reason(check_script.trains, trial)
+
+
+def test_a_gradient_in_one_update_will_do():
+    """Another loss may leave a shared part of the network without one."""
+    network, seen = torch.nn.Linear(1, 1), SimpleNamespace(updates=[], updaters=0)
+    seen.with_gradient = set()
+
+    def updater(loss, network, *others):
+        def update(gradient):
+            for parameter in network.parameters():
+                parameter.grad = torch.full_like(parameter, gradient)
+                parameter.data += gradient
+            return {}
+
+        return update
+
+    update = watched_run.watch_updates(updater, seen)(None, network)
+    for gradient in (0.0, 1.0, 0.0):
+        update(gradient)
+    check_script.learns(SimpleNamespace(run=seen))
