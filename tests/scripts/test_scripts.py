@@ -263,6 +263,7 @@ BAD = [  # arguments, what the line names
     ({"env_id": "no_such_module:Env-v0"}, "no_such_module"),
     ({"env_id": "CartPole-v1"}, "needs Box actions of floats in one dimension; CartPole-v1 has"),
     ({"exp_name": ".."}, "--exp-name must be a name, not '..'"),
+    ({"runs_dir": "/dev/null/runs"}, "--runs-dir /dev/null/runs: "),
     ({"noise": NOISES, "noise_rate": (0.1, 1.1)}, "1.1"),
     ({"test_noise": ("RandomNormalNoisyReward(1.0)",), "test_noise_rate": (2.0,)}, "noise_rate"),
     ({"env_kwargs": ("length=5",)}, "env_kwargs: 'length=5' is not name:value"),
