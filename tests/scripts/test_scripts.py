@@ -263,7 +263,6 @@ BAD = [  # arguments, what the line names
     ({"env_id": "no_such_module:Env-v0"}, "no_such_module"),
     ({"env_id": "CartPole-v1"}, "needs Box actions of floats in one dimension; CartPole-v1 has"),
     ({"exp_name": ".."}, "--exp-name must be a name, not '..'"),
-    ({"runs_dir": "/dev/null/runs"}, "--runs-dir /dev/null/runs: "),
     ({"noise": NOISES, "noise_rate": (0.1, 1.1)}, "1.1"),
     ({"test_noise": ("RandomNormalNoisyReward(1.0)",), "test_noise_rate": (2.0,)}, "noise_rate"),
     ({"env_kwargs": ("length=5",)}, "env_kwargs: 'length=5' is not name:value"),
@@ -295,6 +294,10 @@ BAD_OF_OTHERS = [
 def test_bad_input(bad, word, algorithm, tmp_path, capsys):
     assert word in refused(capsys, run, algorithm, tmp_path, **bad)
     assert not list(tmp_path.glob("*/[!.]*"))  # at most an empty folder with its .lock
+
+
+def test_a_folder_of_runs_that_cannot_be_made(capsys):
+    assert "--runs-dir /dev/null/runs: " in refused(capsys, run, "PPO", "/dev/null/runs")
 
 
 # DIVERGENCE
