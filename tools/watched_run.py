@@ -88,7 +88,7 @@ class Trial:
         """Return what a command prints that is started beside the script."""
         kwargs = {"cwd": self.path.parent, "env": os.environ | {"PYTHON": sys.executable}}
         result = subprocess.run(list(map(str, words)), capture_output=True, text=True, **kwargs)
-        check(result.returncode == 0, (result.stdout + result.stderr).strip()[-400:])
+        check(result.returncode == 0, (result.stdout + result.stderr).strip()[-500:])
         return result.stdout
 
 
