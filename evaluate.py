@@ -161,8 +161,6 @@ def read_conditions(args):
 
     Raises ValueError.
     """
-    if not args.noises and args.noise_rates != Args.noise_rates:
-        raise ValueError("--noise-rates without --noises: name a noise, or leave the rates out")
     conditions = [noisy.BASELINE]
     for noise, rate in itertools.product(args.noises, args.noise_rates):
         configuration = noisy.Configuration.read(noisy.split_noises(noise), [rate])

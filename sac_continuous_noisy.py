@@ -599,8 +599,8 @@ class Run:
         """Move the bar of a terminal; elsewhere print a line after ten seconds, or after a test."""
         self.bar.update(step - self.bar.n)
         if self.bar.disable and now - self.printed > 10:
-            left = (self.bar.total - step) / self.speed if self.speed else None
-            eta = tqdm.format_interval(left) if left is not None else "?"
+            steps_left = self.bar.total - step
+            eta = tqdm.format_interval(steps_left / self.speed) if self.speed else "?"
             # analysis/logs.py reads this line
             say(f"step={step}/{self.bar.total} sps={self.speed:.0f} {self.last_test}eta={eta}")
             self.printed = now

@@ -11,10 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from analysis.permutation import (
-    columns,
-    permutation_t,
-)
+from analysis.permutation import columns, permutation_t
 from analysis.power import LEVEL, detectable_shift
 
 normal_quantile = NormalDist().inv_cdf
