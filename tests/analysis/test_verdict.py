@@ -128,6 +128,7 @@ def test_together_are_the_environments_that_can_tell_something():
     assert "PPO on 2 environments together" in text
 
 
+@pytest.mark.slow
 def test_where_interval_and_p_differ_is_borderline():
     rng, found = np.random.default_rng(0), set()
     for _ in range(40):

@@ -99,7 +99,7 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
     ],
     ("analyses", "ppo", "eval.csv"): [('self.eval_csv += f"{due},', 'self.eval_csv += f"first,')],
 }
-SLOW = ("compiles", "evaluates", "analyses")
+SLOW = ("tests", "compiles", "evaluates", "analyses")
 
 
 @pytest.mark.parametrize(
@@ -113,6 +113,7 @@ def test_a_promise_is_red_where_it_is_broken(mistake, tmp_path):
     assert said in reason(getattr(check_script, promise), trial)
 
 
+@pytest.mark.slow
 def test_something_is_missing_in_the_state_where_episodes_are_short(tmp_path):
     """The run stops when all has been learned once, though four episodes ended long before."""
     old = '"q_optimizer": q_optimizer, "actor_optimizer": actor_optimizer}'

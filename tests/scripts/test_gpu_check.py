@@ -50,6 +50,7 @@ def test_what_fails_is_told(tmp_path):
     assert "\nFAILED in " in result.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("flags", "seen"), [([], "''"), (["--cuda"], "'0'")])
 def test_bench_shows_the_gpu_only_to_programs_with_cuda(flags, seen, tmp_path, monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")

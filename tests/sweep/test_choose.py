@@ -107,6 +107,7 @@ def test_equal_scores_are_decided_by_the_order_given():
     assert play(noises, 15, table)[0].rounds[1].survivors == noises[:2]
 
 
+@pytest.mark.slow
 def test_the_choice_is_as_good_as_a_grid_of_ten_seeds():
     rng, chosen, grid = np.random.default_rng(0), [], []
     for _ in range(150):
@@ -198,6 +199,7 @@ def test_advance_gives_the_same_whenever_it_is_asked():
         assert now == state
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("gain", "share", "runs"), [(0, (0.005, 0.05), (27, 35)), (1, (0.88, 0.97), (31, 39))]
 )
