@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ["analysis", "sweep"]
 FILES = [path for package in PACKAGES for path in sorted((ROOT / package).glob("*.py"))]
 # A module imports only from those before it: by package, and within a package by name.
-ORDER = ["noisy_wrappers", "analysis", "evaluate", "analyze", "sweep"]
+ORDER = ["noisy_wrappers", "analysis", "evaluate", "analyze", "sweep", "tools", "results"]
 
 
 def imported(path):
