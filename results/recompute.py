@@ -16,6 +16,7 @@ from collections import Counter, defaultdict
 from itertools import combinations
 from math import comb
 from pathlib import Path
+from statistics import NormalDist
 
 import numpy as np
 
@@ -53,14 +54,21 @@ def read_runs():
         RUNS[config["algorithm"], *key][args["seed"]] = curve, path.parent
 
 
-def ends(folders, env, noise="", rate="1.0", first=1, last=9999, algorithm="PPO", step=None):
-    """Return the last tests of a configuration, seeds first to last; equal runs count once."""
+def ends(
+    folders, env, noise="", rate="1.0", first=1, last=9999, algorithm="PPO", step=None, late=False
+):
+    """Return the last tests of a configuration, seeds first to last; equal runs count once.
+
+    late: the means of the tests in the last 15 % of the steps instead.
+    """
     found = {}
     for folder in folders.split():
         runs = RUNS[algorithm, folder, env + "-v5", noise, rate if noise else ""]
         for seed, (curve, _) in sorted(runs.items()):
             if first <= seed <= last:
-                found[seed, curve[max(curve)]] = curve[step or max(curve)]
+                end = max(curve)
+                tests = [value for at, value in curve.items() if at > 0.85 * end]
+                found[seed, curve[end]] = np.mean(tests) if late else curve[step or end]
     return np.array(list(found.values()))
 
 
@@ -129,22 +137,37 @@ def mann_whitney(x, y):
     return min(1, 2 * min(below, above) / ways[n].sum())
 
 
+def divided(x, y, rng, every=False):
+    """Return Welch's t as the runs are, and as they are divided at random, or in every way."""
+    values, n, m = np.concatenate([x, y]), len(x), len(y)
+    chosen = rng.permuted(np.tile(np.arange(n + m), (DRAWS, 1)), axis=1)[:, :n]
+    if every and comb(n + m, n) <= DRAWS:
+        chosen = np.array(list(combinations(range(n + m), n)))
+    part = values[np.vstack([np.arange(n), chosen])]
+    other = (values.sum() - part.sum(1)) / m
+    spread = ((values**2).sum() - (part**2).sum(1) - m * other**2) / (m - 1) / m
+    return (part.mean(1) - other) / np.sqrt(part.var(1, ddof=1) / n + spread)
+
+
 def permutation(pairs):
-    """Return p of the sum of Welch's t over environments, whose runs are divided at random."""
-    rng, sums = np.random.default_rng(1), 0
-    for x, y in pairs:
-        values, n, m = np.concatenate([x, y]), len(x), len(y)
-        chosen = rng.permuted(np.tile(np.arange(n + m), (DRAWS, 1)), axis=1)[:, :n]
-        if len(pairs) == 1 and comb(n + m, n) <= DRAWS:
-            chosen = np.array(list(combinations(range(n + m), n)))
-        part = values[np.vstack([np.arange(n), chosen])]
-        other = (values.sum() - part.sum(1)) / m
-        spread = ((values**2).sum() - (part**2).sum(1) - m * other**2) / (m - 1) / m
-        sums = sums + (part.mean(1) - other) / np.sqrt(part.var(1, ddof=1) / n + spread)
+    """Return p of the sum of Welch's t over environments."""
+    rng = np.random.default_rng(1)
+    sums = sum(divided(x, y, rng, every=len(pairs) == 1) for x, y in pairs)
     far = [sums[1:] >= sums[0] - 1e-9, sums[1:] <= sums[0] + 1e-9]
     if len(pairs) > 1:
         return np.mean(abs(sums[1:]) >= abs(sums[0]) - 1e-9)
     return min(1, 2 * min(f.mean() for f in far))
+
+
+def in_scores(pairs):
+    """Return p of the sum over environments of the normal quantiles of the ranks of t."""
+    rng, sums = np.random.default_rng(1), 0
+    quantile_at = NormalDist().inv_cdf
+    quantiles = np.array([quantile_at((i + 0.5) / (1 + DRAWS)) for i in range(1 + DRAWS)])
+    for x, y in pairs:
+        t = divided(x, y, rng)
+        sums = sums + quantiles[t.argsort().argsort()]
+    return min(1, 2 * min((sums >= sums[0]).mean(), (sums <= sums[0]).mean()))
 
 
 def holm(ps):
@@ -252,6 +275,42 @@ def baselines():
             check("baselines_sac_td3", row, "sd", tests.std(ddof=1))
 
 
+def new_set(name, algorithm):
+    """Check set F or G, whose runs count with the mean of their tests in the last 15 % of steps."""
+    if not (HERE / f"tables/{name}.csv").exists():
+        return
+    rows, where = rows_of(f"tables/{name}.csv"), {"algorithm": algorithm, "late": True}
+    alone = [row for row in rows if row["environment"] != "together"]
+    pairs = defaultdict(dict)  # of each noise, by environment
+    for row in alone:
+        env, noise = row["environment"], row["noise"]
+        pairs[noise][env] = ends(name, env, noise, row["rate"], **where), ends(name, env, **where)
+    together = {noise: in_scores(list(found.values())) for noise, found in pairs.items()}
+    corrected = dict(zip(together, holm(together.values()), strict=True))
+    for row in alone:
+        x, y = pairs[row["noise"]][row["environment"]]
+        change, low, high = fieller(x, y)
+        cells = {"n": len(x), "mean": x.mean(), "sd": x.std(ddof=1)}
+        cells |= {"n_without": len(y), "mean_without": y.mean(), "sd_without": y.std(ddof=1)}
+        cells |= {"difference": x.mean() - y.mean(), "effect_size": effect_size(x, y)}
+        cells |= {"difference_percent": change, "low_percent": low, "high_percent": high}
+        for column, value in cells.items():
+            check(name, row, column, value)
+        check(name, row, "p", one(x, y), drawn=True)
+    for row in rows[len(alone) :]:
+        found = list(pairs[row["noise"]].values())
+        change = np.mean([fieller(x, y)[0] for x, y in found])
+        check(name, row, "difference_percent", change)
+        check(name, row, "effect_size", np.median([effect_size(x, y) for x, y in found]))
+        check(name, row, "p", together[row["noise"]], drawn=True)
+        check(name, row, "holm", corrected[row["noise"]], drawn=True)
+
+
+def effect_size(x, y):
+    """Return the difference in standard deviations over seeds."""
+    return (x.mean() - y.mean()) / ((x.var(ddof=1) + y.var(ddof=1)) / 2) ** 0.5
+
+
 def physics():
     """Check set D: policies under other masses and frictions, in robustness.csv of each run."""
     changed, found = [f"factor {factor}" for factor in (0.7, 0.85, 1.15, 1.3)], {}
@@ -314,6 +373,8 @@ def main():
     compare("td3_harmful", [(x, clean) for x in noisy])
     averages("ppo_harmful", "runs", "1.0", 5, 10)
     averages("ablation", "ablation", "0.05", 3, 3)
+    new_set("td3_fresh", "TD3")
+    new_set("ppo_relative", "PPO")
     harmful()
     baselines()
     physics()

@@ -1,4 +1,4 @@
-"""The picture of the project's first page: the paper's best noises for PPO, its gains and ours."""
+"""The picture of the project's first page, and those of sets E, F and G in plans.md."""
 
 import re
 
@@ -47,5 +47,45 @@ def draw():
     return fig
 
 
+def draw_set(table):
+    """Draw a set's changes with their 95 % intervals: a panel a noise, a line an environment.
+
+    table: of compare. Where it has looks, each of them is a line.
+    """
+    noises = table["noise"].unique()
+    lines = len(table) // len(noises)
+    size = style.PAGE, 0.75 + 0.2 * lines
+    fig = Figure(figsize=size, layout="constrained")
+    axes = fig.subplots(1, len(noises), sharey=True, squeeze=False)[0]
+    for noise, ax in zip(noises, axes, strict=True):
+        rows = list(table[table["noise"] == noise].itertuples())
+        for y, row in enumerate(rows):
+            color = {"helps": style.BETTER, "harms": style.WORSE}.get(row.verdict, style.UNCLEAR)
+            ax.plot([row.low_percent, row.high_percent], [y, y], color=color)
+            ax.plot(row.difference_percent, y, "o", color=color)
+            verdict = "" if pd.isna(row.verdict) else row.verdict
+            ax.annotate(verdict, (1.01, y), xycoords=("axes fraction", "data"), va="center")
+        ax.axvline(0, color="0.6", linewidth=0.6, zorder=0)
+        ax.set_title(f"{noise}\nrate {rows[0].rate:g}")
+    has_looks = table["environment"].nunique() == 1
+    seeds = [f"{row.n:.0f} + {row.n_without:.0f} seeds" for row in rows]
+    axes[0].set_yticks(range(lines), seeds if has_looks else [row.environment for row in rows])
+    axes[0].margins(y=0.12)
+    axes[0].invert_yaxis()
+    fig.supxlabel("change of the test return by the noise (%)", fontsize=style.TEXT)
+    return fig
+
+
+def pictures():
+    """Return {name: figure}; a set has one when it has a table."""
+    found = {"best_noises": draw()}
+    for name in ("ppo_walker2d", "td3_fresh", "ppo_relative"):
+        path = RESULTS / f"tables/{name}.csv"
+        if path.exists():
+            found[name] = draw_set(pd.read_csv(path))
+    return found
+
+
 if __name__ == "__main__":
-    draw().savefig(RESULTS / "figures/best_noises.svg", metadata={"Date": None})
+    for name, fig in pictures().items():
+        fig.savefig(RESULTS / f"figures/{name}.svg", metadata={"Date": None})

@@ -9,6 +9,7 @@ import pytest
 import sweeps
 from scipy import stats
 
+from analysis.permutation import permutation_t
 from analysis.statistics import fieller
 from results import recompute
 from results.study import __main__, claims, compare, paper, picture, returns
@@ -264,6 +265,15 @@ def test_sets_f_and_g_are_compared_as_analyze_does(data):
         assert set(table["verdict"].dropna()) == {"under way"}
 
 
+def permutation_p_of(pairs):
+    """The p of the tool's test over environments, which takes arrays with a row for each seed."""
+    x, y = (np.full((8, len(pairs)), np.nan) for _ in range(2))
+    for e, samples in enumerate(pairs):
+        for side, values in zip((x, y), samples, strict=True):
+            side[: len(values), e] = values
+    return permutation_t(x, y)[1]
+
+
 def test_the_second_computation_has_its_own_statistics():
     rng = np.random.default_rng(0)
     x, y = rng.normal(5, 1, 6), rng.normal(4, 2, 8)
@@ -275,6 +285,8 @@ def test_the_second_computation_has_its_own_statistics():
     assert recompute.average([(x, y)] * 2) == pytest.approx(
         compare.average_change([(x, y)] * 2)[:3], rel=1e-4
     )
+    pairs = [(x, y), (x[:5], y[:5] + 1)]
+    assert recompute.in_scores(pairs) == pytest.approx(permutation_p_of(pairs), rel=0.05)
     assert recompute.holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
 
 
@@ -297,7 +309,7 @@ def test_the_tables_are_right_by_the_second_computation(capsys):
     assert recompute.main() == 0, capsys.readouterr().out
 
 
-def test_the_picture_of_the_first_page(tmp_path):
+def test_the_picture_of_the_first_page():
     table = pd.read_csv(returns.RESULTS / "tables/claims.csv")
     table.columns = ["claim", "paper", "ours", "covered", "verdict", "runs"]
     best = picture.best_noises(table)
@@ -305,6 +317,10 @@ def test_the_picture_of_the_first_page(tmp_path):
     paper = {"HalfCheetah": "+36 %", "Hopper": "+28 %", "Humanoid": "+3 %", "Pusher": "+20 %"}
     assert gains == paper | {"Walker2d": "+90 %"}
     assert best["Hopper"].claim.endswith(", fresh")
-    picture.draw().savefig(tmp_path / "drawn.svg", metadata={"Date": None})
-    committed = (returns.RESULTS / "figures/best_noises.svg").read_bytes()
-    assert (tmp_path / "drawn.svg").read_bytes() == committed
+
+
+def test_the_pictures_are_those_of_the_tables(tmp_path):
+    for name, fig in picture.pictures().items():
+        fig.savefig(tmp_path / "drawn.svg", metadata={"Date": None})
+        committed = (returns.RESULTS / f"figures/{name}.svg").read_bytes()
+        assert (tmp_path / "drawn.svg").read_bytes() == committed, name
