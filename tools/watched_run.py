@@ -47,11 +47,14 @@ class Trial:
     """A script, options of its own, and a folder to try it in."""
 
     def __init__(self, path, options, folder):
-        self.path, self.options, self.folder = path, options, folder
+        self.path, self.folder, self.options = path, folder, []
+        for word in options:  # "--name value" is the same as "--name=value"
+            self.options += word.split("=", 1) if word.startswith("--") else [word]
         self.algorithm = path.name.removesuffix("_continuous_noisy.py").lower()
-        steps = options.index("--total-timesteps") if "--total-timesteps" in options else None
-        # without what belongs to the grid of a sweep
-        self.own_options = options if steps is None else options[:steps] + options[steps + 2 :]
+        self.own_options = self.options.copy()  # without what belongs to the grid of a sweep
+        if "--total-timesteps" in self.options:
+            steps = self.options.index("--total-timesteps")
+            del self.own_options[steps : steps + 2]
 
     def train(self, name, **kwargs):
         """Return a short run, watched, in a folder of runs."""

@@ -194,3 +194,10 @@ def test_a_gradient_in_one_update_will_do():
     for gradient in (0.0, 1.0, 0.0):
         update(gradient)
     check_script.learns(SimpleNamespace(run=seen))
+
+
+@pytest.mark.parametrize("words", [["--total-timesteps", "99"], ["--total-timesteps=99"]])
+def test_an_option_of_the_grid_is_none_of_the_scripts_in_a_sweep(words, tmp_path):
+    trial = Trial(Path("my_continuous_noisy.py"), ["--hidden=64", *words], tmp_path)
+    assert trial.own_options == ["--hidden", "64"]
+    assert trial.options == ["--hidden", "64", "--total-timesteps", "99"]

@@ -419,6 +419,7 @@ def test_baselines_that_pay(noises, more, baselines):
     ("args", "message"),
     [
         ("custom --noises Foo(1) --noise-rates 1", "bad noise 'Foo(1)': unknown name; valid are"),
+        (f"custom --noises {A[:-1]}", "bad noise 'RandomNormalNoisyReward(1': expected Name("),
         (f"custom --noises {A}", "--noises needs --noise-rates, or a rate with each"),
         ("custom --noise-rates 1", "--noise-rates needs --noises that have no rate of their own"),
         (f"custom --noises {A}@1+{A}", "give each of these noises a rate with @, or none"),
