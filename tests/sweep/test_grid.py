@@ -454,7 +454,7 @@ def test_bad_input(args, message, tmp_path):
     assert result.code == 2, result.out + result.err
     lines = [line for line in result.err.splitlines() if not line.endswith(" ms a step")]
     assert lines[0].startswith("error: ") and message in lines[0]
-    assert len(lines) == (1 + len(noisy_wrappers.WRAPPERS) if "unknown name" in message else 1)
+    assert len(lines) == (1 + len(noisy_wrappers.WRAPPERS) if "bad noise" in message else 1)
     assert not result.out and not list(tmp_path.iterdir())
 
 
