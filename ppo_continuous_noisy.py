@@ -385,25 +385,15 @@ def load_policy(run_dir, env=None):
 # UPDATES: how a loss becomes a step of an optimizer, and a network a function in NumPy
 
 
-class Learned(nn.Module):
-    """loss(network, ...) as a module: functional_call needs one to differentiate."""
-
-    def __init__(self, loss, network):
-        super().__init__()
-        self.loss, self.network = loss, network
-
-    def forward(self, *inputs):
-        """Return what the loss returns."""
-        return self.loss(self.network, *inputs)
-
-
 def updater(loss, network, optimizer, args):
     """Return update(*inputs) -> curves: one step of the optimizer on loss(network, *inputs).
 
     Numbers among the inputs may change from one update to the next. The optimizer may be any whose
     step() needs no closure. Loss and gradient in one compiled graph are faster than backward().
     """
-    learned = Learned(loss, network)
+    # functional_call takes a module, whose parameters it replaces: its forward() is the loss
+    learned = nn.ModuleList([network])
+    learned.forward = functools.partial(loss, network)
     parameters = {name: p for name, p in learned.named_parameters() if p.requires_grad}
 
     def clipped_gradient(parameters, inputs):

@@ -328,18 +328,6 @@ def load_policy(run_dir, env=None):
 # UPDATES: how a loss becomes a step of an optimizer
 
 
-class Learned(nn.Module):
-    """loss(network, ...) as a module: functional_call needs one to differentiate."""
-
-    def __init__(self, loss, network):
-        super().__init__()
-        self.loss, self.network = loss, network
-
-    def forward(self, *inputs):
-        """Return what the loss returns."""
-        return self.loss(self.network, *inputs)
-
-
 def updater(loss, network, optimizer, args):
     """Return update(*inputs) -> curves: one step of the optimizer on loss(network, *inputs).
 
@@ -347,7 +335,9 @@ def updater(loss, network, optimizer, args):
     step() needs no closure. Loss and gradient in one compiled graph take about 40 % less processor
     time than a compiled loss and backward().
     """
-    learned, device = Learned(loss, network), next(network.parameters()).device
+    # functional_call takes a module, whose parameters it replaces: its forward() is the loss
+    learned, device = nn.ModuleList([network]), next(network.parameters()).device
+    learned.forward = functools.partial(loss, network)
     parameters = {name: p for name, p in learned.named_parameters() if p.requires_grad}
     gradient_of = grad_and_value(functools.partial(functional_call, learned), has_aux=True)
     gradient_of = compiled(gradient_of) if args.compile else gradient_of

@@ -58,7 +58,7 @@ def test_what_the_scripts_share_is_word_for_word_the_same():
     for one, other in itertools.combinations((sac, td3, ppo), 2):
         found, others = definitions(one), definitions(other)
         common = found.keys() & others.keys()
-        assert {"make_env", "Learned", "updater", "Run", "train"} <= common
+        assert {"make_env", "updater", "Run", "train"} <= common
         differ = {name for name in common if found[name] != others[name]}
         assert differ <= by_design | ({"mlp", "updater"} if other is ppo else set())
     assert sac.TEST_SEED == td3.TEST_SEED == ppo.TEST_SEED
