@@ -467,11 +467,8 @@ class Run:
         self.is_finished = (self.folder / "result.json").exists()
         if self.is_finished:
             self._delete("checkpoint.pt")  # left by a process that was killed before it did so
-        pairs = zip(args.noise, args.noise_rate, strict=True)
-        noises = " + ".join(f"{noise} at {rate}" for noise, rate in pairs) or "no noise"
-        begun = f"{self.config['algorithm']} on {args.env_id}, {noises}, seed {args.seed}"
-        begun += " (compiles first, which takes a while)" if args.compile else ""
-        say(f"{self.folder} is finished" if self.is_finished else f"{begun}: {self.folder}")
+        doing = "is finished" if self.is_finished else "is trained; Ctrl-C stops after an episode"
+        say(f"{self.folder} {doing}")
 
     def resume(self, state):
         """Restore the last checkpoint of {name: object with a state_dict}; return its step, or 0.

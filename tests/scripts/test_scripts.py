@@ -391,7 +391,7 @@ def test_command_line(tmp_path):
     assert (result.code, result.err) == (0, "")
     [run_dir] = tmp_path.iterdir()
     first, *lines, last, finished, tensorboard = result.out.splitlines()
-    assert all(text in first for text in ("PPO", "NoLimit-v0", *NOISES, "0.25", str(run_dir)))
+    assert first.startswith(f"{run_dir} is trained; ")
     assert len(lines) == 2  # not a terminal: plain lines, of each test
     mean = read_json(run_dir / "result.json")["final_return_mean"]
     assert re.fullmatch(rf"step=60/60 sps=\d+ eval_return={mean:.2f} eta=00:00", last)
