@@ -650,10 +650,8 @@ class Run:
         """Move the bar of a terminal; elsewhere print a line after ten seconds, or after a test."""
         self.bar.update(step - self.bar.n)
         if self.bar.disable and now - self.printed > 10:
-            steps_left = self.bar.total - step
-            eta = tqdm.format_interval(steps_left / self.speed) if self.speed else "?"
             # analysis/logs.py reads this line
-            say(f"step={step}/{self.bar.total} sps={self.speed:.0f} {self.last_test}eta={eta}")
+            say(f"step={step}/{self.bar.total} sps={self.speed:.0f} {self.last_test}")
             self.printed = now
 
     def log_episode(self, step, info):
@@ -680,7 +678,7 @@ class Run:
         success = noisy.success_rate(results[:, 2])
         self.result = {"final_return_mean": mean, "final_return_std": std}
         self.result |= {f"final_{name}": rate for name, rate in success.items()}
-        self.last_test, self.printed = f"eval_return={mean:.2f} ", -math.inf  # print a line now
+        self.last_test, self.printed = f"eval_return={mean:.2f}", -math.inf  # print a line now
         self.bar.set_description_str(self.last_test)
         test = {"episodic_return_mean": mean, "episodic_return_std": std}
         self.log(step, eval=test | {"episodic_length_mean": length} | success)
@@ -707,7 +705,7 @@ class Run:
         }
         self._write("result.json", json.dumps(self.result, indent=2) + "\n")
         self._delete("checkpoint.pt")
-        say(f"{self.folder} is finished after {step} steps: {self.last_test.rstrip()}")
+        say(f"{self.folder} is finished after {step} steps: {self.last_test}")
         say(f"See its curves with: tensorboard --logdir {self.args.runs_dir}")
 
     def _delete(self, *patterns):

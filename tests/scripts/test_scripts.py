@@ -394,7 +394,7 @@ def test_command_line(tmp_path):
     assert first.startswith(f"{run_dir} is trained; ")
     assert len(lines) == 2  # not a terminal: plain lines, of each test
     mean = read_json(run_dir / "result.json")["final_return_mean"]
-    assert re.fullmatch(rf"step=60/60 sps=\d+ eval_return={mean:.2f} eta=00:00", last)
+    assert re.fullmatch(rf"step=60/60 sps=\d+ eval_return={mean:.2f}", last)
     assert f"{run_dir} is finished" in finished and str(tmp_path) in tensorboard
     again = command("PPO", *flags(args))
     assert (again.code, again.out, again.err) == (0, f"{run_dir} is finished\n", "")
