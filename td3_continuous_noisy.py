@@ -506,9 +506,9 @@ class Run:
             self._log_hyperparameters()
         total = self.args.total_timesteps
         self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None, smoothing=0)
-        self.saved_step, self.last_test, self.printed = step, "", time.monotonic()
-        self.learning_since = None  # the step and the time of the first losses
-        self.speed = 0.0  # steps per second since then
+        self.saved_step, self.last_test = step, ""
+        self.first_step, self.begun = step, time.monotonic()
+        self.printed = self.begun  # when a line was
         self.wall_begun = time.monotonic() - seconds
         self.processor_begun = time.process_time() - processor_seconds
         return step
@@ -539,27 +539,24 @@ class Run:
 
     def log(self, step, **groups):
         """Log numbers as group/name to TensorBoard, and the speed; show the progress."""
-        tags, now = {}, time.monotonic()
+        now = time.monotonic()
+        speed = (step - self.first_step) / (now - self.begun)
+        tags = {"charts/SPS": speed}
         for group, values in groups.items():
             tags |= {f"{group}/{name}": float(value) for name, value in values.items()}
-        if "losses" in groups and self.learning_since:
-            first_step, since = self.learning_since
-            self.speed = tags["charts/SPS"] = (step - first_step) / (now - since)
-        elif "losses" in groups:  # the first ones: compiling does not count
-            self.learning_since = step, now
         if not all(map(math.isfinite, tags.values())):
             reason = f"step {step}: training diverged, some values are not finite: {tags}"
             raise noisy.NotFiniteError(reason)
         for tag, value in tags.items():
             self.writer.add_scalar(tag, value, step)
-        self._show_progress(step, now)
+        self._show_progress(step, speed, now)
 
-    def _show_progress(self, step, now):
+    def _show_progress(self, step, speed, now):
         """Move the bar of a terminal; elsewhere print a line after ten seconds, or after a test."""
         self.bar.update(step - self.bar.n)
         if self.bar.disable and now - self.printed > 10:
             # analysis/logs.py reads this line
-            say(f"step={step}/{self.bar.total} sps={self.speed:.0f} {self.last_test}")
+            say(f"step={step}/{self.bar.total} sps={speed:.0f} {self.last_test}")
             self.printed = now
 
     def log_episode(self, step, info):
