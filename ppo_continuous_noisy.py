@@ -688,16 +688,11 @@ class Run:
         self.bar.close()
         noises = noisy.noise_wrappers(self.env).items()
         returns = self.env.get_wrapper_attr("return_queue")  # of the last 100 training episodes
-        seconds = time.monotonic() - self.wall_begun
         self.result |= {
-            "final_return_n": self.args.eval_episodes,
-            "total_timesteps": self.args.total_timesteps,
             "trained_timesteps": step,  # PPO: whole rollouts
             "train_return_mean_last_100": np.mean(returns) if returns else None,
-            "steps_per_second": step / seconds,
-            "wall_time_seconds": seconds,
+            "wall_time_seconds": time.monotonic() - self.wall_begun,
             "processor_seconds": time.process_time() - self.processor_begun,
-            "noise_applied_fraction": {name: noise.applied_fraction for name, noise in noises},
             "noise_applied": {name: [w.times_applied, w.opportunities] for name, w in noises},
         }
         self._write("result.json", json.dumps(self.result, indent=2) + "\n")

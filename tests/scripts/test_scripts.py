@@ -116,15 +116,12 @@ def test_run_folder(tmp_path, capsys):
     result = read_json(run_dir / "result.json")
     assert result["final_return_mean"] == pytest.approx(last.mean())
     assert result["final_return_std"] == pytest.approx(last.std(ddof=1))
-    assert result["final_return_n"] == 3
-    assert result["total_timesteps"] == result["trained_timesteps"] == 60
-    assert result["steps_per_second"] == pytest.approx(60 / result["wall_time_seconds"])
-    applied, counts = result["noise_applied_fraction"], result["noise_applied"]
-    names = ["RandomEarlyTermination", "RandomNormalNoisyReward"]
-    assert list(applied) == list(counts) == names
+    assert result["trained_timesteps"] == 60
+    counts = result["noise_applied"]
+    assert list(counts) == ["RandomEarlyTermination", "RandomNormalNoisyReward"]
     assert counts["RandomNormalNoisyReward"][1] == 60  # steps; of the other, episodes
-    for name, rate in zip(names, (0.25, 0.5), strict=True):
-        assert applied[name] == counts[name][0] / counts[name][1] == pytest.approx(rate, abs=0.3)
+    for (applied, of), rate in zip(counts.values(), (0.25, 0.5), strict=True):
+        assert applied / of == pytest.approx(rate, abs=0.3)
 
     # the same again, in another spelling: finished, and nothing is written
     before = {path: path.stat().st_mtime_ns for path in run_dir.iterdir()}
@@ -222,8 +219,7 @@ def test_overwrite_of_nothing_and_a_short_run(algorithm, tmp_path):
 def test_ppo_evaluates_at_the_end_of_rollouts_under_the_nominal_step(tmp_path):
     rollouts = {"num_steps": 16, "num_minibatches": 2, "eval_episodes": 1}
     run_dir = run("PPO", tmp_path / "seldom", total_timesteps=100, eval_frequency=20, **rollouts)
-    result = read_json(run_dir / "result.json")
-    assert (result["total_timesteps"], result["trained_timesteps"]) == (100, 96)
+    assert read_json(run_dir / "result.json")["trained_timesteps"] == 96
     # rollouts end at 16, 32, ..., 96; 100 is what was asked for
     assert [row[0] for row in evaluations(run_dir)] == [20, 40, 60, 80, 100]
     tests = [step for step, _ in curves(run_dir)["eval/episodic_return_mean"]]
@@ -357,8 +353,8 @@ def test_curves(algorithm, tmp_path):
     assert list(np.cumsum(list(lengths.values()))) == list(lengths) and len(lengths) > 15
     for tag in losses:
         assert list(values[tag]) == ([*range(12, 121, 12)] if algorithm == "PPO" else [100, 120])
-    for name, fraction in result["noise_applied_fraction"].items():
-        assert values[f"noise/{name}/applied_fraction"][120] == pytest.approx(fraction)
+    for name, (applied, of) in result["noise_applied"].items():
+        assert values[f"noise/{name}/applied_fraction"][120] == pytest.approx(applied / of)
     speeds = EventAccumulator(str(run_dir)).Reload().Scalars("charts/SPS")
     assert min(speed.value for speed in speeds) > 0 and speeds[-1].step == 120
 
