@@ -568,7 +568,7 @@ class Run:
         A state_dict may hold tensors, NumPy's arrays and numbers, and Python's own types.
         """
         self.state, self.eval_csv = state, "step,episode,episodic_return,episodic_length,success\n"
-        step, seconds, processor_seconds = 0, 0.0, 0.0
+        step, processor_seconds = 0, 0.0
         path = self.folder / "checkpoint.pt"
         if path.exists():
             with fail_on(Exception, f"cannot read {path} (--overwrite starts afresh)"):
@@ -581,7 +581,7 @@ class Run:
                     part.load_state_dict(checkpoint["state"][name])
             torch.set_rng_state(checkpoint["torch"])
             step, self.eval_csv = checkpoint["step"], checkpoint["eval_csv"]
-            seconds, processor_seconds = checkpoint["seconds"], checkpoint["processor_seconds"]
+            processor_seconds = checkpoint["processor_seconds"]
             say(f"resumed at step {step}")
         else:
             self._delete("events.out.tfevents.*")  # of a process killed before its first checkpoint
@@ -601,7 +601,6 @@ class Run:
         self.saved_step, self.last_test = step, ""
         self.first_step, self.begun = step, time.monotonic()
         self.printed = self.begun  # when a line was
-        self.wall_begun = time.monotonic() - seconds
         self.processor_begun = time.process_time() - processor_seconds
         return step
 
@@ -623,7 +622,6 @@ class Run:
             "state": {name: part.state_dict() for name, part in self.state.items()},
             "torch": torch.get_rng_state(),
             "eval_csv": self.eval_csv,
-            "seconds": time.monotonic() - self.wall_begun,
             "processor_seconds": time.process_time() - self.processor_begun,
         }
         self._write("checkpoint.pt", checkpoint)
@@ -691,7 +689,6 @@ class Run:
         self.result |= {
             "trained_timesteps": step,  # PPO: whole rollouts
             "train_return_mean_last_100": np.mean(returns) if returns else None,
-            "wall_time_seconds": time.monotonic() - self.wall_begun,
             "processor_seconds": time.process_time() - self.processor_begun,
             "noise_applied": {name: [w.times_applied, w.opportunities] for name, w in noises},
         }
