@@ -518,8 +518,7 @@ class Run:
         table = "".join(f"|{name}|{value}|\n" for name, value in args.items())
         self.writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + table)
         metrics = ["eval/episodic_return_mean", "charts/episodic_return", "eval/success_rate"]
-        experiment, session_start, _ = hparams(args, dict.fromkeys(metrics, 0))
-        for summary in (experiment, session_start):
+        for summary in hparams(args, dict.fromkeys(metrics, 0)):
             self.writer.file_writer.add_summary(summary)
 
     def save(self, step):
@@ -588,8 +587,6 @@ class Run:
 
     def finish(self, step):
         """Write result.json, last of all, and delete the checkpoint."""
-        _, _, session_end = hparams({}, {})  # HPARAMS shows the run as successful
-        self.writer.file_writer.add_summary(session_end)
         self.writer.close()
         self.bar.close()
         noises = noisy.noise_wrappers(self.env).items()
