@@ -389,8 +389,7 @@ def updater(loss, network, optimizer, args):
     return update
 
 
-# THE RUN: environments, folder, signals. The three scripts have the same text, and you can change
-# one of them alone.
+# THE RUN: environments, folder, signals. Three scripts have the same text; you may change one.
 
 
 def fail(message, code=2):
@@ -499,10 +498,7 @@ class Run:
         say(f"{self.folder} {doing}")
 
     def resume(self, state):
-        """Restore the last checkpoint of {name: object with a state_dict}; return its step, or 0.
-
-        A state_dict may hold tensors, NumPy's arrays and numbers, and Python's own types.
-        """
+        """Restore the last checkpoint of {name: part with state_dict()}; return its step, or 0."""
         self.state, self.eval_csv = state, "step,episode,episodic_return,episodic_length,success\n"
         step, processor_seconds = 0, 0.0
         path = self.folder / "checkpoint.pt"
@@ -570,8 +566,7 @@ class Run:
         for group, values in groups.items():
             tags |= {f"{group}/{name}": float(value) for name, value in values.items()}
         if not all(map(math.isfinite, tags.values())):
-            reason = f"step {step}: training diverged, some values are not finite: {tags}"
-            raise noisy.NotFiniteError(reason)
+            raise noisy.NotFiniteError(f"step {step}: training diverged: {tags}")
         for tag, value in tags.items():
             self.writer.add_scalar(tag, value, step)
         self._show_progress(step, speed, now)
@@ -590,12 +585,8 @@ class Run:
         self.log(step, charts=charts | noisy.success_rate([noisy.outcome(info)]))
 
     def log_test(self, step, results, policy, due=None):
-        """Log the (N, 3) returns, lengths and outcomes of a test, and save the policy.
-
-        `due` is the step in eval.csv and policy_STEP.pt, if it is not `step`: PPO tests after whole
-        rollouts.
-        """
-        due = due or step
+        """Log the (N, 3) returns, lengths and outcomes of a test, and save the policy."""
+        due = due or step  # the step in eval.csv: PPO tests after whole rollouts
         for episode, (episodic_return, length, outcome) in enumerate(results.tolist()):
             success = "" if math.isnan(outcome) else int(outcome)
             self.eval_csv += f"{due},{episode},{episodic_return},{length:.0f},{success}\n"
@@ -649,7 +640,7 @@ class Run:
 
 
 def read_state(file):
-    """Read a checkpoint that may hold arrays and numbers of NumPy, but never code."""
+    """Read a checkpoint that may hold tensors, arrays and numbers of NumPy, but never code."""
     multiarray = np._core.multiarray
     types = [np.ndarray, np.dtype, bytes, multiarray._reconstruct, multiarray.scalar]
     types += {type(np.dtype(code)) for code in np.typecodes["All"]}
