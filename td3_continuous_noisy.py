@@ -464,8 +464,6 @@ class Run:
         if self.config["script_sha256"] != new["script_sha256"]:
             say("the script has changed since the run began; if it matters, use --exp-name")
         self.is_finished = (self.folder / "result.json").exists()
-        if self.is_finished:
-            self._delete("checkpoint.pt")  # left by a process that was killed before it did so
         doing = "is finished" if self.is_finished else "is trained; Ctrl-C stops after an episode"
         say(f"{self.folder} {doing}")
 
