@@ -589,7 +589,6 @@ class Run:
         self._write("result.json", json.dumps(self.result, indent=2) + "\n")
         self._delete("checkpoint.pt")
         say(f"{self.folder} is finished after {step} steps: {self.last_test}")
-        say(f"See its curves with: tensorboard --logdir {self.args.runs_dir}")
 
     def _delete(self, *patterns):
         for pattern in patterns:
