@@ -232,10 +232,8 @@ def ppo_loss(agent, minibatch, args):
 def learn(args, env, test_env, stop):
     """Train in the noisy `env` and test in `test_env`; return False if stop() ended it early."""
     # a minibatch needs two steps at least, for the standard deviation of its advantages
-    least, most = 2 * args.num_minibatches, args.total_timesteps
-    if not least <= args.num_steps <= most:
-        limits = f"2 * --num-minibatches ({least}) to --total-timesteps ({most})"
-        fail(f"--num-steps must be from {limits}, not {args.num_steps}")
+    if not 2 * args.num_minibatches <= args.num_steps <= args.total_timesteps:
+        fail("--num-steps must be from 2 * --num-minibatches to --total-timesteps")
     device = torch.device("cuda" if args.cuda else "cpu")
     run = Run(args, env)
     if run.is_finished:

@@ -270,7 +270,7 @@ BAD = [  # arguments, what the line names
     ({"seed": -1}, "--seed must be at least 0, not -1\n"),
     ({"gamma": 1.1}, "--gamma must be at most 1, not 1.1\n"),
     ({"gamma": math.nan}, "--gamma must be at least 0, not nan\n"),
-    ({"num_steps": 61}, "--num-steps must be from 2 * --num-minibatches (6) to"),
+    ({"num_steps": 61}, "--num-steps must be from 2 * --num-minibatches to --total-timesteps"),
     ({"num_minibatches": 13}, "--num-steps must be from"),
 ]
 BAD += [] if torch.cuda.is_available() else [({"cuda": True}, "--cuda: PyTorch finds no GPU")]
