@@ -187,7 +187,7 @@ class Rollout(Saved):
         self.rewards, self.dones = np.zeros((2, steps), np.float32)  # done: terminated or truncated
 
 
-def compute_gae(rewards, values, dones, gamma, gae_lambda):
+def compute_gae(rewards, values, dones, args):
     """Generalized advantage estimation: A_t = delta_t + gamma lambda (1 - done_t) A_(t+1).
 
     delta_t = r_t + gamma (1 - done_t) V_(t+1) - V_t. Rewards and dones (T,), values (T + 1,).
@@ -195,9 +195,9 @@ def compute_gae(rewards, values, dones, gamma, gae_lambda):
     rewards, values, dones = (x.tolist() for x in (rewards, values, dones))
     advantages, advantage = [0.0] * len(rewards), 0.0
     for t in reversed(range(len(rewards))):
-        discount = gamma * (1 - dones[t])
+        discount = args.gamma * (1 - dones[t])
         delta = rewards[t] + discount * values[t + 1] - values[t]
-        advantages[t] = advantage = delta + discount * gae_lambda * advantage
+        advantages[t] = advantage = delta + discount * args.gae_lambda * advantage
     return torch.tensor(advantages)
 
 
@@ -294,9 +294,7 @@ def learn(args, env, test_env, stop):
             log_probs, _, values = agent(observations[:-1], actions)
             check_acting(log_probs, rollout, std)
             all_values = torch.cat([values, agent.critic(observations[-1])])
-            advantages = compute_gae(
-                rollout.rewards, all_values, rollout.dones, args.gamma, args.gae_lambda
-            ).to(device)
+            advantages = compute_gae(rollout.rewards, all_values, rollout.dones, args).to(device)
             returns = advantages + values
 
             # LEARN: policy and value function
