@@ -142,8 +142,7 @@ class Saved:
 
     def load_state_dict(self, state):
         """Set the attributes."""
-        for name, value in state.items():
-            setattr(self, name, value)
+        vars(self).update(state)
 
 
 class Normalizer(Saved):
@@ -418,14 +417,15 @@ def in_numpy(network):
     Linear, Tanh and ReLU are computed in NumPy, several times faster than in PyTorch. A network
     that has anything else is called as it is.
     """
+    activations = {nn.Tanh: np.tanh, nn.ReLU: lambda x: np.maximum(x, 0)}
     functions = []
     for layer in network if type(network) is nn.Sequential else [network]:
         has_hooks = layer._forward_hooks or layer._forward_pre_hooks
         if type(layer) is nn.Linear and layer.bias is not None and not has_hooks:
             weight, bias = layer.weight.numpy(force=True), layer.bias.numpy(force=True)
-            functions.append(functools.partial(linear, weight, bias))
-        elif type(layer) in IN_NUMPY and not has_hooks:
-            functions.append(IN_NUMPY[type(layer)])
+            functions.append(lambda x, weight=weight, bias=bias: weight @ x + bias)
+        elif type(layer) in activations and not has_hooks:
+            functions.append(activations[type(layer)])
         else:
             device = next(network.parameters()).device
             return lambda x: network(torch.from_numpy(x).to(device)).numpy(force=True)
@@ -436,14 +436,6 @@ def in_numpy(network):
         return x
 
     return call
-
-
-def linear(weight, bias, x):
-    """Return what nn.Linear returns."""
-    return weight @ x + bias
-
-
-IN_NUMPY = {nn.Tanh: np.tanh, nn.ReLU: lambda x: np.maximum(x, 0)}
 
 
 # THE RUN: environments, folder, signals. Three scripts have the same text; you may change one.
