@@ -374,9 +374,6 @@ def load_policy(run_dir, env=None):
     return make_policy(agent, observation_stats, env)
 
 
-# UPDATES: how a loss becomes a step of an optimizer, and a network a function in NumPy
-
-
 def updater(loss, network, optimizer, args):
     """Return update(*inputs) -> curves: one step of the optimizer on loss(network, *inputs).
 

@@ -322,15 +322,11 @@ def load_policy(run_dir, env=None):
     return actor.policy
 
 
-# UPDATES: how a loss becomes a step of an optimizer
-
-
 def updater(loss, network, optimizer, args):
     """Return update(*inputs) -> curves: one step of the optimizer on loss(network, *inputs).
 
     Numbers among the inputs may change from one update to the next. The optimizer may be any whose
-    step() needs no closure. Loss and gradient in one compiled graph take about 40 % less processor
-    time than a compiled loss and backward().
+    step() needs no closure. Loss and gradient in one compiled graph are faster than backward().
     """
     # functional_call takes a module, whose parameters it replaces: its forward() is the loss
     learned, device = nn.ModuleList([network]), next(network.parameters()).device
