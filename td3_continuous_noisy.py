@@ -179,8 +179,7 @@ class ReplayBuffer:
 
     def state_dict(self):
         """Return the filled rows, as tensors that share the buffer's memory."""
-        arrays = {name: getattr(self, name)[: self.size] for name in self.ARRAYS}
-        state = {name: torch.from_numpy(array) for name, array in arrays.items()}
+        state = {name: torch.from_numpy(getattr(self, name)[: self.size]) for name in self.ARRAYS}
         return state | {"position": self.position, "size": self.size}
 
     def load_state_dict(self, state):
