@@ -575,8 +575,7 @@ class Run:
         total = self.args.total_timesteps
         self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None, smoothing=0)
         self.saved_step, self.last_test = step, ""
-        self.first_step, self.begun = step, time.monotonic()
-        self.printed = self.begun  # when a line was
+        self.first_step, self.begun, self.printed = step, time.monotonic(), -math.inf
         self.processor_begun = time.process_time() - processor_seconds
         return step
 

@@ -388,7 +388,7 @@ def test_command_line(tmp_path):
     [run_dir] = tmp_path.iterdir()
     first, *lines, last, finished = result.out.splitlines()
     assert first.startswith(f"{run_dir} is trained; ")
-    assert len(lines) == 2  # not a terminal: plain lines, of each test
+    assert len(lines) == 3  # not a terminal: plain lines, the first at once, then of each test
     mean = read_json(run_dir / "result.json")["final_return_mean"]
     assert re.fullmatch(rf"step=60/60 sps=\d+ eval_return={mean:.2f}", last)
     assert finished.startswith(f"{run_dir} is finished after 60 steps: eval_return=")
