@@ -6,9 +6,6 @@ defaults of CleanRL's td3_continuous_action.py. The noise is that of Khraishi an
 
     python td3_continuous_noisy.py --env-id HalfCheetah-v5 --seed 1
     python td3_continuous_noisy.py --noise "RandomUniformScaleReward(0.5, 1.5)" --noise-rate 0.05
-
-Writes config.json, eval.csv, TensorBoard events, policy.pt and result.json into a folder in runs/.
-You can interrupt it at any time; run the same command again to resume.
 """
 
 import contextlib
@@ -182,8 +179,7 @@ class ReplayBuffer:
 
     def state_dict(self):
         """Return the filled rows, as tensors that share the buffer's memory."""
-        arrays = {name: getattr(self, name)[: self.size] for name in self.ARRAYS}
-        state = {name: torch.from_numpy(array) for name, array in arrays.items()}
+        state = {name: torch.from_numpy(getattr(self, name)[: self.size]) for name in self.ARRAYS}
         return state | {"position": self.position, "size": self.size}
 
     def load_state_dict(self, state):
@@ -325,29 +321,15 @@ def load_policy(run_dir, env=None):
     return actor.policy
 
 
-# UPDATES: how a loss becomes a step of an optimizer
-
-
-class Learned(nn.Module):
-    """loss(network, ...) as a module: functional_call needs one to differentiate."""
-
-    def __init__(self, loss, network):
-        super().__init__()
-        self.loss, self.network = loss, network
-
-    def forward(self, *inputs):
-        """Return what the loss returns."""
-        return self.loss(self.network, *inputs)
-
-
 def updater(loss, network, optimizer, args):
     """Return update(*inputs) -> curves: one step of the optimizer on loss(network, *inputs).
 
     Numbers among the inputs may change from one update to the next. The optimizer may be any whose
-    step() needs no closure. Loss and gradient in one compiled graph take about 40 % less processor
-    time than a compiled loss and backward().
+    step() needs no closure. Loss and gradient in one compiled graph are faster than backward().
     """
-    learned, device = Learned(loss, network), next(network.parameters()).device
+    # functional_call takes a module, whose parameters it replaces: its forward() is the loss
+    learned, device = nn.ModuleList([network]), next(network.parameters()).device
+    learned.forward = functools.partial(loss, network)
     parameters = {name: p for name, p in learned.named_parameters() if p.requires_grad}
     gradient_of = grad_and_value(functools.partial(functional_call, learned), has_aux=True)
     gradient_of = compiled(gradient_of) if args.compile else gradient_of
@@ -371,8 +353,7 @@ def updater(loss, network, optimizer, args):
     return update
 
 
-# THE RUN: environments, folder, signals. The three scripts have the same text, and you can change
-# one of them alone.
+# THE RUN: environments, folder, signals. Three scripts have the same text; you may change one.
 
 
 def fail(message, code=2):
@@ -475,21 +456,13 @@ class Run:
         if self.config["script_sha256"] != new["script_sha256"]:
             say("the script has changed since the run began; if it matters, use --exp-name")
         self.is_finished = (self.folder / "result.json").exists()
-        if self.is_finished:
-            self._delete("checkpoint.pt")  # left by a process that was killed before it did so
-        pairs = zip(args.noise, args.noise_rate, strict=True)
-        noises = " + ".join(f"{noise} at {rate}" for noise, rate in pairs) or "no noise"
-        begun = f"{self.config['algorithm']} on {args.env_id}, {noises}, seed {args.seed}"
-        begun += " (compiles first, which takes a while)" if args.compile else ""
-        say(f"{self.folder} is finished" if self.is_finished else f"{begun}: {self.folder}")
+        doing = "is finished" if self.is_finished else "is trained; Ctrl-C stops after an episode"
+        say(f"{self.folder} {doing}")
 
     def resume(self, state):
-        """Restore the last checkpoint of {name: object with a state_dict}; return its step, or 0.
-
-        A state_dict may hold tensors, NumPy's arrays and numbers, and Python's own types.
-        """
+        """Restore the last checkpoint of {name: part with state_dict()}; return its step, or 0."""
         self.state, self.eval_csv = state, "step,episode,episodic_return,episodic_length,success\n"
-        step, seconds, processor_seconds = 0, 0.0, 0.0
+        step, processor_seconds = 0, 0.0
         path = self.folder / "checkpoint.pt"
         if path.exists():
             with fail_on(Exception, f"cannot read {path} (--overwrite starts afresh)"):
@@ -502,7 +475,7 @@ class Run:
                     part.load_state_dict(checkpoint["state"][name])
             torch.set_rng_state(checkpoint["torch"])
             step, self.eval_csv = checkpoint["step"], checkpoint["eval_csv"]
-            seconds, processor_seconds = checkpoint["seconds"], checkpoint["processor_seconds"]
+            processor_seconds = checkpoint["processor_seconds"]
             say(f"resumed at step {step}")
         else:
             self._delete("events.out.tfevents.*")  # of a process killed before its first checkpoint
@@ -519,10 +492,8 @@ class Run:
             self._log_hyperparameters()
         total = self.args.total_timesteps
         self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None, smoothing=0)
-        self.saved_step, self.last_test, self.printed = step, "", time.monotonic()
-        self.learning_since = None  # the step and the time of the first losses
-        self.speed = 0.0  # steps per second since then
-        self.wall_begun = time.monotonic() - seconds
+        self.saved_step, self.last_test = step, ""
+        self.first_step, self.begun, self.printed = step, time.monotonic(), -math.inf
         self.processor_begun = time.process_time() - processor_seconds
         return step
 
@@ -532,8 +503,7 @@ class Run:
         table = "".join(f"|{name}|{value}|\n" for name, value in args.items())
         self.writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + table)
         metrics = ["eval/episodic_return_mean", "charts/episodic_return", "eval/success_rate"]
-        experiment, session_start, _ = hparams(args, dict.fromkeys(metrics, 0))
-        for summary in (experiment, session_start):
+        for summary in hparams(args, dict.fromkeys(metrics, 0)):
             self.writer.file_writer.add_summary(summary)
 
     def save(self, step):
@@ -544,7 +514,6 @@ class Run:
             "state": {name: part.state_dict() for name, part in self.state.items()},
             "torch": torch.get_rng_state(),
             "eval_csv": self.eval_csv,
-            "seconds": time.monotonic() - self.wall_begun,
             "processor_seconds": time.process_time() - self.processor_begun,
         }
         self._write("checkpoint.pt", checkpoint)
@@ -552,29 +521,23 @@ class Run:
 
     def log(self, step, **groups):
         """Log numbers as group/name to TensorBoard, and the speed; show the progress."""
-        tags, now = {}, time.monotonic()
+        now = time.monotonic()
+        speed = (step - self.first_step) / (now - self.begun)
+        tags = {"charts/SPS": speed}
         for group, values in groups.items():
             tags |= {f"{group}/{name}": float(value) for name, value in values.items()}
-        if "losses" in groups and self.learning_since:
-            first_step, since = self.learning_since
-            self.speed = tags["charts/SPS"] = (step - first_step) / (now - since)
-        elif "losses" in groups:  # the first ones: compiling does not count
-            self.learning_since = step, now
         if not all(map(math.isfinite, tags.values())):
-            reason = f"step {step}: training diverged, some values are not finite: {tags}"
-            raise noisy.NotFiniteError(reason)
+            raise noisy.NotFiniteError(f"step {step}: training diverged: {tags}")
         for tag, value in tags.items():
             self.writer.add_scalar(tag, value, step)
-        self._show_progress(step, now)
+        self._show_progress(step, speed, now)
 
-    def _show_progress(self, step, now):
+    def _show_progress(self, step, speed, now):
         """Move the bar of a terminal; elsewhere print a line after ten seconds, or after a test."""
         self.bar.update(step - self.bar.n)
         if self.bar.disable and now - self.printed > 10:
-            steps_left = self.bar.total - step
-            eta = tqdm.format_interval(steps_left / self.speed) if self.speed else "?"
             # analysis/logs.py reads this line
-            say(f"step={step}/{self.bar.total} sps={self.speed:.0f} {self.last_test}eta={eta}")
+            say(f"step={step}/{self.bar.total} sps={speed:.0f} {self.last_test}")
             self.printed = now
 
     def log_episode(self, step, info):
@@ -583,12 +546,8 @@ class Run:
         self.log(step, charts=charts | noisy.success_rate([noisy.outcome(info)]))
 
     def log_test(self, step, results, policy, due=None):
-        """Log the (N, 3) returns, lengths and outcomes of a test, and save the policy.
-
-        `due` is the step in eval.csv and policy_STEP.pt, if it is not `step`: PPO tests after whole
-        rollouts.
-        """
-        due = due or step
+        """Log the (N, 3) returns, lengths and outcomes of a test, and save the policy."""
+        due = due or step  # the step in eval.csv: PPO tests after whole rollouts
         for episode, (episodic_return, length, outcome) in enumerate(results.tolist()):
             success = "" if math.isnan(outcome) else int(outcome)
             self.eval_csv += f"{due},{episode},{episodic_return},{length:.0f},{success}\n"
@@ -601,35 +560,26 @@ class Run:
         success = noisy.success_rate(results[:, 2])
         self.result = {"final_return_mean": mean, "final_return_std": std}
         self.result |= {f"final_{name}": rate for name, rate in success.items()}
-        self.last_test, self.printed = f"eval_return={mean:.2f} ", -math.inf  # print a line now
+        self.last_test, self.printed = f"eval_return={mean:.2f}", -math.inf  # print a line now
         self.bar.set_description_str(self.last_test)
         test = {"episodic_return_mean": mean, "episodic_return_std": std}
         self.log(step, eval=test | {"episodic_length_mean": length} | success)
 
     def finish(self, step):
         """Write result.json, last of all, and delete the checkpoint."""
-        _, _, session_end = hparams({}, {})  # HPARAMS shows the run as successful
-        self.writer.file_writer.add_summary(session_end)
         self.writer.close()
         self.bar.close()
         noises = noisy.noise_wrappers(self.env).items()
         returns = self.env.get_wrapper_attr("return_queue")  # of the last 100 training episodes
-        seconds = time.monotonic() - self.wall_begun
         self.result |= {
-            "final_return_n": self.args.eval_episodes,
-            "total_timesteps": self.args.total_timesteps,
             "trained_timesteps": step,  # PPO: whole rollouts
             "train_return_mean_last_100": np.mean(returns) if returns else None,
-            "steps_per_second": step / seconds,
-            "wall_time_seconds": seconds,
             "processor_seconds": time.process_time() - self.processor_begun,
-            "noise_applied_fraction": {name: noise.applied_fraction for name, noise in noises},
             "noise_applied": {name: [w.times_applied, w.opportunities] for name, w in noises},
         }
         self._write("result.json", json.dumps(self.result, indent=2) + "\n")
         self._delete("checkpoint.pt")
-        say(f"{self.folder} is finished after {step} steps: {self.last_test.rstrip()}")
-        say(f"See its curves with: tensorboard --logdir {self.args.runs_dir}")
+        say(f"{self.folder} is finished after {step} steps: {self.last_test}")
 
     def _delete(self, *patterns):
         for pattern in patterns:
@@ -650,7 +600,7 @@ class Run:
 
 
 def read_state(file):
-    """Read a checkpoint that may hold arrays and numbers of NumPy, but never code."""
+    """Read a checkpoint that may hold tensors, arrays and numbers of NumPy, but never code."""
     multiarray = np._core.multiarray
     types = [np.ndarray, np.dtype, bytes, multiarray._reconstruct, multiarray.scalar]
     types += {type(np.dtype(code)) for code in np.typecodes["All"]}
@@ -660,18 +610,14 @@ def read_state(file):
 
 def stop_at_signals():
     """Answer signals at the end of an episode: return stop() -> the first one's number, or 0."""
-    received, script_pid = [], os.getpid()
+    received, script = [], os.getpid()
 
     def remember(number, frame):
         received.append(number)
-        # a process that the environment forked: the episode that goes on needs it
-        is_worker = os.getpid() != script_pid
-        is_second_ctrl_c = number == signal.SIGINT and len(received) > 1
-        if is_second_ctrl_c or (is_worker and number != signal.SIGINT):
+        if number == signal.SIGINT:  # a terminal sends it to the environment's workers, too
+            signal.signal(number, signal.SIG_DFL)  # a second one ends all processes at once
+        elif os.getpid() != script:  # a worker that was forked and is told to end
             os._exit(128 + number)
-        if not is_worker:
-            with contextlib.suppress(OSError):  # print() is not safe in here
-                os.write(1, b"stopping after this episode; Ctrl-C again: without a checkpoint\n")
 
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         if signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP

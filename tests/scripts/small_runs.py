@@ -137,8 +137,7 @@ def outcome(run_dir):
     for tag, values in logged.items():
         steps = [step for step, _ in values]
         assert steps == sorted(set(steps)), tag  # each once
-    for timing in ("steps_per_second", "wall_time_seconds", "processor_seconds"):
-        assert result.pop(timing) > 0
+    assert result.pop("processor_seconds") > 0
     tensors = {name: torch.as_tensor(x).numpy().tobytes() for name, x in policy(run_dir).items()}
     files = {name: (run_dir / name).read_bytes() for name in ("eval.csv", "policy.pt")}
     return logged | tensors | files | {"result": result}

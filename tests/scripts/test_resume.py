@@ -305,15 +305,14 @@ def test_stopped_and_resumed_it_ends_as_if_left_alone(
     assert not differing(outcome(run(algorithm, tmp_path, **hopper(algorithm))), alone(algorithm))
 
 
-def test_times_are_those_of_all_sessions_and_the_speed_that_of_this_one(stopped, capsys):
+def test_processor_seconds_are_those_of_all_sessions(stopped, capsys):
     checkpoint = ppo.read_state(stopped / "checkpoint.pt")
-    torch.save(checkpoint | {"seconds": 1e6, "processor_seconds": 2e6}, stopped / "checkpoint.pt")
+    torch.save(checkpoint | {"processor_seconds": 2e6}, stopped / "checkpoint.pt")
     run("PPO", stopped.parent, **hopper("PPO"))
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("step=")]
     step, speed, *_ = lines[-1].split()
-    assert step == "step=240/260" and int(speed.removeprefix("sps=")) > 0  # and not 240 / 1e6
-    result = read_json(stopped / "result.json")
-    assert result["wall_time_seconds"] > 1e6 and result["processor_seconds"] > 2e6
+    assert step == "step=240/260" and int(speed.removeprefix("sps=")) > 0
+    assert read_json(stopped / "result.json")["processor_seconds"] > 2e6
 
 
 class Part:

@@ -58,7 +58,7 @@ def test_what_the_scripts_share_is_word_for_word_the_same():
     for one, other in itertools.combinations((sac, td3, ppo), 2):
         found, others = definitions(one), definitions(other)
         common = found.keys() & others.keys()
-        assert {"make_env", "Learned", "updater", "Run", "train"} <= common
+        assert {"make_env", "updater", "Run", "train"} <= common
         differ = {name for name in common if found[name] != others[name]}
         assert differ <= by_design | ({"mlp", "updater"} if other is ppo else set())
     assert sac.TEST_SEED == td3.TEST_SEED == ppo.TEST_SEED
@@ -116,15 +116,12 @@ def test_run_folder(tmp_path, capsys):
     result = read_json(run_dir / "result.json")
     assert result["final_return_mean"] == pytest.approx(last.mean())
     assert result["final_return_std"] == pytest.approx(last.std(ddof=1))
-    assert result["final_return_n"] == 3
-    assert result["total_timesteps"] == result["trained_timesteps"] == 60
-    assert result["steps_per_second"] == pytest.approx(60 / result["wall_time_seconds"])
-    applied, counts = result["noise_applied_fraction"], result["noise_applied"]
-    names = ["RandomEarlyTermination", "RandomNormalNoisyReward"]
-    assert list(applied) == list(counts) == names
+    assert result["trained_timesteps"] == 60
+    counts = result["noise_applied"]
+    assert list(counts) == ["RandomEarlyTermination", "RandomNormalNoisyReward"]
     assert counts["RandomNormalNoisyReward"][1] == 60  # steps; of the other, episodes
-    for name, rate in zip(names, (0.25, 0.5), strict=True):
-        assert applied[name] == counts[name][0] / counts[name][1] == pytest.approx(rate, abs=0.3)
+    for (applied, of), rate in zip(counts.values(), (0.25, 0.5), strict=True):
+        assert applied / of == pytest.approx(rate, abs=0.3)
 
     # the same again, in another spelling: finished, and nothing is written
     before = {path: path.stat().st_mtime_ns for path in run_dir.iterdir()}
@@ -222,8 +219,7 @@ def test_overwrite_of_nothing_and_a_short_run(algorithm, tmp_path):
 def test_ppo_evaluates_at_the_end_of_rollouts_under_the_nominal_step(tmp_path):
     rollouts = {"num_steps": 16, "num_minibatches": 2, "eval_episodes": 1}
     run_dir = run("PPO", tmp_path / "seldom", total_timesteps=100, eval_frequency=20, **rollouts)
-    result = read_json(run_dir / "result.json")
-    assert (result["total_timesteps"], result["trained_timesteps"]) == (100, 96)
+    assert read_json(run_dir / "result.json")["trained_timesteps"] == 96
     # rollouts end at 16, 32, ..., 96; 100 is what was asked for
     assert [row[0] for row in evaluations(run_dir)] == [20, 40, 60, 80, 100]
     tests = [step for step, _ in curves(run_dir)["eval/episodic_return_mean"]]
@@ -274,7 +270,7 @@ BAD = [  # arguments, what the line names
     ({"seed": -1}, "--seed must be at least 0, not -1\n"),
     ({"gamma": 1.1}, "--gamma must be at most 1, not 1.1\n"),
     ({"gamma": math.nan}, "--gamma must be at least 0, not nan\n"),
-    ({"num_steps": 61}, "--num-steps must be from 2 * --num-minibatches (6) to"),
+    ({"num_steps": 61}, "--num-steps must be from 2 * --num-minibatches to --total-timesteps"),
     ({"num_minibatches": 13}, "--num-steps must be from"),
 ]
 BAD += [] if torch.cuda.is_available() else [({"cuda": True}, "--cuda: PyTorch finds no GPU")]
@@ -357,8 +353,8 @@ def test_curves(algorithm, tmp_path):
     assert list(np.cumsum(list(lengths.values()))) == list(lengths) and len(lengths) > 15
     for tag in losses:
         assert list(values[tag]) == ([*range(12, 121, 12)] if algorithm == "PPO" else [100, 120])
-    for name, fraction in result["noise_applied_fraction"].items():
-        assert values[f"noise/{name}/applied_fraction"][120] == pytest.approx(fraction)
+    for name, (applied, of) in result["noise_applied"].items():
+        assert values[f"noise/{name}/applied_fraction"][120] == pytest.approx(applied / of)
     speeds = EventAccumulator(str(run_dir)).Reload().Scalars("charts/SPS")
     assert min(speed.value for speed in speeds) > 0 and speeds[-1].step == 120
 
@@ -390,12 +386,12 @@ def test_command_line(tmp_path):
     result = command("PPO", *flags(args))
     assert (result.code, result.err) == (0, "")
     [run_dir] = tmp_path.iterdir()
-    first, *lines, last, finished, tensorboard = result.out.splitlines()
-    assert all(text in first for text in ("PPO", "NoLimit-v0", *NOISES, "0.25", str(run_dir)))
-    assert len(lines) == 2  # not a terminal: plain lines, of each test
+    first, *lines, last, finished = result.out.splitlines()
+    assert first.startswith(f"{run_dir} is trained; ")
+    assert len(lines) == 3  # not a terminal: plain lines, the first at once, then of each test
     mean = read_json(run_dir / "result.json")["final_return_mean"]
-    assert re.fullmatch(rf"step=60/60 sps=\d+ eval_return={mean:.2f} eta=00:00", last)
-    assert f"{run_dir} is finished" in finished and str(tmp_path) in tensorboard
+    assert re.fullmatch(rf"step=60/60 sps=\d+ eval_return={mean:.2f}", last)
+    assert finished.startswith(f"{run_dir} is finished after 60 steps: eval_return=")
     again = command("PPO", *flags(args))
     assert (again.code, again.out, again.err) == (0, f"{run_dir} is finished\n", "")
 
