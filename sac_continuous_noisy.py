@@ -6,6 +6,9 @@ defaults of CleanRL's sac_continuous_action.py. The noise is that of Khraishi an
 
     python sac_continuous_noisy.py --env-id HalfCheetah-v5 --seed 1
     python sac_continuous_noisy.py --noise "RandomUniformScaleReward(0.5, 1.5)" --noise-rate 0.05
+
+Writes config.json, eval.csv, TensorBoard events, policy.pt and result.json into a folder in runs/.
+You can interrupt it at any time; run the same command again to resume.
 """
 
 import contextlib
