@@ -613,14 +613,18 @@ def read_state(file):
 
 def stop_at_signals():
     """Answer signals at the end of an episode: return stop() -> the first one's number, or 0."""
-    received, script = [], os.getpid()
+    received, script_pid = [], os.getpid()
 
     def remember(number, frame):
         received.append(number)
-        if number == signal.SIGINT:  # a terminal sends it to the environment's workers, too
-            signal.signal(number, signal.SIG_DFL)  # a second one ends all processes at once
-        elif os.getpid() != script:  # a worker that was forked and is told to end
+        # a process that the environment forked: the episode that goes on needs it
+        is_worker = os.getpid() != script_pid
+        is_second_ctrl_c = number == signal.SIGINT and len(received) > 1
+        if is_second_ctrl_c or (is_worker and number != signal.SIGINT):
             os._exit(128 + number)
+        if not is_worker:
+            with contextlib.suppress(OSError):  # print() is not safe in here
+                os.write(1, b"stopping after this episode; Ctrl-C again: without a checkpoint\n")
 
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         if signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP

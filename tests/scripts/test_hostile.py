@@ -119,6 +119,7 @@ def test_a_signal_ends_the_episode_and_then_all_processes(tmp_path, log, capsys)
     short = {"total_timesteps": 120}
     result = commands.ended(start(tmp_path / "runs", (STEP, 50, terminate), **short))
     assert (result.code, result.err) == (143, "")
+    assert result.out.count("stopping after this episode") == 1  # not of the workers, too
     assert_closed(log())
     stopped = run("PPO", tmp_path / "runs", **HOSTILE | short)
     assert "resumed at step" in capsys.readouterr().out
@@ -143,7 +144,7 @@ def interrupt_twice(*args):
 
 @pytest.mark.slow
 def test_a_second_ctrl_c_ends_the_workers_too(tmp_path, log):
-    assert commands.ended(start(tmp_path, (STEP, 50, interrupt_twice))).code == -signal.SIGINT
+    assert commands.ended(start(tmp_path, (STEP, 50, interrupt_twice))).code == 128 + signal.SIGINT
     workers = [int(line.split()[1]) for line in log() if line.startswith("worker")]
     for _ in range(50):
         time.sleep(0.1 * any(map(is_alive, workers)))
@@ -178,6 +179,7 @@ def test_ctrl_c_on_a_terminal_leaves_the_workers_at_work_until_the_checkpoint(tm
     terminal.wait_for(b"again to resume")
     assert commands.ended(terminal.process).code == 130
     assert b"Traceback" not in terminal.shown
+    assert terminal.shown.count(b"stopping after this episode") == 1  # not of the workers, too
     assert (folder(tmp_path) / "checkpoint.pt").exists()
     assert_closed(log())
     os.close(terminal.slave)
