@@ -541,8 +541,8 @@ class Run:
         if self.config["script_sha256"] != new["script_sha256"]:
             say("the script has changed since the run began; if it matters, use --exp-name")
         self.is_finished = (self.folder / "result.json").exists()
-        doing = "is finished" if self.is_finished else "is trained; Ctrl-C stops after an episode"
-        say(f"{self.folder} {doing}")
+        begun = "compiling, which takes a while, then training" if args.compile else "training"
+        say(f"{self.folder} is finished" if self.is_finished else f"{begun}: {self.folder}")
 
     def resume(self, state):
         """Restore the last checkpoint of {name: part with state_dict()}; return its step, or 0."""

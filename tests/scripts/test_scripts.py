@@ -387,7 +387,7 @@ def test_command_line(tmp_path):
     assert (result.code, result.err) == (0, "")
     [run_dir] = tmp_path.iterdir()
     first, *lines, last, finished = result.out.splitlines()
-    assert first.startswith(f"{run_dir} is trained; ")
+    assert first == f"training: {run_dir}"
     assert len(lines) == 3  # not a terminal: plain lines, the first at once, then of each test
     mean = read_json(run_dir / "result.json")["final_return_mean"]
     assert re.fullmatch(rf"step=60/60 sps=\d+ eval_return={mean:.2f}", last)
