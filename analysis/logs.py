@@ -53,8 +53,7 @@ def read_log(folder):
     end = END.fullmatch(lines[-1]) if lines else None
     steps = [found.groups() for found in map(PROGRESS.match, lines) if found]
     step, steps_per_second = map(int, steps[-1]) if steps else (0, 0)
-    # "(" begins the notes that the scripts leave below a traceback
-    own = [line for line in lines if re.search(r"\w", line) and not line.startswith(("# ", "("))]
+    own = [line for line in lines if re.search(r"\w", line) and not line.startswith("# ")]
     age = time.time() - status.st_mtime
     last_line = own[-1].strip() if own else ""
     return Log(path, age, step, steps_per_second, int(end[1]) if end else None, last_line)
