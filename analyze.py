@@ -69,7 +69,9 @@ class Args:
 
 
 def no_finished_run(runs_dir):
-    """End with an error that says where there are finished runs, if that is below `runs_dir`."""
+    """End with an error that says where there are finished runs, if that is near `runs_dir`."""
+    if is_run(runs_dir):
+        fail(f"{runs_dir} is a run itself: name the folder that it is in")
     folders = {path.parents[1] for path in runs_dir.glob("*/**/result.json") if is_run(path.parent)}
     folders = sorted({str(path.parent if is_phase(path) else path) for path in folders})
     where = f"; there are some in {', '.join(folders)}: name it with --runs-dir" if folders else ""
@@ -271,8 +273,9 @@ def main(args):
     except ValueError as error:
         fail(error)
     out = Path(os.path.expanduser(args.out or args.runs_dir / "results"))
-    if out.resolve() == args.runs_dir.resolve() or is_run(out):  # where other tables may be
-        fail("--out must be a folder of its own, not that of the runs or of one of them")
+    others = (args.runs_dir.resolve(), Path.cwd())
+    if out.resolve() in others or is_run(out):  # where other tables may be
+        fail("--out must be a folder of its own, not the current one or one with runs")
     entries = read_runs(args.runs_dir)
     results = analyse(args, entries, choice)
     try:

@@ -50,6 +50,7 @@ counts in halves of each dimension's range.
 import ast
 import contextlib
 import copy
+import difflib
 import functools
 import hashlib
 import importlib
@@ -1193,7 +1194,8 @@ def _read_noise(text: str) -> Noise:
     module, name, args, kwargs = _read_call(text)
     wrapper = _import_wrapper(module, name, text) if module else WRAPPERS.get(name)
     if wrapper is None:
-        raise _bad_noise(text, "unknown name")
+        near = [f" (did you mean {x}?)" for x in difflib.get_close_matches(name, WRAPPERS, n=1)]
+        raise _bad_noise(text, "unknown name" + "".join(near))
     signature = inspect.signature(wrapper)
     try:
         given = signature.bind(None, 1.0, *args, **kwargs).arguments
@@ -2062,6 +2064,8 @@ def canonical_arguments(args: Mapping[str, Any]) -> dict[str, Any]:
     _check_numbers(args)
     if args["exp_name"] in ("", ".", ".."):
         raise ValueError(f"--exp-name must be a name, not {args['exp_name']!r}")
+    if not args["runs_dir"]:
+        raise ValueError("--runs-dir must be a path, not ''")
     parse_env_kwargs(args["env_kwargs"])
     noises, rates = Configuration.read(args["noise"], args["noise_rate"]).texts
     tests = read_test_noise(args["test_noise"], args["test_noise_rate"]).for_tests()

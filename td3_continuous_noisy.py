@@ -371,7 +371,7 @@ def fail_on(errors, message, code=2):
     try:
         yield
     except errors as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = " ".join(str(error).split())[:300] or type(error).__name__
         fail(f"{message}: {reason}", code)
 
 
@@ -483,7 +483,9 @@ class Run:
         else:
             self._delete("events.out.tfevents.*")  # of a process killed before its first checkpoint
             for name, part in state.items():  # fail now, and not when the run is resumed
-                with fail_on(Exception, f"the state of {name!r} cannot be saved and read back"):
+                with fail_on(
+                    Exception, f"{name!r} needs a state_dict() of tensors, arrays, numbers"
+                ):
                     file = io.BytesIO()
                     torch.save(part.state_dict(), file)
                     read_state(io.BytesIO(file.getvalue()))

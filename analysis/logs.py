@@ -54,6 +54,8 @@ def read_log(folder):
     steps = [found.groups() for found in map(PROGRESS.match, lines) if found]
     step, steps_per_second = map(int, steps[-1]) if steps else (0, 0)
     own = [line for line in lines if re.search(r"\w", line) and not line.startswith("# ")]
+    while len(own) > 1 and own[-1].startswith("│") and not own[-2].startswith("╭"):
+        own.pop()  # a box, in which tyro tells what is wrong with an argument: its first line
     age = time.time() - status.st_mtime
-    last_line = own[-1].strip() if own else ""
+    last_line = own[-1].strip(" │") if own else ""
     return Log(path, age, step, steps_per_second, int(end[1]) if end else None, last_line)

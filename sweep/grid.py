@@ -119,7 +119,7 @@ def configurations(args, algorithm, env_id):
     entries, rates = [[pair] for pair in pairs], []
     if args.noises or args.noise_rates:
         entries = args.noises or [[(noise, None)] for noise in dict(pairs)]
-        rates = args.noise_rates or list(dict.fromkeys(own for _, own in pairs))
+        rates = args.noise_rates or list(dict.fromkeys(own for _, own in args.pairs or []))
     crossed = [pairs for pairs in entries if any(rate is None for _, rate in pairs)]
     if crossed and not rates:
         for pairs in crossed:

@@ -31,16 +31,15 @@ def trains(trial):
 def acts(trial):
     """The policy that acts is the one that learns."""
     with mock.patch.multiple(torch, randn=watched_run.zeros, randn_like=torch.zeros_like):
-        run = trial.train("mean_actions")  # in training, too
-    check(run.gaps, "no action follows a test within an episode: see TEST in learn()")
-    gap, policy = max(run.gaps), run.script.load_policy(run.folder)
-    advice = "act alike in both (or test another policy on purpose), draw noise by torch.randn"
+        run = trial.train("mean_actions", env_id=trial.lopsided)  # no noise in training, either
+        check(run.gaps, "no action follows a test within an episode: see TEST in learn()")
+        gaps = watched_run.gaps_in_losses(run, run.script.load_policy(run.folder))
+    gap, advice = max(run.gaps), "act alike in both (or on purpose not); draw noise by torch.randn"
     check(gap < 1e-4, f"actions in training are {gap:.2g} from those of load_policy(): {advice}")
-    gaps = watched_run.gaps_in_losses(run, policy)
     check(gaps, "policy.pt has no network that an update learns: give log_test() that one")
     for name, gap in gaps.items():
-        text = f"{name}() learns actions {gap:.2g} from those of the policy"
-        check(gap < 1e-4, f"{text}: let both call the same method of the network")
+        advice = "let both call the same method of the network"
+        check(gap < 1e-4, f"{name}() learns actions {gap:.2g} from those of the policy: {advice}")
 
 
 def learns(trial):
@@ -55,15 +54,16 @@ def learns(trial):
 
 def follows(trial):
     """Targets follow the networks that learn."""
-    stays = ", ".join(watched_run.left_behind(trial.run))
-    check(not stays, f"{stays} never changes (parameters() has no buffers)")
+    problems = "; ".join(watched_run.left_behind(trial.run))
+    check(not problems, problems)
 
 
 def resumes(trial):
     """Stopped and resumed, a run ends with the same bytes."""
     for name in ("eval.csv", "policy.pt"):
         same = trial.read(trial.resumed, name) == trial.read(trial.run, name)
-        check(same, f"another {name}: put all that training changes into `state`, see RESUME")
+        missing = "put all that training changes into `state`; draw by torch, rng or env alone"
+        check(same, f"another {name}: {missing}")
 
 
 def tests(trial):
@@ -83,7 +83,8 @@ def compiles(trial):
     for update, other in zip(trial.run.updates, run.updates, strict=False):
         for name, value in update.first.items():
             gap = (other.first[name] - value).abs().max() / value.abs().max().clamp(0.1)
-            check(gap < 1e-4, f"{name} of {update.name}() by {gap:.2g} of it: use plain PyTorch")
+            where = f"{name} of {update.name}() by {gap:.2g} of it"
+            check(gap < 1e-4, f"{where}: use plain PyTorch; draw random numbers before the loss")
 
 
 def options(trial):
@@ -98,10 +99,9 @@ def options(trial):
 
 def sweeps(trial):
     """The sweep knows the script."""
-    words = ["custom", "--algos", trial.algorithm, "--envs", "Pendulum-v1", "--seeds", "1"]
+    words = ["custom", "--algos", trial.algorithm, "--envs", trial.run.args.env_id, "--seeds", "1"]
     words += ["--total-timesteps", "150", "--runs-dir", trial.folder / "swept", "--dry-run"]
-    words += ["--", *trial.own_options] if trial.own_options else []
-    out = trial.command(ROOT / "benchmark.sh", *words)
+    out = trial.command(ROOT / "benchmark.sh", *words, "--", *trial.own_options)
     check(trial.path.name in out, "benchmark.sh --dry-run shows no command with this script")
 
 
@@ -126,8 +126,8 @@ PROMISES += [sweeps, evaluates, analyses]
 def main(path="", *options):
     """Print a line for each promise; return the exit status."""
     if not (Path(path).name.endswith("_continuous_noisy.py") and Path(path).is_file()):
-        wrong = f"error: {path!r} is no script NAME_continuous_noisy.py\n\n"
-        print(__doc__ if path[:1] == "-" else wrong + __doc__)
+        wrong = f"error: there is no file {path}, or its name is not NAME_continuous_noisy.py"
+        print(__doc__ if path[:1] in ("", "-") else wrong, file=sys.stderr)
         return 2
     kept = True
     with tempfile.TemporaryDirectory() as folder:

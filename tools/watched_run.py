@@ -13,13 +13,16 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import gymnasium as gym
 import numpy as np
 import torch
 import tyro
+from torch.overrides import TorchFunctionMode
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import noisy_wrappers as noisy  # noqa: E402
+from sweep.options import GIVEN_BY_THE_GRID  # noqa: E402
 
 # A test and the end of a rollout fall within an episode; the buffer is filled twice.
 SMALL = {"env_id": "Pendulum-v1", "total_timesteps": 150, "max_episode_steps": 20}
@@ -30,6 +33,32 @@ SMALL |= {"num_steps": 50, "num_minibatches": 2, "update_epochs": 2}
 
 class BrokenError(Exception):
     """A promise is broken: what is wrong, and what to do."""
+
+
+class Lopsided(gym.Env):
+    """A walk in the plane. Its two actions have other bounds, which are not centred at 0.
+
+    What is wrong in the second action, or in the bounds, does not show on Pendulum-v1.
+    """
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,))
+    low, high = np.array([[-1, -2], [1, 3]], np.float32)
+    action_space = gym.spaces.Box(low, high)
+
+    def reset(self, *, seed=None, options=None):
+        """Begin at a random place."""
+        super().reset(seed=seed)
+        self.place = self.np_random.normal(size=2).astype(np.float32)
+        return self.place.copy(), {}
+
+    def step(self, action):
+        """Move, and lose what the place is away from 0."""
+        noise = self.np_random.normal(size=2).astype(np.float32)
+        self.place = 0.5 * self.place + action + 0.1 * noise
+        return self.place.copy(), -float(abs(self.place).sum()), False, False, {}
+
+
+gym.register("Lopsided-v0", Lopsided, max_episode_steps=20)
 
 
 def zeros(*size, generator=None, **options):
@@ -47,14 +76,13 @@ class Trial:
     """A script, options of its own, and a folder to try it in."""
 
     def __init__(self, path, options, folder):
-        self.path, self.folder, self.options = path, folder, []
-        for word in options:  # "--name value" is the same as "--name=value"
-            self.options += word.split("=", 1) if word.startswith("--") else [word]
+        self.path, self.options, self.folder = path, options, folder
         self.algorithm = path.name.removesuffix("_continuous_noisy.py").lower()
-        self.own_options = self.options.copy()  # without what belongs to the grid of a sweep
-        if "--total-timesteps" in self.options:
-            steps = self.options.index("--total-timesteps")
-            del self.own_options[steps : steps + 2]
+        self.own_options, in_grid = [], False  # without those that a sweep's grid sets
+        for word in options:
+            if word.startswith("--"):
+                in_grid = word.partition("=")[0].replace("_", "-") in GIVEN_BY_THE_GRID
+            self.own_options += [] if in_grid else [word]
 
     def train(self, name, **kwargs):
         """Return a short run, watched, in a folder of runs."""
@@ -64,9 +92,15 @@ class Trial:
         """Return whether the finished run is refused with other arguments."""
         try:
             self.train("whole", **changed)
-        except BrokenError:
+        except Exception:  # the script may check its own options
             return True
         return False
+
+    @property
+    def lopsided(self):
+        """The environment in which actions are compared, if the options name none."""
+        env_id = self.run.args.env_id
+        return "Lopsided-v0" if env_id == SMALL["env_id"] else env_id
 
     @functools.cached_property
     def run(self):
@@ -147,14 +181,23 @@ def other_values(args):
 def watch_updates(updater, seen):
     """Return a script's updater, which notes what it updates."""
 
-    def watched_updater(loss, network, *others):
-        update, name = updater(loss, network, *others), getattr(loss, "__name__", "a loss")
+    def watched_updater(loss, network, optimizer, *others):
+        update = updater(loss, network, optimizer, *others)
         parameters = {name: p for name, p in network.named_parameters() if p.requires_grad}
         before = {name: p.detach().clone() for name, p in parameters.items()}
-        own = SimpleNamespace(name=name, loss=loss, network=network, parameters=parameters)
+        own = SimpleNamespace(name=getattr(loss, "__name__", "a loss"), loss=loss, network=network)
+        own.parameters, known = parameters, set(map(id, network.parameters()))
+        stepped = {id(p) for group in optimizer.param_groups for p in group["params"]}
+        text = f"the optimizer of {own.name}() also steps {len(stepped - known)} tensors of others"
+        check(
+            stepped <= known, f"{text}, by old gradients: give it this network's parameters alone"
+        )
         seen.updaters += 1
 
         def watched(*inputs):
+            if not hasattr(own, "first"):
+                with noisy.kept_generators(), Broadcasts(own.name):
+                    loss(network, *inputs)
             curves, own.inputs = update(*inputs), inputs
             moved = {id(p) for p in parameters.values() if p.grad is not None and p.grad.any()}
             seen.with_gradient |= moved
@@ -169,21 +212,44 @@ def watch_updates(updater, seen):
     return watched_updater
 
 
+class Broadcasts(TorchFunctionMode):
+    """Refuses to make (B, B) of (B, 1) and (B,), the quietest of all mistakes in a loss."""
+
+    def __init__(self, name):
+        super().__init__()
+        self.name = name
+
+    def __torch_function__(self, function, types, args=(), kwargs=None):
+        """Call a function of PyTorch."""
+        result = function(*args, **(kwargs or {}))
+        shapes = {tuple(x.shape) for x in args if torch.is_tensor(x)}
+        for n in {shape[0] for shape in shapes if len(shape) == 1 and shape[0] > 1}:
+            is_loss = function.__name__.endswith("_loss")  # returns the mean of them
+            if shapes == {(n,), (n, 1)} and (is_loss or result.shape == (n, n)):
+                text = f"{self.name}() makes ({n}, {n}) of ({n}, 1) and ({n},)"
+                raise BrokenError(f"{text}: give both the same shape, as squeeze(1) does")
+        return result
+
+
 def watch_actions(learn, seen):
     """Return a script's learn(), which compares actions with the policy of the last test."""
 
     def watched_learn(args, env, *others):
-        step, policy_pt, written, observation = env.step, seen.folder / "policy.pt", 0, None
+        step, policy_pt, written = env.step, seen.folder / "policy.pt", 0
+        observation = given = None
 
         def watched_step(action):
-            nonlocal written, observation
+            nonlocal written, observation, given
+            advice = "learn() changes an observation in place, and stores that: change a copy"
+            check(observation is None or np.array_equal(observation, given), advice)
             time = policy_pt.stat().st_mtime_ns if policy_pt.exists() else 0
             if time != written and observation is not None:  # nothing was learned since the test
                 with noisy.kept_generators():
                     wanted = seen.script.load_policy(seen.folder)(observation)
                 seen.gaps.append(np.abs(wanted - action).max())
             written, result = time, step(action)
-            observation = None if result[2] or result[3] else result[0]
+            given = None if result[2] or result[3] else result[0]
+            observation = copy.copy(given)
             seen.observations.add(np.float32(result[0]).tobytes())
             return result
 
@@ -205,20 +271,27 @@ def watch_networks(resume, seen):
 
 
 def left_behind(seen):
-    """Yield the tensors of targets that have not moved, as those of the learned networks have.
+    """Yield what is wrong with targets: the networks in the state that no update learns.
 
-    A target is a network in the state that no update learns, with the tensors of one that is. What
-    is to stay as it is needs no place in the state.
+    The tensors of a target move as those of the learned network do that it is a copy of; of another
+    one, all parameters move. What is to stay as it is needs no place in the state.
     """
     learned = [update.network for update in seen.updates]
+    places = {}
     for name, (network, begun) in seen.networks.items():
+        if network in places:
+            yield f"{name!r} is {places[network]!r} itself: copy it"
+        places.setdefault(network, name)
+        if network in learned:
+            continue
+        moving, of = {key for key, _ in network.named_parameters()}, ""
         for other, (leader, leader_begun) in seen.networks.items():
-            is_target = leader in learned and network not in learned
-            if is_target and network.state_dict().keys() == leader.state_dict().keys():
-                for key, value in network.state_dict().items():
-                    moves = not torch.equal(leader.state_dict()[key], leader_begun[key])
-                    if moves and torch.equal(value, begun[key]):
-                        yield f"{key} of {name!r}, a copy of {other!r}"
+            if leader in learned and leader.state_dict().keys() == begun.keys():
+                after, of = leader.state_dict(), f", a copy of {other!r},"
+                moving = {key for key in begun if not torch.equal(after[key], leader_begun[key])}
+        for key, value in network.state_dict().items():
+            if key in moving and torch.equal(value, begun[key]):
+                yield f"{key} of {name!r}{of} never changes (parameters() has no buffers)"
 
 
 def is_saved(network, seen):

@@ -62,7 +62,7 @@ def test_nothing_to_read_or_no_place_to_write_is_an_error(case, tmp_path, capsys
     assert ("unfinished" in printed.out) == (case == "none finished")
 
 
-def test_results_go_beside_the_runs(tmp_path):
+def test_results_go_beside_the_runs(tmp_path, monkeypatch):
     write_run(tmp_path / "runs", [1])
     for _ in range(2):  # its own results are renewed
         main(analyze.Args(runs_dir=tmp_path / "runs"))
@@ -70,6 +70,17 @@ def test_results_go_beside_the_runs(tmp_path):
     with pytest.raises(SystemExit):
         main(analyze.Args(runs_dir=tmp_path / "runs", out=tmp_path / "results/../runs"))
     assert not (tmp_path / "runs/best.csv").exists()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit):
+        main(analyze.Args(runs_dir=tmp_path / "runs", out=Path("")))
+    assert not (tmp_path / "best.csv").exists()
+
+
+def test_a_run_is_no_folder_of_runs(tmp_path, capsys):
+    folder = write_run(tmp_path, [1])
+    with pytest.raises(SystemExit):
+        main(analyze.Args(runs_dir=folder))
+    assert capsys.readouterr().err.endswith("is a run itself: name the folder that it is in\n")
 
 
 @pytest.mark.parametrize(

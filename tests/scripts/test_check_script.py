@@ -64,8 +64,20 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
         before("    target_entropy = -", "first = copy.deepcopy(actor.state_dict())"),
         ('{"actor": actor.state_dict()}', '{"actor": first}'),
     ],
+    ("acts", "sac", "from those of the policy"): [  # in the second dimension
+        ("        return actions, log", "        return squashed * self.action_scale, log")
+    ],
+    ("trains", "sac", "also steps 12 tensors of others"): [
+        ("Adam(actor.parameters(), ", "Adam([*actor.parameters(), *critic.parameters()], ")
+    ],
+    ("trains", "td3", "changes an observation in place"): [
+        before("            action = actor.policy(observation, eps)", "observation += 0.1")
+    ],
+    ("trains", "td3", "makes (16, 16) of (16, 1) and (16,)"): [(".squeeze(1) for", " for")],
     ("learns", "ppo", "no gradient of critic."): [(" + args.vf_coef * value_loss, c", ", c")],
-    ("learns", "sac", "critic_loss() never changes"): [("Adam(critic.", "Adam(target.")],
+    ("learns", "sac", "critic_loss() never changes"): [
+        ("lr=args.q_lr, fused=True)\n    actor", "lr=0.0)\n    actor")
+    ],
     ("follows", "td3", "network.0.weight of 'target_actor'"): [
         ("target_parameters = [*target_actor.parameters(), ", "target_parameters = ["),
         ("online_parameters = [*actor.parameters(), ", "online_parameters = ["),
@@ -74,6 +86,14 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
         (INPUTS, f"{INPUTS} / self.scale"),
         before("        self.networks = nn.", 'self.register_buffer("scale", torch.ones(1))'),
         before("            curves = update_critic(", "critic.scale += 0.01"),
+    ],
+    ("follows", "td3", "'target_actor' is 'actor' itself"): [
+        before("    q_optimizer = torch", "target_actor, target_critic = actor, critic")
+    ],
+    ("follows", "sac", "0.networks.0.0.weight of 'target' never changes"): [
+        before("    alpha = torch.tensor(", "target = nn.Sequential(target)"),
+        ("target(next_observations, next_actions)", "target[0](next_observations, next_actions)"),
+        ("torch._foreach_lerp_(target_parameters, critic_parameters, args.tau)", "pass"),
     ],
     ("resumes", "td3", MISSING): [('state |= {"target_actor": target_actor, ', "state |= {")],
     ("resumes", "sac", MISSING): [  # which changes after the first stop
@@ -181,7 +201,7 @@ def test_a_gradient_in_one_update_will_do():
     network, seen = torch.nn.Linear(1, 1), SimpleNamespace(updates=[], updaters=0)
     seen.with_gradient = set()
 
-    def updater(loss, network, *others):
+    def updater(loss, network, optimizer):
         def update(gradient):
             for parameter in network.parameters():
                 parameter.grad = torch.full_like(parameter, gradient)
@@ -190,14 +210,17 @@ def test_a_gradient_in_one_update_will_do():
 
         return update
 
-    update = watched_run.watch_updates(updater, seen)(None, network)
+    optimizer = torch.optim.SGD(network.parameters())
+    update = watched_run.watch_updates(updater, seen)(lambda *inputs: None, network, optimizer)
     for gradient in (0.0, 1.0, 0.0):
         update(gradient)
     check_script.learns(SimpleNamespace(run=seen))
 
 
-@pytest.mark.parametrize("words", [["--total-timesteps", "99"], ["--total-timesteps=99"]])
+@pytest.mark.parametrize(
+    "words", ["--total-timesteps 99", "--total_timesteps=99", "--noise A B --seed -1"]
+)
 def test_an_option_of_the_grid_is_none_of_the_scripts_in_a_sweep(words, tmp_path):
-    trial = Trial(Path("my_continuous_noisy.py"), ["--hidden=64", *words], tmp_path)
-    assert trial.own_options == ["--hidden", "64"]
-    assert trial.options == ["--hidden", "64", "--total-timesteps", "99"]
+    options = [*words.split(), "--hidden=64", "--env-kwargs", "g:1"]
+    trial = Trial(Path("my_continuous_noisy.py"), options, tmp_path)
+    assert trial.own_options == ["--hidden=64", "--env-kwargs", "g:1"]

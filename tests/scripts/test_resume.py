@@ -358,7 +358,7 @@ def test_state_that_cannot_be_read_back_is_named_at_the_start(tmp_path, capsys):
     for value in (np.random.default_rng(), lambda: 0, np.array([Path("x")])):
         state = {"whole": Part(a=1), "mine": Part(value=value)}
         line = refused(capsys, lambda state=state: a_run(tmp_path).resume(state))
-        assert line.startswith("error: the state of 'mine' cannot be saved and read back: ")
+        assert line.startswith("error: 'mine' needs a state_dict() of tensors, arrays, numbers: ")
 
 
 def test_a_checkpoint_of_other_parts_is_named(tmp_path, capsys):

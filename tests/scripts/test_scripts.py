@@ -294,6 +294,7 @@ def test_bad_input(bad, word, algorithm, tmp_path, capsys):
 
 def test_a_folder_of_runs_that_cannot_be_made(capsys):
     assert "--runs-dir /dev/null/runs: " in refused(capsys, run, "PPO", "/dev/null/runs")
+    assert "--runs-dir must be a path, not ''" in refused(capsys, run, "PPO", "")
 
 
 # DIVERGENCE

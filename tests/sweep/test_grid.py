@@ -24,6 +24,9 @@ from sweep import scripts
 ALGORITHMS = {"sac": 5, "td3": 5, "ppo": 10}  # seeds
 SCALE = "RandomUniformScaleReward(0.5, 1.5)"
 A = "RandomNormalNoisyReward(1)"
+BOX = (
+    "╭─ Parsing error ─╮\n│ Argument --a: bad │\n│ ───── │\n│ For help, see │\n╰─────╯\n"  # of tyro
+)
 ENDING = "_continuous_noisy"
 C = "choose --algos ppo --envs Hopper-v5"
 GRID = ["--algos", "sac", "--envs", "Pendulum-v1", "--seeds", "1"]
@@ -178,7 +181,7 @@ def test_states_and_what_is_left(tmp_path, monkeypatch):
         (silent, 14, "step=500/1000 sps=100\ncompiling\n"),
         (elsewhere, 1, "step=200/1000 sps=10 eta=0:01:20\n"),
         (future, -999, "step=500/1000 sps=100\n"),  # another machine's clock is wrong
-        (failed, 1, "step=600/1000 sps=100\nValueError: bad\n(stopped)\n# now host: exit=1\n"),
+        (failed, 1, f"step=600/1000 sps=100\n{BOX}# now host: exit=1\n"),
         (stopped, 1, "step=500/1000 sps=100\n# now host: exit=143\n"),
         (lost, 5, "step=500/1000 sps=100\n"),
         (deleted, 1, "step=1000/1000 sps=100\n# now host: exit=0\n"),
@@ -192,7 +195,7 @@ def test_states_and_what_is_left(tmp_path, monkeypatch):
     state = "9 runs: 1 done, 2 running, 1 probably running, 1 failed, 4 to do; "
     state += "4,000 of 9,000 steps; about 32 s left, 210 steps/s"
     assert status.code == 0 and state in status.out
-    assert re.search(rf"exit 1 +{log_of(failed)} +ValueError: bad\n", status.out)
+    assert re.search(rf"exit 1 +{log_of(failed)} +Argument --a: bad\n", status.out)
     assert re.search(rf"silent for 14 min +{log_of(silent)} +compiling", status.out)
     assert "2 running, 1 failed, 5 to do" in report and report.count("still running") == 2
     assert not (lost / ".lock").exists()
@@ -419,6 +422,7 @@ def test_baselines_that_pay(noises, more, baselines):
     ("args", "message"),
     [
         ("custom --noises Foo(1) --noise-rates 1", "bad noise 'Foo(1)': unknown name; valid are"),
+        (f"best --noises {A}", "--noises needs --noise-rates, or a rate with each"),
         (f"custom --noises {A[:-1]}", "bad noise 'RandomNormalNoisyReward(1': expected Name("),
         (f"custom --noises {A}", "--noises needs --noise-rates, or a rate with each"),
         ("custom --noise-rates 1", "--noise-rates needs --noises that have no rate of their own"),

@@ -198,3 +198,8 @@ def test_an_entry_is_split_into_its_noises():
     assert split_noises(f"{SCALE}+{SHIFT}") == split_noises(f" {SCALE} + {SHIFT} ")
     assert split_noises("A(1e+5)@1:0+B()@.5") == ["A(1e+5)@1:0", "B()@.5"]
     assert split_noises("own:A('x + y()')+B()") == ["own:A('x + y()')", "B()"]
+
+
+def test_a_mistyped_name_is_told_what_it_resembles():
+    with pytest.raises(ValueError, match=r"unknown name \(did you mean RandomMixupObservation\?\)"):
+        parse_noise("RandomMixUpObservation(0.5)")
