@@ -14,6 +14,7 @@ import check_script
 import commands
 import numpy as np
 import pytest
+import sweeps
 import torch
 import watched_run
 
@@ -186,3 +187,16 @@ def test_a_compiled_loss_reads_the_statistics_as_they_are(tmp_path):
         assert before is None or not torch.allclose(compiled["actions"], before)
         before = compiled["actions"].clone()
         normalizer.update(np.array([5.0, -3.0]))
+
+
+def test_two_scripts_are_compared(tmp_path, capsys, monkeypatch):
+    """The program at the end of the page, on runs whose difference is known."""
+    [program] = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+    for name, change in {"my": 10, "td3": 0}.items():
+        for seed in range(1, 7):
+            final = [100 + change + seed]
+            sweeps.write_run(tmp_path / "runs", final, name.upper(), "Hopper-v5", seed=seed)
+    monkeypatch.chdir(tmp_path)
+    exec(program, {})
+    out = capsys.readouterr().out
+    assert re.fullmatch(r"Hopper-v5: \+10 % \[\d+, \d+\], p = 0\.00\d+, 6 \+ 6 seeds\n", out), out
