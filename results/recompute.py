@@ -161,13 +161,16 @@ def permutation(pairs):
 
 def in_scores(pairs):
     """Return p of the sum over environments of the normal quantiles of the ranks of t."""
-    rng, sums = np.random.default_rng(1), 0
-    quantile_at = NormalDist().inv_cdf
-    quantiles = np.array([quantile_at((i + 0.5) / (1 + DRAWS)) for i in range(1 + DRAWS)])
+    rng, sums, quantile_at = np.random.default_rng(1), 0, NormalDist().inv_cdf
     for x, y in pairs:
-        t = divided(x, y, rng)
-        sums = sums + quantiles[t.argsort().argsort()]
-    return min(1, 2 * min((sums >= sums[0]).mean(), (sums <= sums[0]).mean()))
+        actual, *ways = divided(x, y, rng, every=True).round(9)
+        t, counts = np.unique(ways, return_counts=True)
+        ranks = counts.cumsum() - counts / 2  # equal ones share theirs; each less a half
+        scores = np.array([quantile_at(rank / len(ways)) for rank in ranks])
+        drawn = rng.choice(scores, DRAWS, p=counts / len(ways))
+        sums = sums + np.append(scores[t.searchsorted(actual)], drawn)
+    far = (sums >= sums[0] - 1e-9).mean(), (sums <= sums[0] + 1e-9).mean()
+    return min(1, 2 * min(far))
 
 
 def holm(ps):
@@ -284,12 +287,15 @@ def new_set(name, algorithm):
     pairs = defaultdict(dict)  # of each noise, by environment
     for row in alone:
         env, noise = row["environment"], row["noise"]
-        pairs[noise][env] = ends(name, env, noise, row["rate"], **where), ends(name, env, **where)
+        rate = str(float(row["rate"]))
+        pairs[noise][env] = ends(name, env, noise, rate, **where), ends(name, env, **where)
     together = {noise: in_scores(list(found.values())) for noise, found in pairs.items()}
     corrected = dict(zip(together, holm(together.values()), strict=True))
     for row in alone:
         x, y = pairs[row["noise"]][row["environment"]]
         change, low, high = fieller(x, y)
+        if min(len(x), len(y)) < 5:  # too few for an interval
+            low = high = np.nan
         cells = {"n": len(x), "mean": x.mean(), "sd": x.std(ddof=1)}
         cells |= {"n_without": len(y), "mean_without": y.mean(), "sd_without": y.std(ddof=1)}
         cells |= {"difference": x.mean() - y.mean(), "effect_size": effect_size(x, y)}

@@ -54,7 +54,7 @@ def draw_set(table):
     """
     noises = table["noise"].unique()
     lines = len(table) // len(noises)
-    size = style.PAGE, 0.75 + 0.2 * lines
+    size = style.PAGE, 0.85 + 0.2 * lines
     fig = Figure(figsize=size, layout="constrained")
     axes = fig.subplots(1, len(noises), sharey=True, squeeze=False)[0]
     for noise, ax in zip(noises, axes, strict=True):
@@ -66,7 +66,8 @@ def draw_set(table):
             verdict = "" if pd.isna(row.verdict) else row.verdict
             ax.annotate(verdict, (1.01, y), xycoords=("axes fraction", "data"), va="center")
         ax.axvline(0, color="0.6", linewidth=0.6, zorder=0)
-        ax.set_title(f"{noise}\nrate {rows[0].rate:g}")
+        room = (style.PAGE - 1.5) / len(noises)
+        ax.set_title(style.fitted(f"{noise}, rate {rows[0].rate:g}", room))
     has_looks = table["environment"].nunique() == 1
     seeds = [f"{row.n:.0f} + {row.n_without:.0f} seeds" for row in rows]
     axes[0].set_yticks(range(lines), seeds if has_looks else [row.environment for row in rows])
