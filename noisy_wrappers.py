@@ -233,6 +233,7 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             "noise": self.noise.bit_generator.state,
             "opportunities": self.opportunities,
             "times_applied": self.times_applied,
+            "schedule": list(self.schedule),  # a number may have been assigned to noise_rate
         }
         if self._spread is not None:
             state["spread"] = _without_arrays(vars(self._spread))
@@ -244,6 +245,7 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.noise.bit_generator.state = state["noise"]
         self.opportunities = state["opportunities"]
         self.times_applied = state["times_applied"]
+        self.schedule = tuple(state.get("schedule", self.schedule))
         if self._spread is not None:
             self._spread = _Spread(**state["spread"])
 
@@ -662,7 +664,7 @@ class RewardNoise(NoiseWrapper):
         if self._spread is not None:
             self._spread.add(float(_number_in(reward)))
         if self.acts():
-            given: Any = _number_in(reward)
+            given = float(_number_in(reward))
             reward = self._perturb(given)
             if reward != given:
                 info = self.mark(info)
@@ -741,8 +743,8 @@ class RandomNormalNoisyAction(NoiseWrapper):
     """Adds Gaussian noise to the action: a + e with e ~ N(loc, scale^2 I). Not in the paper.
 
     The environment receives a + e clipped to its action space, in the space's dtype; the caller's
-    action is left as it is. e = ``noise.normal(loc, scale, a.shape)``; ``relative`` needs finite
-    bounds.
+    action is left as it is, and without noise passes unclipped. e = ``noise.normal(loc, scale,
+    a.shape)``; ``relative`` needs finite bounds.
 
     >>> env = RandomNormalNoisyAction(gym.make("Pendulum-v1"), 1.0, 0.5)
     >>> _ = env.reset(seed=0), env.step(np.zeros(1, np.float32))
@@ -985,7 +987,8 @@ class RandomDynamics(NoiseWrapper):
             model = getattr(model, "ptr", model)
             if mujoco and isinstance(model, mujoco.MjModel):
                 return model
-        raise ValueError(f"RandomDynamics needs an environment with a MuJoCo model, not {base}")
+        where = "as its .model or .physics.model"
+        raise ValueError(f"RandomDynamics needs a MuJoCo model, {where}, and {base} has none")
 
     def _reset_scaled(self, seed: int | None, options: Info | None) -> tuple[Any, Info]:
         """Scale the model by the factors of this wrapper and the outer ones, and reset."""
@@ -1127,11 +1130,14 @@ def _check_fields(model: Any, fields: tuple[str, ...]) -> None:
         if not getattr(model, field).any():
             zeros = f"fields: this environment's model has no {field}, or zeros only"
             raise ValueError(f"{zeros}, which no factor changes")
+        if np.any(getattr(model, f"{field}poly", 0)):  # of stiffness and damping
+            raise ValueError(f"fields: {field} of this environment's model is a polynomial")
     types = {*model.actuator_gaintype.tolist(), *model.actuator_biastype.tolist()}
-    if "actuator_gainprm" in fields and not types <= _STRENGTH_IN_GAIN.keys():
+    constant = model.actuator_biasprm[model.actuator_biastype == 1, 0]  # of affine ones
+    if "actuator_gainprm" in fields and (constant.any() or not types <= _STRENGTH_IN_GAIN.keys()):
         raise ValueError(
             "fields: actuator_gainprm is the strength of motors, servos and muscles, and this "
-            "environment's model has actuators of other kinds"
+            "environment's model has actuators of other kinds, or with a constant bias"
         )
 
 
@@ -1382,9 +1388,15 @@ class Configuration:
         for noise, rate in pairs:
             if noise.wrapper.kind in ("dynamics", "action"):
                 env = noise(env, rate)
-        inside = next(layer for layer in _layers(env) if not isinstance(layer, NoiseWrapper))
-        if record_statistics and not isinstance(inside, gym.wrappers.RecordEpisodeStatistics):
-            env = gym.wrappers.RecordEpisodeStatistics(env)
+        recorder = gym.wrappers.RecordEpisodeStatistics
+        inside = [layer for layer in _layers(env) if not isinstance(layer, NoiseWrapper)]
+        if record_statistics and not isinstance(inside[0], recorder):
+            if _layers(env, recorder) and not _layers(env, FiniteNumbers):
+                advice = "or say record_statistics=False"
+                raise ValueError(
+                    f"this environment records its returns: let make_noisy do, {advice}"
+                )
+            env = recorder(env)
         for noise, rate in pairs:
             if noise.wrapper.kind in ("observation", "reward"):
                 env = noise(env, rate)
@@ -2302,6 +2314,8 @@ def _interval(low: float, high: float, least: float = -math.inf) -> tuple[float,
     low, high = _number("low", low, least), _number("high", high, least)
     if low > high:
         raise ValueError(f"low must not exceed high, got low={low}, high={high}")
+    if not math.isfinite(high - low):
+        raise ValueError(f"high - low must be finite, got low={low}, high={high}")
     return low, high
 
 

@@ -295,16 +295,23 @@ def test_dm_control_keeps_its_model_in_its_physics():
 
 
 def test_environments_that_it_cannot_change():
-    with pytest.raises(ValueError, match="needs an environment with a MuJoCo model"):
+    with pytest.raises(ValueError, match="needs a MuJoCo model, as its .model or .physics.model"):
         RandomDynamics(gym.make("CartPole-v1"), 0.1, 0.5, 1.5)
     with pytest.raises(ValueError, match="has no tendon_damping, or zeros only"):
         RandomDynamics(gym.make("Hopper-v5"), 0.1, 0.5, 1.5, fields=("tendon_damping",))
     with pytest.raises(ValueError, match="body_mass takes body_inertia along"):
         RandomDynamics(Cart(), 0.1, 0.5, 1.5, fields=("body_inertia", "body_mass"))
-    other = '<dcmotor joint="slide" motorconst="1" resistance="1"/>'
-    env = Choosing(MODEL.replace('<motor joint="slide" gear="50"/>', other))
-    with pytest.raises(ValueError, match="actuators of other kinds"):
-        RandomDynamics(env, 0.1, 0.5, 1.5, fields=("actuator_gainprm",))
+    for other in (
+        '<dcmotor joint="slide" motorconst="1" resistance="1"/>',
+        '<cylinder joint="slide" area="2" bias="1 -3 -1"/>',  # its constant force would stay
+    ):
+        env = Choosing(MODEL.replace('<motor joint="slide" gear="50"/>', other))
+        with pytest.raises(ValueError, match="actuators of other kinds, or with a constant bias"):
+            RandomDynamics(env, 0.1, 0.5, 1.5, fields=("actuator_gainprm",))
+    env = Cart()
+    env.model.dof_dampingpoly[0] = 2  # beside the linear damping
+    with pytest.raises(ValueError, match="dof_damping of this environment's model is a polynomial"):
+        RandomDynamics(env, 0.1, 0.5, 1.5, fields=("dof_damping",))
     once = RandomNormalNoisyReward(RandomDynamics(Cart(), 0.1, 0.5, 1.5), 0.1, 1)
     for field in ("body_mass", "body_inertia"):
         with pytest.raises(ValueError, match="another RandomDynamics .* scales body_"):

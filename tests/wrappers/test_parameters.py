@@ -28,6 +28,7 @@ BAD = [
     ("RandomObservationBias", {}, "scale", [*BAD_NUMBERS, -0.1]),
     ("RandomUniformNoisyObservation", {"low": 0.5, "high": 1.0}, "low high", BAD_NUMBERS),
     ("RandomUniformNoisyReward", {"high": 0.5}, "low", [1.0]),
+    ("RandomUniformNoisyReward", {"high": 1e308}, "low", [-1e308]),
     ("RandomUniformScaleObservation", {"low": 0, "high": 1}, "per_dimension", [1, "yes"]),
     ("RandomUniformScaleReward", {"low": 0.5, "high": 1.0}, "low high", BAD_NUMBERS),
     ("RandomMixupObservation", {}, "factor", [*BAD_NUMBERS, -0.001, 1.001]),

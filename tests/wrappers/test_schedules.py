@@ -60,3 +60,11 @@ def test_bad_progress(fraction):
     env = RandomNormalNoisyReward(constant_env(), "1:0", 1.0)
     with pytest.raises(ValueError, match="fraction"):
         set_progress(env, fraction)
+
+
+def test_a_rate_that_was_assigned_is_resumed():
+    env, resumed = (RandomNormalNoisyReward(constant_env(), 0.5, 0.1) for _ in range(2))
+    env.noise_rate = 0.9
+    resumed.load_state_dict(env.state_dict())
+    resumed.reset()
+    assert resumed.noise_rate == 0.9

@@ -114,6 +114,14 @@ def test_integer_observations_are_rounded_and_clipped():
     assert 0 in got[:, 1] and 255 in got[:, 2:] and len(np.unique(got)) > 50
 
 
+def test_a_record_below_other_wrappers_is_refused():
+    """Gymnasium's would end a run at the end of an episode, with an empty AssertionError."""
+    env = gym.wrappers.TimeLimit(RecordEpisodeStatistics(constant_env(2.0)), 5)
+    with pytest.raises(ValueError, match="this environment records its returns"):
+        make_noisy(env, [], [])
+    assert make_noisy(env, [], [], record_statistics=False) is env
+
+
 def test_a_record_of_the_true_return_that_there_is_is_kept():
     env = RecordEpisodeStatistics(gym.wrappers.TimeLimit(constant_env(2.0), 5))
     noisy = make_noisy(make_noisy(env, [A], [1.0]), [B], [1.0])
