@@ -14,6 +14,7 @@ https://arxiv.org/abs/2305.02882; IQM and probability of improvement are those o
 (2021), https://arxiv.org/abs/2108.13264.
 """
 
+import math
 import os
 import shutil
 import sys
@@ -259,7 +260,7 @@ def main(args):
         runs_dir=Path(os.path.expanduser(args.runs_dir)),
         metric=args.metric.replace("_", " "),
     )
-    if args.smallest_gain is not None and not args.smallest_gain > 0:
+    if args.smallest_gain is not None and not 0 < args.smallest_gain < math.inf:
         fail(f"--smallest-gain must be above 0, not {args.smallest_gain}")
     if not COLUMN <= args.figure_width <= 20:
         fail(f"--figure-width must be between {COLUMN} and 20 inches, not {args.figure_width}")
@@ -274,7 +275,7 @@ def main(args):
         fail(error)
     out = Path(os.path.expanduser(args.out or args.runs_dir / "results"))
     others = (args.runs_dir.resolve(), Path.cwd())
-    if out.resolve() in others or is_run(out):  # where other tables may be
+    if out.resolve() in others or is_run(out) or is_phase(out):  # where other tables may be
         fail("--out must be a folder of its own, not the current one or one with runs")
     entries = read_runs(args.runs_dir)
     results = analyse(args, entries, choice)

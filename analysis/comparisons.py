@@ -173,22 +173,18 @@ def as_chosen(compared, choice):
     It looks at them several times, at levels that were fixed beforehand, so a plain p would be one
     look more. One that it has not judged yet has no verdict. choice: of read_choice, or None.
     """
-    helped = {}
+    said = {}
     if choice is not None:
         for row in choice[choice["phase"] == CONFIRMATION].itertuples():
             key = row.algorithm, row.environment, row.noise, row.noise_rate
-            helped[key] = row.survives == "yes"
+            said[key] = {"yes": verdicts.BETTER, "worse": verdicts.WORSE}.get(row.survives)
 
     def verdict(row):
         tested = row["verdict"] in (*verdicts.CLEAR, verdicts.UNCLEAR)
         if row["phase"] != CONFIRMATION or not tested:
             return row["verdict"]
         key = row["algorithm"], row["environment"], row["noise"], row["noise_rate"]
-        if key not in helped:
-            return np.nan
-        if helped[key]:
-            return verdicts.BETTER
-        return verdicts.UNCLEAR if row["verdict"] == verdicts.BETTER else row["verdict"]
+        return (said[key] or verdicts.UNCLEAR) if key in said else np.nan
 
     judged = {}
     for name in ("noises", "rates"):
@@ -232,16 +228,15 @@ def judged(rows, family, metric, smallest_gain=None):
     """Add p corrected for all comparisons of a family, the smallest possible, and verdicts.
 
     A family is a study in one environment, or over all, corrected with Benjamini and Hochberg's
-    method. The confirmations of `./benchmark.sh choose` were fixed beforehand: they are one family,
-    corrected with Holm's method.
+    method. A confirmation of `./benchmark.sh choose` was fixed beforehand, with a level of its own,
+    and is not corrected.
     """
     tested = rows[rows["p"].notna()]
-    confirmed = tested["phase"] == CONFIRMATION
-    families = [(tested[confirmed], statistics.holm)] if confirmed.any() else []
-    for _, group in tested[~confirmed].groupby(family):
-        families.append((group, stats.false_discovery_control))
-    for group, correct in families:
-        rows.loc[group.index, "p_adjusted"] = correct(group["p"].to_numpy(float))
+    rows.loc[tested.index, "p_adjusted"] = tested["p"]
+    rows.loc[tested.index, "comparisons"] = 1
+    for _, group in tested[tested["phase"] != CONFIRMATION].groupby(family):
+        corrected = stats.false_discovery_control(group["p"].to_numpy(float))
+        rows.loc[group.index, "p_adjusted"] = corrected
         rows.loc[group.index, "comparisons"] = len(group)
     rows["smallest_p_adjusted"] = (rows["smallest_p"] * rows["comparisons"]).clip(upper=1)
     found = [verdicts.verdict(row, smallest_gain, metric) for row in rows.to_dict("records")]

@@ -22,9 +22,8 @@ from analysis.runs import KEYS, STUDY, study_name, study_of, where_tested
 from analysis.statistics import compare, holm, mean_std, percent_of
 from analysis.tables import table_of
 from analysis.words import counted
-from noisy_wrappers import BASELINE
+from noisy_wrappers import BASELINE, WRAPPERS
 
-EPISODES = 100  # of a condition, as evaluate.py plays by default
 CLEAN = BASELINE  # a condition of a test is a Configuration, too
 RUN_COLUMNS = [*STUDY, "environment", "configuration", "seed", "elsewhere", "condition", "mean"]
 COLUMNS = [*KEYS, "test_noise", "test_rate", "tested_on", "n", "mean", "std", "difference"]
@@ -177,12 +176,8 @@ def environment_score(runs, config, metric=RETURN):
     if CLEAN not in x or CLEAN not in y:
         return None
     complete = pd.concat([x, y]).notna().all()
-    conditions = [
-        name
-        for name in complete.index[complete]
-        # noise on rewards leaves returns as they are: that is the clean test once more
-        if name != config and not (x[name].equals(x[CLEAN]) and y[name].equals(y[CLEAN]))
-    ]
+    tested = [name for name in complete.index[complete] if not is_clean(name)]
+    conditions = [name for name in tested if name != config]
     if not conditions:
         return None
     clean, clean_x = y[CLEAN], x[CLEAN]
@@ -193,7 +188,8 @@ def environment_score(runs, config, metric=RETURN):
         return percent_of(difference, clean, everything)
 
     row = row_keys(runs, config) | {"elsewhere": runs["elsewhere"].iloc[0]}
-    row |= compare(x, y, episodes=EPISODES if metric == SUCCESS else None)._asdict()
+    episodes = int(runs["number"].min()) if metric == SUCCESS else None
+    row |= compare(x, y, episodes=episodes)._asdict() | {"episodes": episodes}
     row |= {
         "difference_percent": in_percent(x.mean() - y.mean()),
         "percent_low": np.nan,  # of the clean return, so it has no interval
@@ -211,11 +207,18 @@ def environment_score(runs, config, metric=RETURN):
     }
 
 
+def is_clean(condition):
+    """Tell whether a test is the clean one: noise on rewards leaves returns as they are."""
+    kinds = {getattr(WRAPPERS.get(name), "kind", "own") for name in condition.wrappers}
+    return kinds <= {"reward"}
+
+
 def average_score(scores, metric=RETURN):
     """Return the row of all environments; they count equally, whatever their number of seeds."""
     table = pd.DataFrame(scores)
     x, y = (np.array([*zip_longest(*table[name], fillvalue=np.nan)]) for name in ("x", "y"))
-    row = scores[0] | compare(x, y, episodes=EPISODES if metric == SUCCESS else None)._asdict()
+    episodes = min(table["episodes"]) if metric == SUCCESS else None
+    row = scores[0] | compare(x, y, episodes=episodes)._asdict()
     row |= {"environment": "", **table[["conditions", "conditions_tested"]].sum()}
     return row | table.filter(like="percent").mean(skipna=False).to_dict()
 

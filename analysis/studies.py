@@ -124,7 +124,8 @@ def notes_on(study, runs):
         notes.append(
             f"{study.name}: runs that ended by themselves before their "
             f"{runs[0].total_timesteps:,} steps: {len(ended)} of {len(runs)}, at step "
-            f"{min(last):,} to {max(last):,}; they count with their own last tests"
+            f"{' to '.join(f'{step:,}' for step in sorted({min(last), max(last)}))}; they count "
+            "with their own last tests"
         )
     for e, env in enumerate(study.environments):
         if study.phase != SEARCH and len(study.sample(BASELINE, e)) == 0:
@@ -150,7 +151,7 @@ def version_notes(entries):
         for library in sorted(set().union(*versions.values())):
             used = defaultdict(Counter)  # environment -> how many runs have a version
             for run in runs:
-                used[run.environment][str(versions[run].get(library))] += 1
+                used[run.environment][str(versions[run].get(library) or "unknown")] += 1
             mixed = [counts for counts in used.values() if len(counts) > 1]
             if mixed:
                 counts = sum(mixed, Counter())

@@ -137,13 +137,14 @@ def judge(state, plan, returns, episodes=None):
     return Verdict(comparison, len(state.seeds), plan.looks[-1], needed)
 
 
-def records(algorithm, environment, state, returns, helped):
+def records(algorithm, environment, state, returns, verdict):
     """Yield the rows of choice.csv for one finished choice; their columns are CHOICE_COLUMNS."""
     kind = algorithm, environment
     for number, done in enumerate(state.rounds, start=1):
         for candidate, score in done.scores.items():
             survives = "yes" if candidate in done.survivors else "no"
             yield *kind, "search", number, *candidate.columns, done.seeds, score, survives
-    for candidate, survives in ((BASELINE, ""), (*state.candidates, "yes" if helped else "no")):
+    said = "yes" if verdict.helps else "worse" if verdict.significant else "no"
+    for candidate, survives in ((BASELINE, ""), (*state.candidates, said)):
         score = fmean(returns[candidate, seed] for seed in state.seeds)
         yield *kind, "confirmation", "", *candidate.columns, len(state.seeds), score, survives

@@ -122,7 +122,7 @@ def report(found, args):
     for choice in found:
         verdict = judge(choice, args)
         print(sentence(choice, verdict, UNITS[args.metric]), flush=True)
-        rows += halving.records(*choice.kind, choice.state, choice.returns, verdict.helps)
+        rows += halving.records(*choice.kind, choice.state, choice.returns, verdict)
     write_choice(Path(args.runs_dir, choice_file(args.metric)), rows)
 
 

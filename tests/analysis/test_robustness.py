@@ -15,6 +15,7 @@ import analysis.robustness
 from analysis.folders import RETURN
 from analysis.heatmap import heatmaps
 from analysis.matrices import matrices
+from analysis.robustness import is_clean
 from analysis.runs import finished, read_runs
 from noisy_wrappers import BASELINE, Configuration, split_noises
 
@@ -341,3 +342,11 @@ def test_heatmap_of_a_matrix(tmp_path):
         assert ax.images[0].get_clim() == (-4, 40)
         texts = {text.get_position(): float(text.get_text()) for text in ax.texts}
         assert texts[1, 2] == factor * 19 and len(texts) == 8
+
+
+def test_a_harmless_noise_is_a_test_condition(tmp_path):
+    """Where all episodes end alike it looks like the clean test, and is none."""
+    harmless = Configuration.read([PUSH], [1.0])
+    assert not is_clean(harmless) and is_clean(Configuration())
+    assert is_clean(Configuration.read(["RandomNormalNoisyReward(1.0)"], [1.0]))
+    assert not is_clean(Configuration(("mine:OfRewards(1)",), ((1.0, 1.0),)))

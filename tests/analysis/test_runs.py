@@ -93,7 +93,7 @@ def test_a_run_that_failed_before_it_had_a_folder_is_listed(tmp_path):
     for phase in ("", "search", "confirmation"):
         (tmp_path / phase / "logs").mkdir(parents=True)
     (tmp_path / "logs/a__1.log").write_text(f"{BEGUN}error: no\n# 2026 host: exit=2\n")
-    text = f"{BEGUN}KeyError: 'x'\n(training stopped)\n# 2026 host: exit=1\n"
+    text = f"{BEGUN}KeyError: 'x'\n# 2026 host: exit=1\n"
     (tmp_path / "search/logs/a__2.log").write_text(text)
     for code in (0, 130, 143):  # finished or stopped; its folder was moved or deleted afterwards
         (tmp_path / f"logs/a__{code}.log").write_text(f"{BEGUN}x\n# now host: exit={code}\n")
