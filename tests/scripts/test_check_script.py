@@ -181,7 +181,7 @@ def test_a_line_for_each_promise(tmp_path, capsys, monkeypatch):
     assert check_script.main(path) == 0
     capsys.readouterr()
     assert check_script.main("no.py") == check_script.main("--help") == check_script.main() == 2
-    assert "error: 'no.py' is no script NAME_continuous_noisy.py\n" in capsys.readouterr().out
+    assert "error: there is no file no.py, or its name is not " in capsys.readouterr().err
 
 
 def test_no_more_than_a_line_where_it_does_not_train(tmp_path, capsys):
