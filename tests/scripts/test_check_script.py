@@ -119,7 +119,7 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
     ],
     ("analyses", "ppo", "eval.csv"): [('self.eval_csv += f"{due},', 'self.eval_csv += f"first,')],
 }
-SLOW = ("tests", "compiles", "evaluates", "analyses")
+SLOW = ("follows", "resumes", "tests", "compiles", "evaluates", "analyses")
 
 
 @pytest.mark.parametrize(
