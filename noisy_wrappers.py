@@ -1200,8 +1200,9 @@ def _read_noise(text: str) -> Noise:
     module, name, args, kwargs = _read_call(text)
     wrapper = _import_wrapper(module, name, text) if module else WRAPPERS.get(name)
     if wrapper is None:
-        near = [f" (did you mean {x}?)" for x in difflib.get_close_matches(name, WRAPPERS, n=1)]
-        raise _bad_noise(text, "unknown name" + "".join(near))
+        near = difflib.get_close_matches(name, WRAPPERS, n=1)
+        advice = f" (did you mean {near[0]}?)" if near else ""
+        raise _bad_noise(text, f"unknown name{advice}")
     signature = inspect.signature(wrapper)
     try:
         given = signature.bind(None, 1.0, *args, **kwargs).arguments
@@ -1389,13 +1390,14 @@ class Configuration:
             if noise.wrapper.kind in ("dynamics", "action"):
                 env = noise(env, rate)
         recorder = gym.wrappers.RecordEpisodeStatistics
-        inside = [layer for layer in _layers(env) if not isinstance(layer, NoiseWrapper)]
-        if record_statistics and not isinstance(inside[0], recorder):
-            if _layers(env, recorder) and not _layers(env, FiniteNumbers):
-                advice = "or say record_statistics=False"
-                raise ValueError(
-                    f"this environment records its returns: let make_noisy do, {advice}"
-                )
+        inside = next(layer for layer in _layers(env) if not isinstance(layer, NoiseWrapper))
+        if record_statistics and not isinstance(inside, recorder):
+            is_recorded = _layers(env, recorder) and not _layers(
+                env, FiniteNumbers
+            )  # drops records
+            if is_recorded:
+                advice = "let make_noisy do, or say record_statistics=False"
+                raise ValueError(f"this environment records its returns: {advice}")
             env = recorder(env)
         for noise, rate in pairs:
             if noise.wrapper.kind in ("observation", "reward"):

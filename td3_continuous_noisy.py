@@ -483,9 +483,8 @@ class Run:
         else:
             self._delete("events.out.tfevents.*")  # of a process killed before its first checkpoint
             for name, part in state.items():  # fail now, and not when the run is resumed
-                with fail_on(
-                    Exception, f"{name!r} needs a state_dict() of tensors, arrays, numbers"
-                ):
+                needed = f"{name!r} needs a state_dict() of tensors, arrays, numbers"
+                with fail_on(Exception, needed):
                     file = io.BytesIO()
                     torch.save(part.state_dict(), file)
                     read_state(io.BytesIO(file.getvalue()))

@@ -176,8 +176,8 @@ def environment_score(runs, config, metric=RETURN):
     if CLEAN not in x or CLEAN not in y:
         return None
     complete = pd.concat([x, y]).notna().all()
-    tested = [name for name in complete.index[complete] if not is_clean(name)]
-    conditions = [name for name in tested if name != config]
+    shared = complete.index[complete]
+    conditions = [name for name in shared if name != config and not is_clean(name)]
     if not conditions:
         return None
     clean, clean_x = y[CLEAN], x[CLEAN]

@@ -121,11 +121,11 @@ def notes_on(study, runs):
     ended = [run for run in runs if run.curve.steps[-1] < run.total_timesteps]
     if ended:
         last = [run.curve.steps[-1] for run in ended]
+        steps = " to ".join(f"{step:,}" for step in sorted({min(last), max(last)}))
         notes.append(
             f"{study.name}: runs that ended by themselves before their "
-            f"{runs[0].total_timesteps:,} steps: {len(ended)} of {len(runs)}, at step "
-            f"{' to '.join(f'{step:,}' for step in sorted({min(last), max(last)}))}; they count "
-            "with their own last tests"
+            f"{runs[0].total_timesteps:,} steps: {len(ended)} of {len(runs)}, at step {steps}; "
+            "they count with their own last tests"
         )
     for e, env in enumerate(study.environments):
         if study.phase != SEARCH and len(study.sample(BASELINE, e)) == 0:

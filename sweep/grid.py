@@ -122,8 +122,8 @@ def configurations(args, algorithm, env_id):
         rates = args.noise_rates or list(dict.fromkeys(own for _, own in args.pairs or []))
     crossed = [pairs for pairs in entries if any(rate is None for _, rate in pairs)]
     if crossed and not rates:
-        for pairs in crossed:
-            configuration_of(pairs, 1.0)  # a typing error is not a missing rate
+        for entry in crossed:
+            configuration_of(entry, 1.0)  # a typing error is not a missing rate
         fail('--noises needs --noise-rates, or a rate with each noise, as in "NOISE@0.1"')
     if args.noise_rates and not crossed:
         fail("--noise-rates needs --noises that have no rate of their own")
