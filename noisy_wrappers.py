@@ -1392,10 +1392,8 @@ class Configuration:
         recorder = gym.wrappers.RecordEpisodeStatistics
         inside = next(layer for layer in _layers(env) if not isinstance(layer, NoiseWrapper))
         if record_statistics and not isinstance(inside, recorder):
-            is_recorded = _layers(env, recorder) and not _layers(
-                env, FiniteNumbers
-            )  # drops records
-            if is_recorded:
+            drops_records = _layers(env, FiniteNumbers)
+            if _layers(env, recorder) and not drops_records:
                 advice = "let make_noisy do, or say record_statistics=False"
                 raise ValueError(f"this environment records its returns: {advice}")
             env = recorder(env)
