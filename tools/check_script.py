@@ -53,7 +53,7 @@ def learns(trial):
 
 
 def follows(trial):
-    """Targets follow the networks that learn."""
+    """What is in the state changes, and targets follow the networks that learn."""
     problems = "; ".join(watched_run.left_behind(trial.run))
     check(not problems, problems)
 

@@ -133,15 +133,19 @@ def train(path, options, runs_dir, episodes=0, **changed):
     """Train by a script, imported anew as in a new process.
 
     It is stopped when it has learned with each of its updates, and after a number of episodes.
-    Return what was seen: `updates`, for each loss the network that it learns, its parameters before
-    the first update, the curves and the gradient of the first, the inputs of the last;
-    `with_gradient`, the ids of parameters that had one in any; `episodes`, how many ended; `gaps`,
-    how far the first action after each test was from that of load_policy(); and `networks`, those
-    of the state that resumes, {name: (network, its state_dict at the start)}.
+    Return what was seen:
+    - `updates`, for each loss the network that it learns, its parameters before the first update,
+      the curves and the gradient of the first, the inputs of the last
+    - `with_gradient`, the ids of parameters that had a gradient in any update
+    - `start`, the step at which it began, and `episodes`, how many ended
+    - `places`, where observations were returned: {bytes: [(episode, step, at a time limit), ...]}
+    - `gaps`, how far the first action after each test was from that of load_policy()
+    - `networks` of the state that resumes, {name: (network, its state_dict at the start)}
+    - `others`, {name: (another part of the state, the bytes of its state_dict at the start)}
     """
     spec = importlib.util.spec_from_file_location(path.stem, path)
     sys.modules[path.stem] = script = importlib.util.module_from_spec(spec)
-    seen = SimpleNamespace(script=script, updaters=0, updates=[], gaps=[], observations=set())
+    seen = SimpleNamespace(script=script, updaters=0, updates=[], gaps=[], places={})
     seen.episodes, seen.with_gradient, said = 0, set(), io.StringIO()
 
     def stop():
@@ -159,7 +163,7 @@ def train(path, options, runs_dir, episodes=0, **changed):
             seen.args = replace(args, **{"runs_dir": str(runs_dir)} | changed)
             seen.folder = noisy.run_folder(asdict(seen.args))
             script.updater = watch_updates(script.updater, seen)
-            script.learn = watch_actions(script.learn, seen)
+            script.learn = watch_environment(script.learn, seen)
             script.Run.resume = watch_networks(script.Run.resume, seen)
             seen.finished = script.train(seen.args, stop)
         except SystemExit as error:
@@ -198,6 +202,8 @@ def watch_updates(updater, seen):
             if not hasattr(own, "first"):
                 with noisy.kept_generators(), Broadcasts(own.name):
                     loss(network, *inputs)
+            if seen.start == 0:
+                check_transitions(own.name, inputs, seen.places)
             curves, own.inputs = update(*inputs), inputs
             moved = {id(p) for p in parameters.values() if p.grad is not None and p.grad.any()}
             seen.with_gradient |= moved
@@ -231,57 +237,120 @@ class Broadcasts(TorchFunctionMode):
         return result
 
 
-def watch_actions(learn, seen):
-    """Return a script's learn(), which compares actions with the policy of the last test."""
+def tensors_among(inputs):
+    """Return the tensors that an update was given, also those in a list."""
+    lists = [x if isinstance(x, list | tuple) else [x] for x in inputs]
+    return [x for given in lists for x in given if torch.is_tensor(x)]
+
+
+def raw_observations(inputs, places):
+    """Return the batches that have observations as the environment returned them."""
+    batches = [x for x in tensors_among(inputs) if x.ndim == 2]
+    return [x for x in batches if any(row.tobytes() in places for row in x.numpy())]
+
+
+def check_transitions(name, inputs, places):
+    """Check that next observations are later ones, and that no time limit counts as an end.
+
+    That is seen where an update is given both as the environment returned them. Of two vectors of
+    flags, as terminated and truncated, nothing is said.
+    """
+    raw, at_limit = raw_observations(inputs, places), []
+    if len(raw) != 2:
+        return
+    for row, next_row in zip(*raw, strict=True):
+        before, after = (places.get(x.numpy().tobytes(), []) for x in (row, next_row))
+        later = [b for a in before for b in after if a.episode == b.episode and a.step < b.step]
+        advice = "store what step() returned, before reset(), and test in test_env alone"
+        check(later, f"{name}() is given a next observation that does not come later: {advice}")
+        at_limit.append(any(place.at_limit for place in later))
+    vectors = [x.tolist() for x in tensors_among(inputs) if x.shape == (len(at_limit),)]
+    flags = [x for x in vectors if set(x) <= {0, 1}]
+    is_end = any(at_limit) and flags == [at_limit]
+    check(not is_end, f"{name}() takes a time limit for an end: store `terminated` alone")
+
+
+def watch_environment(learn, seen):
+    """Return a script's learn(), whose environment notes what it returns.
+
+    It also compares actions with the policy of the last test.
+    """
 
     def watched_learn(args, env, *others):
-        step, policy_pt, written = env.step, seen.folder / "policy.pt", 0
+        reset, step, policy_pt, written = env.reset, env.step, seen.folder / "policy.pt", 0
+        episode = steps = 0
         observation = given = None
 
+        def note(returned, at_limit=False):
+            nonlocal observation, given
+            given, observation = returned, copy.copy(returned)
+            place = SimpleNamespace(episode=episode, step=steps, at_limit=at_limit)
+            seen.places.setdefault(np.float32(returned).tobytes(), []).append(place)
+
+        def watched_reset(**kwargs):
+            nonlocal episode, steps
+            episode, steps = episode + 1, 0
+            returned, info = reset(**kwargs)
+            note(returned)
+            return returned, info
+
         def watched_step(action):
-            nonlocal written, observation, given
+            nonlocal written, steps
             advice = "learn() changes an observation in place, and stores that: change a copy"
-            check(observation is None or np.array_equal(observation, given), advice)
+            check(np.array_equal(observation, given), advice)
             time = policy_pt.stat().st_mtime_ns if policy_pt.exists() else 0
-            if time != written and observation is not None:  # nothing was learned since the test
+            if time != written and steps > 0:  # nothing was learned since the test
                 with noisy.kept_generators():
                     wanted = seen.script.load_policy(seen.folder)(observation)
                 seen.gaps.append(np.abs(wanted - action).max())
-            written, result = time, step(action)
-            given = None if result[2] or result[3] else result[0]
-            observation = copy.copy(given)
-            seen.observations.add(np.float32(result[0]).tobytes())
-            return result
+            written, steps = time, steps + 1
+            returned, reward, terminated, truncated, info = step(action)
+            note(returned, at_limit=truncated and not terminated)
+            return returned, reward, terminated, truncated, info
 
-        env.step = watched_step
+        env.reset, env.step = watched_reset, watched_step
         return learn(args, env, *others)
 
     return watched_learn
 
 
 def watch_networks(resume, seen):
-    """Return a script's Run.resume(), which notes the networks of the state."""
+    """Return a script's Run.resume(), which notes the state and the step."""
 
     def watched_resume(run, state):
         networks = {name: x for name, x in state.items() if isinstance(x, torch.nn.Module)}
         seen.networks = {name: (x, copy.deepcopy(x.state_dict())) for name, x in networks.items()}
-        return resume(run, state)
+        others = {name: x for name, x in state.items() if name not in networks}
+        seen.others = {name: (x, as_bytes(x.state_dict())) for name, x in others.items()}
+        seen.start = resume(run, state)
+        return seen.start
 
     return watched_resume
 
 
-def left_behind(seen):
-    """Yield what is wrong with targets: the networks in the state that no update learns.
+def as_bytes(state):
+    """Return a state_dict() as a checkpoint has it."""
+    file = io.BytesIO()
+    torch.save(state, file)
+    return file.getvalue()
 
+
+def left_behind(seen):
+    """Yield what in the state never changes, and what is wrong with targets.
+
+    Those are the networks in the state that no update learns.
     The tensors of a target move as those of the learned network do that it is a copy of; of another
     one, all parameters move. What is to stay as it is needs no place in the state.
     """
+    for name, (part, begun) in seen.others.items():
+        if as_bytes(part.state_dict()) == begun:
+            yield f"{name!r} never changes: update it, or leave it out of `state`"
     learned = [update.network for update in seen.updates]
-    places = {}
+    names = {}
     for name, (network, begun) in seen.networks.items():
-        if network in places:
-            yield f"{name!r} is {places[network]!r} itself: copy it"
-        places.setdefault(network, name)
+        if network in names:
+            yield f"{name!r} is {names[network]!r} itself: copy it"
+        names.setdefault(network, name)
         if network in learned:
             continue
         moving, of = {key for key, _ in network.named_parameters()}, ""
@@ -320,11 +389,8 @@ def actions_in_loss(update, seen):
     Nothing is returned where it asked no other network about actions, as in PPO, or where the
     observations are not as the environment gave them.
     """
-    inputs, own, asked = [], set(update.network.modules()), []
-    for given in update.inputs:
-        inputs.extend(given if isinstance(given, list | tuple) else [given])
-    batches = [x for x in inputs if torch.is_tensor(x) and x.ndim == 2]
-    raw = [x for x in batches if any(row.tobytes() in seen.observations for row in x.numpy())]
+    own, asked = set(update.network.modules()), []
+    raw = raw_observations(update.inputs, seen.places)
 
     def note(module, given):
         if module not in own:

@@ -74,6 +74,15 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
         before("            action = actor.policy(observation, eps)", "observation += 0.1")
     ],
     ("trains", "td3", "makes (16, 16) of (16, 1) and (16,)"): [(".squeeze(1) for", " for")],
+    ("trains", "sac", "takes a time limit for an end"): [
+        (
+            "reward, next_observation, terminated, truncated)\n        observation =",
+            "reward, next_observation, terminated or truncated, False)\n        observation =",
+        ),
+    ],
+    ("trains", "td3", "next observation that does not come later"): [
+        ("(next_row + (terminated or truncated)) % self.rows", "next_row")
+    ],
     ("learns", "ppo", "no gradient of critic."): [(" + args.vf_coef * value_loss, c", ", c")],
     ("learns", "sac", "critic_loss() never changes"): [
         ("lr=args.q_lr, fused=True)\n    actor", "lr=0.0)\n    actor")
@@ -81,6 +90,13 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
     ("follows", "td3", "network.0.weight of 'target_actor'"): [
         ("target_parameters = [*target_actor.parameters(), ", "target_parameters = ["),
         ("online_parameters = [*actor.parameters(), ", "online_parameters = ["),
+    ],
+    ("follows", "ppo", "'scheduler' never changes"): [
+        before(
+            '    state = {"agent": agent',
+            "scheduler = torch.optim.lr_scheduler.LinearLR(optimizer)",
+        ),
+        ('"rollout": rollout}', '"rollout": rollout, "scheduler": scheduler}'),
     ],
     ("follows", "sac", "scale of 'target'"): [  # a buffer
         (INPUTS, f"{INPUTS} / self.scale"),
@@ -105,7 +121,10 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
         ),
     ],
     ("resumes", "ppo", "ask stop()"): [("stopping = stop()", "stopping = 0")],
-    ("tests", "sac", "play in test_env"): [("noisy.play(test_env, ", "noisy.play(env, ")],
+    ("trains", "sac", "test in test_env alone"): [("noisy.play(test_env, ", "noisy.play(env, ")],
+    ("tests", "sac", "change nothing while testing"): [
+        before("            results = noisy.play(", "torch.randn(1)")
+    ],
     ("compiles", "td3", "of actor_loss() by"): [
         before(LOSS, "q1 = q1 * (1.001 if torch.compiler.is_compiling() else 1.0)")
     ],
@@ -198,8 +217,8 @@ def test_an_option_that_the_script_does_not_have_is_named(tmp_path):
 
 def test_a_gradient_in_one_update_will_do():
     """Another loss may leave a shared part of the network without one."""
-    network, seen = torch.nn.Linear(1, 1), SimpleNamespace(updates=[], updaters=0)
-    seen.with_gradient = set()
+    network = torch.nn.Linear(1, 1)
+    seen = SimpleNamespace(updates=[], updaters=0, start=0, places={}, with_gradient=set())
 
     def updater(loss, network, optimizer):
         def update(gradient):
