@@ -888,7 +888,7 @@ class RandomEarlyTermination(NoiseWrapper):
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._steps += 1
         ends = self.acts() if self.each_step else self._steps == self._last_step
-        if ends and self.truncate and not truncated:
+        if ends and self.truncate and not (terminated or truncated):
             truncated, info = True, self.mark(info)
         if ends and not self.truncate and not terminated:
             terminated, info = True, self.mark(info)
