@@ -103,7 +103,8 @@ def start(runs_dir, *moments, terminal=None, ignored=(), **kwargs):
 
 
 def terminate(*args):
-    os.kill(os.getpid(), signal.SIGTERM)
+    for number in (signal.SIGTERM, signal.SIGHUP):  # of timeout, and of what it stops
+        os.kill(os.getpid(), number)
 
 
 def terminate_group(*args):
@@ -119,7 +120,8 @@ def test_a_signal_ends_the_episode_and_then_all_processes(tmp_path, log, capsys)
     short = {"total_timesteps": 120}
     result = commands.ended(start(tmp_path / "runs", (STEP, 50, terminate), **short))
     assert (result.code, result.err) == (143, "")
-    assert result.out.count("stopping after this episode") == 1  # not of the workers, too
+    assert result.out.count("stopping after this episode") == 2  # not of the workers, too
+    assert result.out.endswith("\nstopped; run the same command again to resume\n")
     assert_closed(log())
     stopped = run("PPO", tmp_path / "runs", **HOSTILE | short)
     assert "resumed at step" in capsys.readouterr().out
