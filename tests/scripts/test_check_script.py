@@ -38,16 +38,12 @@ def before(text, line):
 
 MISSING = "put all that training changes into `state`"
 LOSS = "    loss = -q1.mean()\n"
-ACTING = "actions, _, _ = self(observations, eps)"
 LEARNING = "z = (actions - self.actor_mean(observations)"
 INPUTS = "inputs = torch.cat([observations, actions], 1)"
 COMPARED = "self.config = noisy.resumed_run(old, new)"
 IMPORT = before("import contextlib\n", "import copy")
 MISTAKES = {  # the promise, the script and what is said: the texts that are replaced
     ("trains", "td3", "nothing was updated"): [("if global_step > args.learning_starts:", "if 0:")],
-    ("acts", "sac", "actor_loss() learns actions"): [
-        (ACTING, f"{ACTING}[0].clamp(0.3, 0.4), 0, 0")
-    ],
     ("trains", "ppo", "acts with one policy"): [(LEARNING, f"{LEARNING}.relu()")],
     ("trains", "ppo", "and learns another"): [  # acts with a copy that was right at the start
         IMPORT,
@@ -59,12 +55,7 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
         before("    online_parameters = [*actor", "first_actor = copy.deepcopy(actor)"),
         ("action = actor.policy(observation, ", "action = first_actor.policy(observation, "),
     ],
-    ("acts", "sac", "load_policy()"): [
-        IMPORT,
-        before("    target_entropy = -", "first = copy.deepcopy(actor.state_dict())"),
-        ('{"actor": actor.state_dict()}', '{"actor": first}'),
-    ],
-    ("acts", "sac", "from those of the policy"): [  # in the second dimension
+    ("acts", "sac", "actor_loss() learns actions"): [  # others, in the second dimension
         ("        return actions, log", "        return squashed * self.action_scale, log")
     ],
     ("trains", "sac", "also steps 12 tensors of others"): [
@@ -84,8 +75,8 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
         ("(next_row + (terminated or truncated)) % self.rows", "next_row")
     ],
     ("learns", "ppo", "no gradient of critic."): [(" + args.vf_coef * value_loss, c", ", c")],
-    ("learns", "sac", "critic_loss() never changes"): [
-        ("lr=args.q_lr, fused=True)\n    actor", "lr=0.0)\n    actor")
+    ("learns", "td3", "critic_loss() never changes"): [
+        ("critic.parameters(), lr=args.learning_rate", "critic.parameters(), lr=0.0")
     ],
     ("follows", "td3", "network.0.weight of 'target_actor'"): [
         ("target_parameters = [*target_actor.parameters(), ", "target_parameters = ["),
@@ -138,7 +129,7 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
     ],
     ("analyses", "ppo", "eval.csv"): [('self.eval_csv += f"{due},', 'self.eval_csv += f"first,')],
 }
-SLOW = ("follows", "resumes", "tests", "compiles", "evaluates", "analyses")
+SLOW = ("acts", "follows", "resumes", "tests", "compiles", "options", "evaluates", "analyses")
 
 
 @pytest.mark.parametrize(
