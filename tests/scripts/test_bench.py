@@ -78,6 +78,7 @@ def test_a_block_lasts_long_enough_and_counts_from_its_start(clock, speed, monke
     assert (program.speeds, program.shares) == ([speed], [0.25])
 
 
+@pytest.mark.slow
 def test_programs_run_in_turn(tmp_path, monkeypatch):
     log = tmp_path / "log"
     folders = [checkout(tmp_path / name, SCRIPT.format(log=log, name=name)) for name in "ab"]
@@ -103,13 +104,6 @@ def test_programs_run_in_turn(tmp_path, monkeypatch):
     stored = [row for row in csv.DictReader(blocks.open()) if row["program"] == "checkout"]
     stored_speeds = [float(row["steps_per_second"]) for row in stored]
     assert stored_speeds == pytest.approx(speeds["checkout"], rel=1e-3)
-
-
-def test_what_ends_says_why(tmp_path, monkeypatch):
-    text = "import sys; print('one'); sys.exit('error: two')"
-    monkeypatch.setattr(bench, "PROJECT", checkout(tmp_path / "a", text))
-    with pytest.raises(SystemExit, match="^one\nerror: two\nerror: ours has ended$"):
-        bench.main(["--algos", "sac", "--envs", "Any-v5"])
 
 
 @pytest.mark.slow
