@@ -5,12 +5,8 @@ import zlib
 import gymnasium as gym
 import mujoco
 import numpy as np
-from hypothesis import settings
 
 from noisy_wrappers import WRAPPERS
-
-# Derandomized: a failure in CI is a failure on every machine.
-hypothesis_settings = settings(deadline=None, derandomize=True, max_examples=150)
 
 # a noise, and its formula(noise generator, o_t, o_(t-1)) for three numbers
 OBSERVATION_CASES = {

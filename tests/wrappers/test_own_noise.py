@@ -15,13 +15,7 @@ import pytest
 from cases import GenericEnv
 from gymnasium.utils.env_checker import check_env
 
-from noisy_wrappers import (
-    Configuration,
-    EnvState,
-    make_noisy,
-    parse_noise,
-    run_name,
-)
+from noisy_wrappers import Configuration, EnvState, make_noisy, parse_noise, run_name
 
 ROOT = Path(__file__).parents[2]
 TEXT = "my_noises:StickyAction(3)"
