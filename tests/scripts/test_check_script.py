@@ -7,7 +7,6 @@ import check_script
 import pytest
 import torch
 import torch._inductor.config
-import watched_run
 from check_script import BrokenError, Trial
 
 ROOT = Path(__file__).parents[2]
@@ -208,22 +207,9 @@ def test_an_option_that_the_script_does_not_have_is_named(tmp_path):
 
 def test_a_gradient_in_one_update_will_do():
     """Another loss may leave a shared part of the network without one."""
-    network = torch.nn.Linear(1, 1)
-    seen = SimpleNamespace(updates=[], updaters=0, start=0, places={}, with_gradient=set())
-
-    def updater(loss, network, optimizer):
-        def update(gradient):
-            for parameter in network.parameters():
-                parameter.grad = torch.full_like(parameter, gradient)
-                parameter.data += gradient
-            return {}
-
-        return update
-
-    optimizer = torch.optim.SGD(network.parameters())
-    update = watched_run.watch_updates(updater, seen)(lambda *inputs: None, network, optimizer)
-    for gradient in (0.0, 1.0, 0.0):
-        update(gradient)
+    shared = torch.ones(1)
+    update = SimpleNamespace(name="loss", parameters={"x": shared}, before={"x": torch.zeros(1)})
+    seen = SimpleNamespace(updates=[update], with_gradient={id(shared)})
     check_script.learns(SimpleNamespace(run=seen))
 
 

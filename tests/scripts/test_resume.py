@@ -415,27 +415,21 @@ def test_a_new_option_is_another_run_unless_it_has_its_default(stopped, monkeypa
     assert "sizes [32], not [64, 64]" in untouched(capsys, stopped)
 
 
-@pytest.mark.slow
 def test_another_text_of_the_script_is_said_and_recorded(
     stopped, tmp_path_factory, monkeypatch, capsys
 ):
     config = read_json(stopped / "config.json")
     copy = tmp_path_factory.mktemp("copy") / "ppo_continuous_noisy.py"
     copy.write_text(Path(ppo.__file__).read_text() + "# changed\n")
-    kwargs = hopper("PPO") | {"exp_name": config["args"]["exp_name"]}
-    said = "the script has changed since the run began; if it matters, use --exp-name\n"
     monkeypatch.setattr(ppo, "__file__", str(copy))
     monkeypatch.setattr(ppo.torch, "__version__", "99.0")
-    run("PPO", stopped.parent, **kwargs)
-    assert capsys.readouterr().out.count(said) == 1
+    run("PPO", stopped.parent, episodes=1, **hopper("PPO"))
+    said = "the script has changed since the run began; if it matters, use --exp-name\n"
+    assert said in capsys.readouterr().out
     found = read_json(stopped / "config.json")
-    first, second = found.pop("script_sha256").split(", ")
-    assert first == config.pop("script_sha256") != second and len(second) == 64
-    assert found["versions"].pop("torch") == config["versions"].pop("torch") + ", 99.0"
-    assert found.pop("git_commit").startswith(config.pop("git_commit"))
-    assert found == config
-    run("PPO", stopped.parent, **kwargs)  # it is finished
-    assert capsys.readouterr().out.count(said) == 1
+    first, second = found["script_sha256"].split(", ")
+    assert first == config["script_sha256"] != second and len(second) == 64
+    assert found["versions"]["torch"] == config["versions"]["torch"] + ", 99.0"
 
 
 @pytest.mark.slow
