@@ -91,20 +91,11 @@ class Broken(Hostile):
         return super().step(action)
 
 
-class OtherShape(Hostile):
-    """Returns a column."""
-
-    def step(self, action):
-        observation, *others = super().step(action)
-        return observation.reshape(2, 1), *others
-
-
 def register(entry_point, name="", **kwargs):
     gym.register(f"{name or entry_point.__name__}-v0", entry_point, kwargs=kwargs)
 
 
 register(Hostile)
 register(Broken)
-register(OtherShape)
 register(Hostile, "HostileAlone", workers=0)
 register(Hostile, "HostileHalf", workers=0, dtype=np.float16)

@@ -58,13 +58,11 @@ DAMAGE = {  # and what is said of it
         text("result.json", lambda _: '{"final_return_mean": ' + 400 * "9" + "}"),
         "result.json: ",
     ),
-    "a seed of 1.7": (config(seed=1.7), "seed is 1.7"),
     "a seed that is true": (config(seed=True), "seed is True"),
     "an infinite seed": (config(seed=float("inf")), "Infinity is no number of JSON"),
     "deep nesting": (text("config.json", lambda _: "[" * 100_000), "recursion"),
     "half of a file": (text("config.json", lambda text: text[:70]), "config.json: "),
     "a time limit as text": (config(max_episode_steps="100"), "max_episode_steps is '100'"),
-    "a newline in an id": (config(env_id="Pendulum-v1\nerror: x"), r"env_id is 'Pendulum-v1\n"),
     "an escape sequence": (config(exp_name="\x1b[31m"), r"exp_name is '\x1b[31m'"),
     "an unknown noise": (config(noise=["RandomX(1)"], noise_rate=[1.0]), "RandomX"),
     "a rate of 5": (config(noise_rate=[5.0], noise=[A]), "5.0"),
@@ -119,11 +117,10 @@ def test_damage_is_named(name, case):
     assert said in str(error.value)
 
 
-# All programs read a run in one place, so one kind of damage to each of its files is enough.
+# All programs read a run in one place, so one kind of damage is enough.
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["an unknown noise", "an infinite result", "a huge number"])
-def test_a_damaged_run_hides_no_other_anywhere(name, case, capsys):
-    damage, said = DAMAGE[name]
+def test_a_damaged_run_hides_no_other_anywhere(case, capsys):
+    damage, said = DAMAGE["an infinite result"]
     for folder in case.bad:
         damage(folder)
     assert analyze.main(analyze.Args(case.runs, case.runs.parent / "out")) == 1
@@ -141,8 +138,6 @@ def test_a_damaged_run_hides_no_other_anywhere(name, case, capsys):
     assert "14 runs: 3 done, 0 running, 1 failed, 10 to do" in out
     assert "Pusher-v5, confirmation" in out and re.search(f"damaged .*{re.escape(said)}", out)
 
-    if name == "a huge number":  # what asks for no returns does not read them
-        return
     assert view("status", "--runs-dir", case.runs) == 1
     out = capsys.readouterr().out
     assert "4 runs: 3 done, 0 running, 1 failed, 0 to do" in out
@@ -204,6 +199,7 @@ def test_one_phase_of_a_choice_is_not_analysed_alone(case, tmp_path, capsys):
     assert f"there are some in {case.choice}: name it" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_folder_that_cannot_be_entered_hides_no_run(case):
     """A process without root's rights must be told of it."""
     case.bad[1].chmod(0)

@@ -24,23 +24,22 @@ all_changes = pytest.mark.skipif("CHANGES" not in os.environ, reason="`make chan
 
 
 @all_changes
-@pytest.mark.parametrize("algorithm", ["sac"])  # minutes each: td3, ppo by hand
-def test_a_rehearsal_passes(algorithm, tmp_path):
-    result = rehearse(tmp_path, ALGORITHMS=algorithm, ENVIRONMENTS="Pendulum-v1")
+def test_a_rehearsal_passes(tmp_path):
+    """That of SAC; the others take minutes each."""
+    result = rehearse(tmp_path, ALGORITHMS="sac", ENVIRONMENTS="Pendulum-v1")
     assert (result.returncode, result.stderr) == (0, "")
     assert "FAILED" not in result.stdout
     title, *parts = result.stdout.split("\n## ")
     assert title.startswith("rehearsed on the CPU, ")
-    rows = [re.findall(r"^\| .+", part, re.MULTILINE)[1:] for part in parts]
-    assert len(rows[0]) == 2  # eager and compiled
-    compiled, eager, resumed = rows[1]
+    updates, runs, speeds = (re.findall(r"^\| .+", part, re.MULTILINE)[1:] for part in parts)
+    assert len(updates) == 2  # eager and compiled
+    _, _, resumed = runs
     assert resumed.endswith("eval.csv as without a stop |")
-    speeds = [[cell.strip() for cell in row.split("|")[2:-1]] for row in rows[2]]
-    assert len(speeds) == (5 if algorithm == "ppo" else 6)
-    assert all(float(one.replace(",", "")) > 0 for one, _ in speeds)
-    assert all(two for _, two in speeds[:2]) and not any(two for _, two in speeds[2:])
-    log = (tmp_path / f"{algorithm}-Pendulum-v1-resumed.log").read_text()
-    assert "resumed at step 192" in log
+    assert "resumed at step 192" in (tmp_path / "sac-Pendulum-v1-resumed.log").read_text()
+    assert len(speeds) == 6
+    for row in speeds:
+        speed = row.split("|")[2]
+        assert float(speed.replace(",", "")) > 0
 
 
 @all_changes

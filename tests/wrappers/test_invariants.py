@@ -3,16 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from cases import (
-    BASES,
-    GenericEnv,
-    build,
-    constant_env,
-    registered,
-    rollout,
-    same,
-    streams,
-)
+from cases import BASES, GenericEnv, build, constant_env, registered, rollout, same, streams
 
 from noisy_wrappers import (
     RandomEarlyTermination,

@@ -7,7 +7,6 @@ import pytest
 from cases import NOISES, A, B, C
 
 from noisy_wrappers import canonical_env_id, parse_env_kwargs, run_name
-from sweep.grid import NOISES as NOISES_OF_THE_PAPER
 
 
 def test_run_names():
@@ -34,17 +33,6 @@ def test_other_configurations_have_other_names():
     names |= {run_name("E", "x", pair, [0.5], 1) for pair in ([A, B], [B, A], [A, A])}
     assert len(names) == len(noises) * len(rates) + 3
     assert all(re.fullmatch(r"[A-Za-z0-9._=+-]+", name) for name in names)
-
-
-def test_31_characters_of_a_name_tell_rate_seed_and_kind():
-    """TensorBoard's list shows no more. Kinds are told apart even where a name is cut."""
-    kinds = {noise.partition("(")[0].removeprefix("Random") for noise in NOISES_OF_THE_PAPER}
-    for noise in NOISES_OF_THE_PAPER:
-        shown = run_name("HalfCheetah-v5", "ppo_continuous_noisy", [noise], [0.01], 10)[:31]
-        assert shown.startswith("p0.01_s10_")
-        text = shown.removeprefix("p0.01_s10_")
-        [kind] = [kind for kind in kinds if text.startswith(kind) or kind.startswith(text)]
-        assert noise.startswith(f"Random{kind}(")
 
 
 def test_long_run_names_fit_into_a_file_system():

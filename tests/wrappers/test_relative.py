@@ -7,11 +7,7 @@ import torch
 from cases import OBSERVATION_CASES, REWARD_CASES, GenericEnv, build, rollout, streams
 from test_actions import actions_env
 
-from noisy_wrappers import (
-    Configuration,
-    RandomNormalNoisyAction,
-    RandomObservationBias,
-)
+from noisy_wrappers import Configuration, RandomNormalNoisyAction, RandomObservationBias
 
 UNITS = np.array([0.001, 1.0, 500.0])
 SPACE = gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)

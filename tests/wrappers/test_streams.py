@@ -53,22 +53,6 @@ def test_equal_wrappers_in_a_stack_draw_different_noise():
     assert all(a != b for a, b in both)
 
 
-@pytest.mark.parametrize("text", BASES)
-def test_initial_states_are_those_of_the_bare_environment(text):
-    def initial_states(env):
-        states = []
-        for episode in range(4):
-            env.reset(seed=11 if episode == 0 else None)
-            data = env.unwrapped.data
-            states.append((data.qpos.tobytes(), data.qvel.tobytes()))
-            env.step(np.zeros(1))
-        return states
-
-    bare = initial_states(gym.make("InvertedPendulum-v5"))
-    assert len(set(bare)) == 4
-    assert initial_states(build(text, gym.make("InvertedPendulum-v5"), 1.0)) == bare
-
-
 @pytest.mark.parametrize("text", STEP_BASES)
 def test_a_lower_rate_perturbs_a_subset_of_the_steps(text):
     def perturbed(rate, start=0):
