@@ -77,9 +77,9 @@ def test_early_termination_golden(rate, truncate):
         end = natural[episode % 5] or math.inf
         for t in range(1, 30):
             _, _, terminated, truncated, info = env.step(0)
-            assert terminated == (t == end or (t == last and not truncate))
-            assert truncated == (t == last and truncate)
-            acted = t == last and (truncate or t != end)
+            acted = t == last and t != end
+            assert terminated == (t == end or (acted and not truncate))
+            assert truncated == (acted and truncate)
             ended += acted
             assert info == ({"noise": ("RandomEarlyTermination",)} if acted else {})
             if terminated or truncated:
