@@ -46,11 +46,12 @@ def luck_of_studies(studies):
     one that ends training, or makes it diverge, does something, and has a spread of its own.
 
     Return {(*study.key, environment): the highest difference of each sweep (draws,)}, NaN where
-    nothing could be drawn.
+    nothing was chosen, because one configuration or none was tried, where all tests have the same
+    result, and where no spread is known.
     """
     lucks = {}
     for study in studies:
-        rng = np.random.default_rng(0)
+        rng, all_equal = np.random.default_rng(0), study.all_equal()
         for e, environment in enumerate(study.environments):
             samples = [study.sample(config, e) for config in study.finals]
             best = max(filter(len, samples[1:]), key=np.mean, default=None)
@@ -59,7 +60,8 @@ def luck_of_studies(studies):
             )
             n_baseline, *n_noisy = map(len, samples)
             draws = np.full((1, DRAWS), np.nan)
-            if n_baseline and df > 0:
+            was_chosen = sum(n > 0 for n in n_noisy) > 1
+            if was_chosen and n_baseline and df > 0 and environment not in all_equal:
                 draws = draw_differences(std, df, n_baseline, n_noisy, rng, samples[0])
             lucks[*study.key, environment] = highest(draws)
     return lucks

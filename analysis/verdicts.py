@@ -226,7 +226,7 @@ def luck_sentence(best):
 
     best: its rows of the table of best noises, one for each environment.
     """
-    judged = best[best["p_luck"].notna()]  # the others have too few seeds
+    judged = best[best["p_luck"].notna()]
     if judged.empty:
         return ""
     if not (best["difference"] > 0).any():
@@ -259,8 +259,6 @@ def headlines(by_noise, best):
         found = rows["verdict"].value_counts()
         said = [word for word in VERDICTS if word in CLEAR or word in found]
         counts = [(word, found.get(word, 0)) for word in said]
-        luck = ""
-        if set(rows["verdict"]) != {ALL_EQUAL}:
-            luck = luck_sentence(best[rows_of(best, key)])
+        luck = luck_sentence(best[rows_of(best, key)])
         lines.append({"name": study_name(*key), "tried": tried, "counts": counts, "luck": luck})
     return lines
