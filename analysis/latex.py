@@ -86,15 +86,16 @@ def is_number(name, values):
 def fitting(text, points):
     """Return the Columns of a table that have room, and the names of those that have none.
 
-    The secondary ones are left out first, then the last ones. What a row is about stays, and the
-    columns of noise rates.
+    The secondary ones are left out first, p too where there is a corrected one, then the last ones.
+    What a row is about stays, and the columns of noise rates.
     """
     columns = {}
     for name in text:
         values = list(text[name])
         make = number_column if is_number(name, values) else text_column
         columns[name] = make(name, values)
-    out = [name for name in SECONDARY if name in columns]
+    secondary = (*SECONDARY, "p") if {"p corrected", "p holm"} & columns.keys() else SECONDARY
+    out = [name for name in secondary if name in columns]
     out += [name for name in reversed(columns) if name not in (*out, *KEPT) and name[0].isalpha()]
     left_out = []
     while out and sum(column.width for column in columns.values()) > points:

@@ -9,7 +9,7 @@ import pytest
 from sweeps import run, small_sweep
 
 from analysis.formatting import DASH, Table, shown
-from analysis.latex import latex_table
+from analysis.latex import fitting, latex_table
 
 PAPERS = {  # by the inches of their text: ICML, NeurIPS, ACM
     6.75: r"\documentclass[twocolumn]{article}\setlength{\textwidth}{6.75in}%s\begin{document}",
@@ -53,6 +53,19 @@ def test_a_wide_table_leaves_columns_out_and_says_so_and_a_long_one_goes_on():
     tables = text.count(r"\begin{table*}")
     assert tables == text.count(r"\end{table*}") > 2 and text.count("(continued)") == tables - 1
     assert len(re.findall("Random[0-9]+ &", text)) == 100
+
+
+@pytest.mark.parametrize(
+    ("last", "order"),
+    [
+        ("p_adjusted", ["p", "n", "p corrected", "mean"]),
+        ("p_holm", ["p", "n", "p holm", "mean"]),
+        ("steps", ["n", "steps", "p", "mean"]),
+    ],
+)
+def test_p_is_left_out_before_the_corrected_p(last, order):
+    columns = {"noise": ["A"], "mean": [1.0], "p": [0.01], last: [0.02], "n": [5]}
+    assert fitting(shown(Table("t", pd.DataFrame(columns), "", "")), 0)[1] == order
 
 
 def test_captions_and_cells_are_escaped():
