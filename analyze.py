@@ -38,7 +38,14 @@ from analysis.robustness import analyse_robustness, read_robustness
 from analysis.runs import KEYS, MORE_TO_COME, finished, in_short, left_out, read_runs
 from analysis.studies import make_studies, version_notes
 from analysis.style import COLUMN, PAGE
-from analysis.tables import lopsided_notes, make_tables, success_table, table_of
+from analysis.tables import (
+    NOISES_IN_SHORT,
+    in_words,
+    lopsided_notes,
+    make_tables,
+    success_table,
+    table_of,
+)
 from analysis.verdicts import POINTS, clear_first, headlines, in_sentences, tally
 
 MOST_ROWS = 15  # of the first table in a terminal; the report has all
@@ -149,6 +156,7 @@ def print_results(out, results):
     first = tables["noises"]
     if 0 < len(first.frame) <= MOST_ROWS:
         say("Does a noise help at all? Its rates together, against no noise:")
+        first = replace(first, view=in_words(first.frame, NOISES_IN_SHORT))
         print(f"\n{text_table(first, width)}\n")
     if len(tables["best"].frame) and "best" not in results.repeated:
         say("The best noise in each environment, which may still be worse than no noise:")

@@ -15,7 +15,9 @@ from analysis.verdicts import ALL_EQUAL
 from noisy_wrappers import BASELINE
 
 CONSISTENT_PERCENT = 80  # of the environments, as in the paper
-# The best noises as people read them; a terminal may lack room for the last columns
+# Columns as people read them; a terminal may lack room for the last ones
+NOISES_IN_SHORT = ["verdict", "noise", "algorithm, environment", "difference", "p_adjusted", "n"]
+NOISES_IN_SHORT += ["noise_rate"]
 BEST_VIEW = ["algorithm, environment", "noise", "noise_rate", "difference", "p_adjusted", "n"]
 BEST_VIEW += ["luck_95", "p_luck", "baseline_mean", "baseline_std", "noisy_mean", "noisy_std"]
 DIFFERENCE = ["difference", "difference_low", "difference_high"]
@@ -217,7 +219,7 @@ def make_tables(studies, compared):
     tables = [
         noises_table("noises_together", compared.noises_together),
         noises_table("noises", compared.noises, note=note),
-        table_of("best", best[COLUMNS["best"]], view=best_view(best), note=note),
+        table_of("best", best[COLUMNS["best"]], view=in_words(best, BEST_VIEW), note=note),
         table_of("consistent", good, note=note),
         table_of("consistently_worse", bad, note=f"{failing} {note}".strip()),
         rates_table("statistics_together", compared.rates_together),
@@ -245,11 +247,12 @@ def table_of(kind, frame, name=None, section=None, **more):
     return Table(name or kind, frame, CAPTIONS[kind], section or kind, **more)
 
 
-def best_view(best):
-    """Return the best noises as people read them, in nine columns."""
-    names = [f"{study_name(*key)}, {env}" for *key, env in best[[*STUDY, "environment"]].values]
-    seeds = [seeds_of(*pair) for pair in best[["n", "n_baseline"]].values]
-    said = [verdicts.difference_in_words(row) for row in best.itertuples()]
-    view = best.assign(difference=said, n=seeds)
+def in_words(compared, columns):
+    """Return comparisons as people read them, with names, differences and seeds in words."""
+    names = compared[[*STUDY, "environment"]].to_numpy()
+    names = [f"{study_name(*key)}, {environment}" for *key, environment in names]
+    seeds = [seeds_of(*pair) for pair in compared[["n", "n_baseline"]].values]
+    said = [verdicts.difference_in_words(row) for row in compared.itertuples()]
+    view = compared.assign(difference=said, n=seeds)
     view["algorithm, environment"] = names
-    return view[BEST_VIEW]
+    return view[columns]

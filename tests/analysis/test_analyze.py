@@ -121,6 +121,19 @@ def test_what_is_printed_fits_the_terminal(width, tmp_path, capsys, monkeypatch)
     assert lines[-1] == "Open results/report.html"
 
 
+def test_a_terminal_of_80_columns_has_the_verdicts(tmp_path, capsys, monkeypatch):
+    """However long the names of what was compared are."""
+    where = {"env": "InvertedPendulum-v5", "exp_name": "my_longer_experiment"}
+    for rate in (0.1, 0.2, 0.5, 1.0):
+        noise = {"noise": "RandomNormalNoisyObservation(0.1, relative=True)", "rate": rate}
+        write_pairs(tmp_path, [] if rate > 0.1 else [1.0, 2, 3], [1.0, 2, 4], **noise, **where)
+    monkeypatch.setattr(analyze, "terminal_width", lambda: 80)
+    main(analyze.Args(runs_dir=tmp_path))
+    _, table = capsys.readouterr().out.split("against no noise:\n\n")
+    assert table.startswith("verdict              noise  ") and "environment" in table
+    assert "\nno clear difference  RandomNormalNoisyObservation(0.1,  SAC" in table
+
+
 def test_committed_runs_had_the_noise_that_their_names_say():
     """Each wrapper acted as often as a binomial sample at its rate would, up to 4 deviations."""
     folders = sorted((RESULTS / "data/runs").iterdir())
