@@ -141,8 +141,10 @@ def borderline(row):
 
 def smallest(row):
     """Say which p is the smallest possible where a comparison has too few seeds for an interval."""
-    few = min(row.n, row.n_baseline) < SEEDS_FOR_INTERVAL and significant(row.smallest_p)
-    return f" (smallest possible: {p_text(row.smallest_p)})" if few else ""
+    if min(row.n, row.n_baseline) >= SEEDS_FOR_INTERVAL or not significant(row.smallest_p):
+        return ""
+    none = "; too few seeds for an interval" if pd.notna(row.difference) else ""  # of one place
+    return f" (smallest possible: {p_text(row.smallest_p)}{none})"
 
 
 def cannot_show(row):

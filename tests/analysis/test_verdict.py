@@ -74,8 +74,11 @@ def test_p_of_exactly_five_percent_is_enough():
 def test_few_seeds():
     """Below five there is no interval, with three no p of 0.05, with one no p."""
     _, said = judge([10.0, 11, 12, 13], [110.0, 111, 112, 113])
-    expected = "better than no noise: +100.0 (+870 %), p = 0.029 (smallest possible: 0.029), the "
-    assert expected in said["sentence"].iloc[0]
+    few = "(smallest possible: 0.029; too few seeds for an interval)"
+    expected = f"better than no noise: +100.0 (+870 %), p = 0.029 {few}, the only comparison there."
+    assert said["sentence"].iloc[0].endswith(expected)
+    _, said = judge(TEN, [104.0, 104.5])
+    assert "p = 0.85 (smallest possible: 0.03; too few" in said["sentence"].iloc[0]
     _, said = judge([10.0, 11, 12], [9.0, 10])
     assert "2 seeds against 3 cannot show any (smallest possible p" in said["sentence"].iloc[0]
     _, said = judge([10.0], [5.0])
