@@ -265,7 +265,7 @@ def robustness_sentences(scores, metric):
             shown = "too few seeds for a test of robustness"
         else:
             corrected = p_value(row.p_holm).removeprefix("= ")
-            evidence += f", p {p_value(row.p)}, Holm {corrected}"
+            evidence += f", p {p_value(row.p)}{verdicts.smallest(row)}, Holm {corrected}"
             limit = verdicts.excluded(row, unit) + verdicts.cannot_show(row)
         if verdicts.significant(row.p_holm):
             shown = "more robust" if row.t > 0 else "less robust"
