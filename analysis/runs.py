@@ -15,7 +15,7 @@ import pandas as pd
 from analysis import folders
 from analysis.folders import NOT_SETTINGS, SEARCH, DamageError, Run, script_name
 from analysis.logs import STOPPED, read_log
-from noisy_wrappers import BASELINE, different_arguments
+from noisy_wrappers import BASELINE, different_arguments, run_name
 
 STUDY = ["algorithm", "exp_name", "phase", "tested"]  # the columns that name a study: study_name
 KEYS = [*STUDY, "environment", "noise", "noise_rate"]
@@ -189,9 +189,10 @@ def missing_runs(entries):
     Expected are the seeds that at least half of a study's configurations with noise have, each
     environment counted apart. An environment in which anything was run should have the baseline
     with these seeds. The search of `./benchmark.sh choose` gives few noises many seeds: nothing is
-    missing there.
+    missing there. Nor is a run whose folder is there, by its name, and tells nothing.
     """
     missing = []
+    silent = {Path(entry.folder).name for entry in entries if entry.run is None}
     runs = [e.run for e in entries if e.run is not None and e.status != "different"]
     for study in by_study(run for run in runs if run.phase != SEARCH).values():
         found, example = defaultdict(set), {}
@@ -206,8 +207,17 @@ def missing_runs(entries):
         for environment, configuration in sorted(found.keys() | baselines):
             for seed in sorted(expected - found.get((environment, configuration), set())):
                 run = replace(example[environment], configuration=configuration, seed=seed)
-                missing.append(Entry("", "missing", "no run folder", run))
+                if folder_of(run) not in silent:
+                    missing.append(Entry("", "missing", "no run folder", run))
     return missing
+
+
+def folder_of(run):
+    """Return the name that a run's script gives its folder."""
+    noise, rate = run.tested_under.texts
+    more = {"env_kwargs": run.args.get("env_kwargs", ()), "test_noise": noise}
+    identity = run.environment, run.exp_name, *run.configuration.texts, run.seed
+    return run_name(*identity, **more, test_noise_rate=rate)
 
 
 def left_out(entries):

@@ -10,7 +10,7 @@ from sweeps import ENDING, SCALE, row, run, small_sweep, write_pairs, write_run
 
 from analysis.runs import in_short, left_out, missing_runs, read_runs
 from analysis.studies import make_studies, version_notes
-from noisy_wrappers import BASELINE
+from noisy_wrappers import BASELINE, run_name
 
 BEGUN = "# 2026-01-01 00:00:00 host: python ppo_continuous_noisy.py\n"
 NEW = {"versions": {"noisy_wrappers": "0.4.1"}}
@@ -65,6 +65,22 @@ def test_unfinished_missing_and_duplicate_runs_are_listed(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "WARNING: Runs left out: 3 (" in printed and "copy" in printed
     assert "not complete (1 unfinished, 1 missing)" in printed
+
+
+@pytest.mark.parametrize(("file", "status"), [("config.json", "corrupt"), (".lock", "unfinished")])
+def test_a_run_whose_config_cannot_be_read_is_not_missing_too(file, status, tmp_path):
+    """The name of its folder tells which run it is."""
+    more = {"test_noise": [ENDING], "test_noise_rate": [0.5], "env_kwargs": ["mode:1"]}
+    for noise, rate in (((), ()), ((ENDING,), (0.1,)), ((SCALE,), (0.1,))):
+        for seed in (1, 2):
+            name = run_name("Hopper-v5", "sac_continuous_noisy", noise, rate, seed, **more)
+            run = {"noise": noise, "rate": rate, "seed": seed, "folder": name}
+            folder = write_run(tmp_path, [1], **run, **more)
+    shutil.rmtree(folder)
+    folder.mkdir()
+    (folder / file).write_text("{")
+    (folder / ".lock").touch()
+    assert left_out(read_runs(tmp_path))["status"].tolist() == [status]
 
 
 def test_every_run_left_out_has_its_own_reason(tmp_path):
