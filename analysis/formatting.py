@@ -67,6 +67,12 @@ def percent(value, sign="+"):
     return f"{value:{sign},.{0 if abs(value) >= 10 else 1}f} %"
 
 
+def percent_end(value):
+    """Write an end of an interval in percent; what looks like zero and is not gets a digit."""
+    text = percent(value, sign="")
+    return f"{value:.1g} %" if text == "0.0 %" and abs(value) > 1e-9 else text
+
+
 def seeds_of(n, n_baseline):
     """Write the seeds with and without noise: "5", or "5/10" where they differ."""
     return f"{n:.0f}" if n == n_baseline else f"{n:.0f}/{n_baseline:.0f}"
@@ -190,7 +196,8 @@ def text_of(name, value, spread=None):
     if name in FORMATS:
         return f"{value:{FORMATS[name]}}"
     if name in PERCENTS or (name.endswith("_percent") and spread is None):
-        return percent(value, sign="").removesuffix(" %")
+        is_end = name in ("percent_low", "percent_high")
+        return (percent_end(value) if is_end else percent(value, sign="")).removesuffix(" %")
     return rounded(value, spread)
 
 

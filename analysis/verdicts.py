@@ -15,6 +15,7 @@ from analysis.formatting import (
     p_text,
     p_value,
     percent,
+    percent_end,
     rounded,
 )
 from analysis.power import LEVEL
@@ -97,28 +98,27 @@ def difference_in_words(row, unit=""):
 
 def percent_interval(row):
     """Write the interval of a change in percent: " [15, 28]", or ""."""
-    low, high = getattr(row, "percent_low", nan), getattr(row, "percent_high", nan)
-    if pd.isna(low):
+    ends = getattr(row, "percent_low", nan), getattr(row, "percent_high", nan)
+    if pd.isna(ends[0]):
         return ""
-    return f" [{', '.join(percent(end, sign='').removesuffix(' %') for end in (low, high))}]"
+    return f" [{', '.join(percent_end(end).removesuffix(' %') for end in ends)}]"
 
 
 def excluded(row, unit=""):
     """Say which gains and losses the interval of a comparison excludes, or ""."""
     if pd.isna(row.difference_low):
         return ""
-    low, high = row.difference_low, row.difference_high
-    in_percent = pd.notna(getattr(row, "percent_high", nan))
+    spread = spread_of(row)
 
-    def size(end, end_in_percent):
-        if in_percent:
-            return percent(abs(end_in_percent), sign="")
-        return not_zero(abs(end), spread_of(row)) + unit
+    def beyond(what, end, end_in_percent):  # above zero there is more than nothing
+        if end_in_percent > 0:
+            return f"a {what} of more than {percent_end(end_in_percent)}"
+        if end > 0:
+            return f"a {what} of more than {not_zero(end, spread)}{unit}"
+        return f"any {what}"
 
-    gain = "any gain" if high <= 0 else ""
-    loss = "any loss" if low >= 0 else ""
-    gain = gain or f"a gain of more than {size(high, row.percent_high if in_percent else nan)}"
-    loss = loss or f"a loss of more than {size(low, row.percent_low if in_percent else nan)}"
+    gain = beyond("gain", row.difference_high, row.percent_high)
+    loss = beyond("loss", -row.difference_low, -row.percent_low)
     return f"; excluded: {gain}, {loss}"
 
 

@@ -171,6 +171,26 @@ def test_an_end_of_an_interval_looks_like_zero_only_if_it_is(value, spread, expe
     assert analysis.formatting.text_of("difference_low", value, spread) == expected
 
 
+def test_what_is_excluded_agrees_with_the_ends_of_both_intervals():
+    """Welch's and Fieller's may end on two sides of zero, and close to it."""
+
+    def said(low, high, percent_low, percent_high):
+        row = {"difference": 5.0, "difference_low": low, "difference_high": high}
+        row |= {"difference_percent": 5.0, "percent_low": percent_low, "percent_high": percent_high}
+        row = pd.Series(row)
+        text = analysis.verdicts.difference_in_words(row) + analysis.verdicts.excluded(row)
+        return text.replace("; excluded: a gain of more than 11 %, a loss of more than ", " > ")
+
+    assert said(-0.011, 10, -0.011, 11) == "+5.0 [-0.011, 10.0] (+5.0 % [-0.01, 11]) > 0.01 %"
+    assert said(-0.26, 10, 0.3, 11) == "+5.0 [-0.3, 10.0] (+5.0 % [0.3, 11]) > 0.3"
+    assert said(0.2, 10, -0.1, 11) == "+5.0 [0.2, 10.0] (+5.0 % [-0.1, 11]) > 0.1 %"
+    assert said(0.2, 10, 0.3, 11).endswith("a gain of more than 11 %, any loss")
+    assert said(-9, 0.2, -9, -0.1).endswith("a gain of more than 0.2, a loss of more than 9.0 %")
+    assert said(-9, 0.0, -9, 0.0).endswith("any gain, a loss of more than 9.0 %")
+    assert analysis.formatting.text_of("percent_low", -0.011) == "-0.01"
+    assert analysis.formatting.text_of("percent_high", 1e-12) == "0.0"
+
+
 def test_a_p_above_the_level_does_not_look_like_it():
     said = [analysis.formatting.p_value(p) for p in (0.0496, 0.05, 0.0504, 0.051, 0.0004)]
     assert said == ["= 0.05", "= 0.05", "= 0.0504", "= 0.051", "< 0.001"]
