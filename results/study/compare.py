@@ -135,7 +135,7 @@ def in_words(effect, p):
     return "helps" if effect > 0 else "harms"
 
 
-# Set E of plans.md: after so many seeds a side, the nominal level of p, and what |t| must reach
+# Of a set with looks: after so many seeds a side, the nominal level of p, and what |t| must reach
 LOOKS = {
     10: (0.0000011, 0.0),
     20: (0.00079, 0.3),
@@ -146,7 +146,7 @@ LOOKS = {
 
 
 def in_looks(runs):
-    """Compare the runs of set E, in the order of their seeds, at each look and after the last seed.
+    """Compare the runs of a set, in the order of their seeds, at each look and after the last seed.
 
     The look that decides, or sees too little hope, is the last row: what comes after it does not
     count.
@@ -180,7 +180,7 @@ NAMES |= {
 
 
 def by_the_tool(folder, environments, seeds, seeds_without):
-    """Compare the runs of a set as analyze.py does: sets F and G of plans.md.
+    """Compare the runs of a set as analyze.py does, environments together.
 
     The rows "together", one for each noise, have the verdicts, corrected for each other, when all
     environments have all seeds. A set without a noise in two environments has no table yet.

@@ -1,4 +1,4 @@
-"""The picture of the project's first page, and those of sets E, F and G in plans.md."""
+"""The picture of the project's first page, and those of sets of plans.md."""
 
 import re
 
@@ -6,6 +6,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from analysis import style
+from results.study.__main__ import IN_LOOKS, TOGETHER
 from results.study.returns import RESULTS
 
 COLORS = {"confirmed": style.BETTER, "contradicted": style.WORSE}
@@ -80,7 +81,7 @@ def draw_set(table):
 def pictures():
     """Return {name: figure}; a set has one when it has a table."""
     found = {"best_noises": draw()}
-    for name in ("ppo_walker2d", "td3_fresh", "ppo_relative"):
+    for name in (*IN_LOOKS, *TOGETHER):
         path = RESULTS / f"tables/{name}.csv"
         if path.exists():
             found[name] = draw_set(pd.read_csv(path))

@@ -190,7 +190,7 @@ def test_the_papers_tables_stand_beside_ours(tmp_path):
     assert len(early) == 75 and len(tables["consistent"]) == 29  # the paper's rows
 
 
-def runs_of_set_e(n, change, spread=1.0, seed=0):
+def runs_of_a_set(n, change, spread=1.0, seed=0):
     """Return n seeds a side whose means differ by exactly `change` and deviate by `spread`."""
     rng = np.random.default_rng(seed)
     rows = []
@@ -221,10 +221,10 @@ def runs_of_set_e(n, change, spread=1.0, seed=0):
         (50, -0.45, 4 * ["under way"] + ["harms"]),
     ],
 )
-def test_set_e_ends_at_the_look_that_decides(n, change, verdicts, monkeypatch):
+def test_a_set_with_looks_ends_at_the_one_that_decides(n, change, verdicts, monkeypatch):
     """Runs of both directions: better, worse, too little hope, and going on."""
     monkeypatch.setattr(compare, "SHUFFLES", 20_000)
-    runs = runs_of_set_e(n, change)
+    runs = runs_of_a_set(n, change)
     half = runs.iloc[[0]].assign(seed=999)  # a seed with one side only
     table = compare.in_looks(pd.concat([runs, half]))
     assert list(table["verdict"]) == verdicts
@@ -242,7 +242,7 @@ def test_the_levels_of_set_e_stand_in_its_plan():
     assert [float(text) for text in least[2:5]] == [t for _, t in compare.LOOKS.values()][1:4]
 
 
-def test_sets_f_and_g_are_compared_as_analyze_does(data):
+def test_a_set_of_several_environments_is_compared_as_analyze_does(data):
     """One verdict a noise, over environments; two noises are corrected for each other."""
     (data / "set").mkdir()
     assert compare.by_the_tool("set", 2, 6, 6).empty
