@@ -46,7 +46,7 @@ def verdict(row, smallest_gain=None, metric=None):
         return TOO_FEW
     if significant(row["p_adjusted"]):
         return BETTER if row["t"] > 0 else WORSE
-    if smallest_gain is not None:
+    if smallest_gain is not None and row["difference_low"] < row["difference_high"]:
         limit = row["difference_high"] if metric == SUCCESS else row["percent_high"]
         if limit < smallest_gain:
             return NO_SUCH_GAIN
@@ -106,7 +106,7 @@ def percent_interval(row):
 
 def excluded(row, unit=""):
     """Say which gains and losses the interval of a comparison excludes, or ""."""
-    if pd.isna(row.difference_low):
+    if not row.difference_low < row.difference_high:  # there is none, or nothing varies
         return ""
     spread = spread_of(row)
 

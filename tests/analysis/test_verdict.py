@@ -100,6 +100,15 @@ def test_an_unclear_verdict_says_what_is_excluded():
     assert ": 0.0 [" in said["sentence"].iloc[0]  # no sign of what is written as zero
 
 
+def test_returns_that_never_vary_exclude_nothing():
+    """All runs reach the highest return: that says nothing about the next seed."""
+    curve = np.array([[1.0], [5]])
+    one = study({None: 5 * [5.0], 1: 5 * [5.0]})
+    one.curves = {config: np.stack([curve] * 5, axis=1) for config in one.finals}
+    [text] = analysis.verdicts.in_sentences(compare_all([one], smallest_gain=5).noises)["sentence"]
+    assert text.endswith("shows no clear difference: 0 [0, 0] (0.0 % [0.0, 0.0]), p = 1.")
+
+
 def test_a_gain_that_matters_may_be_excluded():
     high = judge(TEN, TEN - 1)[0]["percent_high"][0]
     for gain, verdict in ((high + 0.01, "no such gain"), (high - 0.01, "no clear difference")):
