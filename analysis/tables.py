@@ -122,8 +122,9 @@ def split_consistency(consistency):
 
 def lopsided_notes(compared):
     """Say where verdicts may be wrong too often, because one side has few of all seeds."""
-    pairs = zip(compared.noises["n"], compared.noises["n_baseline"], strict=True)
-    noises = compared.noises[np.array([verdicts.is_lopsided(*pair) for pair in pairs], bool)]
+    noises = compared.noises[compared.noises["p"].notna()]
+    pairs = zip(noises["n"], noises["n_baseline"], strict=True)
+    noises = noises[np.array([verdicts.is_lopsided(*pair) for pair in pairs], bool)]
     rates = compared.rates[compared.rates["n"].ge(2) & compared.rates["smallest_p"].isna()]
     notes = []
     for rows, said in (

@@ -100,6 +100,15 @@ def test_rates_with_too_few_of_all_seeds_have_no_verdict(tmp_path, capsys):
     )
 
 
+def test_a_note_on_lopsided_seeds_needs_a_verdict(tmp_path, capsys):
+    """One seed against six is no test, and equal returns are none either."""
+    write_pairs(tmp_path / "runs", [1.0, 2, 3, 4, 5, 6], [7.0])
+    write_pairs(tmp_path / "runs", 6 * [1.0], 2 * [1.0], env="Maze-v0")
+    tables = run(tmp_path)
+    assert set(tables["noises"]["verdict"]) == {"too few seeds", "all equal"}
+    assert "more often than in 5 %" not in capsys.readouterr().out
+
+
 def test_a_runs_value_is_the_mean_of_its_tests_in_the_last_15_percent(tmp_path):
     """result.json keeps the last test."""
     write_run(tmp_path / "runs", 18 * [0] + [30, 60], every=50_000)
