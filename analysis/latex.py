@@ -17,6 +17,7 @@ CHARACTER, BETWEEN = 3.7, 7.0  # points at \footnotesize: of a character, and be
 # Characters in a line of a column of text, which is broken there
 MOST_OF_NAMES, MOST_OF_WORDS = 24, 12
 KEPT = ("environment", "noise", "noise rate", "steps millions", "algorithm, environment")
+CORRECTED = ("p corrected", "p holm")
 SECONDARY = ("P(improvement)", "IQM change %", "effect size", "chosen from")  # left out first
 MOST_ROWS = 30  # of a table, where a name may take two lines; the others have tables of their own
 NUMBER = re.compile(r"((?:< ?)?[-+]?(?:[0-9]|inf)[^ ]*) ?(.*)")
@@ -86,17 +87,19 @@ def is_number(name, values):
 def fitting(text, points):
     """Return the Columns of a table that have room, and the names of those that have none.
 
-    The secondary ones are left out first, p too where there is a corrected one, then the last ones.
-    What a row is about stays, and the columns of noise rates.
+    The secondary ones are left out first, with them p where there is a corrected one, then the last
+    ones. What a row is about stays, and what a verdict needs: its size and the corrected p.
     """
     columns = {}
     for name in text:
         values = list(text[name])
         make = number_column if is_number(name, values) else text_column
         columns[name] = make(name, values)
-    secondary = (*SECONDARY, "p") if {"p corrected", "p holm"} & columns.keys() else SECONDARY
-    out = [name for name in secondary if name in columns]
-    out += [name for name in reversed(columns) if name not in (*out, *KEPT) and name[0].isalpha()]
+    size = "difference" if "difference" in columns else "effect size"
+    kept = (*OF_STUDY, *KEPT, "verdict", size, *CORRECTED)
+    secondary = (*SECONDARY, "p") if columns.keys() & set(CORRECTED) else SECONDARY
+    out = [name for name in (*secondary, *reversed(columns)) if name in columns]
+    out = [name for name in dict.fromkeys(out) if name not in kept and name[0].isalpha()]
     left_out = []
     while out and sum(column.width for column in columns.values()) > points:
         left_out.append(out.pop(0))
@@ -115,6 +118,8 @@ def latex_table(table, text, inches):
     if shared and len(text) > 1:
         caption = f"{', '.join(text.iloc[0][shared])}: {caption}"
         text = text.drop(columns=shared)
+    if len(text):
+        text = text.loc[:, (text != DASH).any()]  # a column of dashes says nothing
     columns, left_out = fitting(text, 72 * inches)
     lines = []
     if left_out:

@@ -9,7 +9,7 @@ import pytest
 from sweeps import run, small_sweep
 
 from analysis.formatting import DASH, Table, shown
-from analysis.latex import fitting, latex_table
+from analysis.latex import latex_table
 
 PAPERS = {  # by the inches of their text: ICML, NeurIPS, ACM
     6.75: r"\documentclass[twocolumn]{article}\setlength{\textwidth}{6.75in}%s\begin{document}",
@@ -47,6 +47,7 @@ def test_what_rows_share_is_said_once():
 def test_a_wide_table_leaves_columns_out_and_says_so_and_a_long_one_goes_on():
     columns = {"noise": [f"Random{i}" for i in range(100)], "effect_size": [1.5] * 100}
     columns |= {f"a column {i}": ["some words here"] * 100 for i in range(9)}
+    columns["difference"] = [1.0] * 100
     text = table_of(columns, 5.5)
     [left_out] = re.findall("% no room for: (.*) \\(see t.csv\\)", text)
     assert left_out.startswith("effect size, a column 8") and "noise" not in left_out
@@ -55,17 +56,16 @@ def test_a_wide_table_leaves_columns_out_and_says_so_and_a_long_one_goes_on():
     assert len(re.findall("Random[0-9]+ &", text)) == 100
 
 
-@pytest.mark.parametrize(
-    ("last", "order"),
-    [
-        ("p_adjusted", ["p", "n", "p corrected", "mean"]),
-        ("p_holm", ["p", "n", "p holm", "mean"]),
-        ("steps", ["n", "steps", "p", "mean"]),
-    ],
-)
-def test_p_is_left_out_before_the_corrected_p(last, order):
-    columns = {"noise": ["A"], "mean": [1.0], "p": [0.01], last: [0.02], "n": [5]}
-    assert fitting(shown(Table("t", pd.DataFrame(columns), "", "")), 0)[1] == order
+@pytest.mark.parametrize("corrected", ["p_adjusted", "p_holm"])
+def test_what_a_verdict_needs_is_never_left_out(corrected):
+    """In one environment the difference; all together have the effect size instead."""
+    columns = {"noise": ["A"], "verdict": ["worse"], "difference": [-1.0], "effect_size": [-3.0]}
+    columns |= {"algorithm": ["A"], "p": [0.01], corrected: [0.02], "n": [5]}
+    for lacking, left_out in ((None, "effect size, p, n"), ("difference", "p, n")):
+        text = table_of(columns | {lacking: [None]} if lacking else columns, 1)
+        assert "algorithm & " in text
+        assert f"% no room for: {left_out} (see" in text
+        assert ("effect" in text.partition("toprule")[2]) == bool(lacking)
 
 
 def test_captions_and_cells_are_escaped():
