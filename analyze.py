@@ -38,14 +38,7 @@ from analysis.robustness import analyse_robustness, read_robustness
 from analysis.runs import KEYS, MORE_TO_COME, finished, in_short, left_out, read_runs
 from analysis.studies import make_studies, version_notes
 from analysis.style import COLUMN, PAGE
-from analysis.tables import (
-    NOISES_IN_SHORT,
-    in_words,
-    lopsided_notes,
-    make_tables,
-    success_table,
-    table_of,
-)
+from analysis.tables import in_words, lopsided_notes, make_tables, success_table, table_of
 from analysis.verdicts import POINTS, clear_first, headlines, in_sentences, tally
 
 MOST_ROWS = 15  # of the first table in a terminal; the report has all
@@ -156,7 +149,7 @@ def print_results(out, results):
     first = tables["noises"]
     if 0 < len(first.frame) <= MOST_ROWS:
         say("Does a noise help at all? Its rates together, against no noise:")
-        first = replace(first, view=in_words(first.frame, NOISES_IN_SHORT))
+        first = replace(first, view=in_words(first.frame, "noises"))
         print(f"\n{text_table(first, width)}\n")
     if len(tables["best"].frame) and "best" not in results.repeated:
         say("The best noise in each environment, which may still be worse than no noise:")
@@ -231,12 +224,7 @@ def analyse(args, entries, choice):
         robustness=robustness,
         overview=overview_of(entries, studies),
         problems=f"Runs left out: {number.sum():,} ({counts})." if len(number) else "",
-        notes=[
-            *incomplete_note(number),
-            *lopsided_notes(compared),
-            *notes,
-            *unreadable,
-        ],
+        notes=[*incomplete_note(number), *lopsided_notes(compared), *notes, *unreadable],
         versions=version_notes(entries),
     )
 

@@ -220,9 +220,8 @@ def parameters_figure(study, configs, band=INTERVAL, width=None):
     noises = list(dict.fromkeys(config.noise for config in configs))
     rates = sorted({config.noise_rate for config in configs}, key=rate_order)
     colors = dict(zip(noises, style.hues(len(noises)), strict=True))
-    beside = dict(
-        zip(noises, 0.7 * ((np.arange(len(noises)) + 0.5) / len(noises) - 0.5), strict=True)
-    )
+    shifts = 0.7 * ((np.arange(len(noises)) + 0.5) / len(noises) - 0.5)
+    beside = dict(zip(noises, shifts, strict=True))
     places = range(len(study.environments))
     tried = [e for e in places if any(len(study.sample(config, e)) for config in configs)]
     if any(len(study.sample(BASELINE, e)) for e in tried):

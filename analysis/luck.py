@@ -21,8 +21,7 @@ def draw_differences(std, df, n_baseline, n_noisy, rng, seeds=()):
     own, std sqrt(df / chi2_df). For a single configuration this is Student's t-test. Returns are
     normal, or have the shape of the baseline's `seeds` if there are SEEDS_TO_RESAMPLE or more.
 
-    std, df, n_baseline: numbers; n_noisy (configs,), 0 where there is no run
-    -> (configs x draws) in units of std, NaN where there is no run.
+    std, df, n_baseline: numbers; n_noisy (configs,) -> (configs x draws) in units of std.
     """
     spread = std * np.sqrt(df / rng.chisquare(df, DRAWS))
     resample = len(seeds) >= SEEDS_TO_RESAMPLE and np.ptp(seeds) > 0
@@ -35,8 +34,7 @@ def draw_differences(std, df, n_baseline, n_noisy, rng, seeds=()):
         return rng.standard_normal(DRAWS) / np.sqrt(n)
 
     baseline = mean_of(n_baseline)
-    nothing = np.full(DRAWS, np.nan)
-    return np.array([spread * (mean_of(n) - baseline) if n else nothing for n in n_noisy])
+    return np.array([spread * (mean_of(n) - baseline) for n in n_noisy])
 
 
 def luck_of_studies(studies):
@@ -59,22 +57,18 @@ def luck_of_studies(studies):
                 [s for s in samples if s is best or not clearly_worse(s, samples[0])]
             )
             n_baseline, *n_noisy = map(len, samples)
-            draws = np.full((1, DRAWS), np.nan)
-            was_chosen = sum(n > 0 for n in n_noisy) > 1
-            if was_chosen and n_baseline and df > 0 and environment not in all_equal:
-                draws = draw_differences(std, df, n_baseline, n_noisy, rng, samples[0])
-            lucks[*study.key, environment] = highest(draws)
+            tried = [n for n in n_noisy if n]
+            best_draws = np.full(DRAWS, np.nan)
+            if len(tried) > 1 and n_baseline and df > 0 and environment not in all_equal:
+                draws = draw_differences(std, df, n_baseline, tried, rng, samples[0])
+                best_draws = draws.max(axis=0)
+            lucks[*study.key, environment] = best_draws
     return lucks
 
 
 def clearly_worse(sample, baseline):
     """Tell whether the 95 % interval of the difference of two samples is below zero."""
     return len(sample) > 1 and len(baseline) > 1 and contrast([sample, baseline], [1, -1])[3] < 0
-
-
-def highest(draws):
-    """Return the highest difference of each sweep: (configs x draws) -> (draws,), or NaN."""
-    return np.fmax.reduce(draws, axis=0, initial=np.nan)
 
 
 def p_of_luck(draws, observed):

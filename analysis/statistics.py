@@ -85,7 +85,7 @@ def at_least_minus_100(percent, returns):
     return max(percent, -100.0) if np.all(returns > 0) else percent
 
 
-def fieller(x, y, level=LEVEL, episodes=None):
+def fieller(x, y, level=LEVEL):
     """Return the interval of 100 (mean x - mean y) / |mean y|, in percent: Fieller's.
 
     Both means are uncertain. The interval has the ratios r for which Student's t of mean x -
@@ -93,11 +93,11 @@ def fieller(x, y, level=LEVEL, episodes=None):
     NaN where that set is unbounded, because mean y is not clearly unequal to zero, or nearly so:
     percent_of tells no change beyond 1,000 % either.
 
-    x (seeds,), y (other seeds,), two or more on each side; level, episodes: see contrast.
+    x (seeds,), y (other seeds,), two or more on each side; level: of the interval.
     Fieller (1954), https://doi.org/10.1111/j.2517-6161.1954.tb00159.x
     """
     means = np.array([np.mean(x), np.mean(y)])
-    variances = np.array([variance_of_mean(sample, episodes) for sample in (x, y)])
+    variances = np.array([variance_of_mean(sample) for sample in (x, y)])
     if means[1] == 0:
         return nan, nan
     ratio = means[0] / means[1]

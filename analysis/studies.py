@@ -156,9 +156,7 @@ def version_notes(entries):
             if mixed:
                 counts = sum(mixed, Counter())
                 told = ", ".join(f"{version} (n = {n})" for version, n in sorted(counts.items()))
-                what = {"git commit": "of different code versions"}
-                what["script"] = f"made by different texts of {runs[0].script}"
-                kind = what.get(library, f"with different {library}")
                 advice = "; give a changed script another --exp-name" if library == "script" else ""
-                notes.append(f"{study_name(*key)}: some rows average runs {kind}: {told}{advice}")
+                rows = f"{study_name(*key)}: some rows average runs with different {library}"
+                notes.append(f"{rows}: {told}{advice}")
     return notes

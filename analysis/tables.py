@@ -15,11 +15,11 @@ from analysis.verdicts import ALL_EQUAL
 from noisy_wrappers import BASELINE
 
 CONSISTENT_PERCENT = 80  # of the environments, as in the paper
+_BEST = ["algorithm, environment", "noise", "noise_rate", "difference", "p_adjusted", "n"]
+_BEST += ["luck_95", "p_luck", "baseline_mean", "baseline_std", "noisy_mean", "noisy_std"]
+_NOISES = ["verdict", "noise", "algorithm, environment", "difference", "p_adjusted", "n"]
 # Columns as people read them; a terminal may lack room for the last ones
-NOISES_IN_SHORT = ["verdict", "noise", "algorithm, environment", "difference", "p_adjusted", "n"]
-NOISES_IN_SHORT += ["noise_rate"]
-BEST_VIEW = ["algorithm, environment", "noise", "noise_rate", "difference", "p_adjusted", "n"]
-BEST_VIEW += ["luck_95", "p_luck", "baseline_mean", "baseline_std", "noisy_mean", "noisy_std"]
+IN_WORDS = {"best": _BEST, "noises": [*_NOISES, "noise_rate"]}
 DIFFERENCE = ["difference", "difference_low", "difference_high"]
 DIFFERENCE += ["difference_percent", "percent_low", "percent_high"]
 MORE = ["t", "pooled_std", "environments", "comparisons", "smallest_p", "smallest_p_adjusted"]
@@ -45,7 +45,7 @@ COLUMNS = {name: text.split() for name, text in _COLUMNS.items()} | {
     "statistics_together": [*RATES, *IQM_CHANGE, *PROBABILITY, *MORE],
 }  # after those that name a study
 COLUMNS = {name: [*STUDY, *columns] for name, columns in COLUMNS.items()}
-ONLY_CSV = (*IQM, *MORE, "detectable")
+ONLY_CSV = (*IQM, *MORE, "detectable")  # wide tables lack these where people read them
 
 # --------------------------------------------------------------------------------------------- rows
 
@@ -144,7 +144,7 @@ def success_table(studies):
     """Return the table of final success rates as {name: Table}, empty without such studies."""
     studies = [study for study in studies if study.phase != SEARCH]
     rows = results(studies, compare_all(studies))
-    return {"success": table_of("success", rows[COLUMNS["success"]])} if len(rows) else {}
+    return {"success": table_of("success", rows)} if len(rows) else {}
 
 
 # At most two lines in the report; docs/statistics.md says how the numbers are computed.
@@ -215,45 +215,38 @@ def make_tables(studies, compared):
     failing = f"Worse at every rate that was tried: {failing or 'none'}."
     note = percent_note(judged, metric)
     has_comparison = judged["difference"].notna()
-    table = judged.assign(n_baseline=judged["n_baseline"].where(has_comparison))
-    table = table[COLUMNS["statistics"]]
+    rates = judged.assign(n_baseline=judged["n_baseline"].where(has_comparison))
+    rates = rates[COLUMNS["statistics"]]
     tables = [
-        noises_table("noises_together", compared.noises_together),
-        noises_table("noises", compared.noises, note=note),
-        table_of("best", best[COLUMNS["best"]], view=in_words(best, BEST_VIEW), note=note),
+        table_of("noises_together", compared.noises_together, section="noises", only_csv=MORE),
+        table_of("noises", compared.noises, only_csv=MORE, note=note),
+        table_of("best", best, view=in_words(best, "best"), note=note),
         table_of("consistent", good, note=note),
         table_of("consistently_worse", bad, note=f"{failing} {note}".strip()),
-        rates_table("statistics_together", compared.rates_together),
-        table_of("statistics", table, view=table[has_comparison], only_csv=ONLY_CSV, note=note),
+        table_of(
+            "statistics_together", compared.rates_together, section="statistics", only_csv=ONLY_CSV
+        ),
+        table_of("statistics", rates, view=rates[has_comparison], only_csv=ONLY_CSV, note=note),
         table_of("early_performance", early, rates_beside=True),
     ]
     for algorithm, table in alone.groupby("algorithm"):
         more = {"name": f"summary_{slug(algorithm)}", "note": percent_note(table, metric)}
-        tables.append(table_of("summary", table[COLUMNS["summary"]], **more))
+        tables.append(table_of("summary", table, **more))
     return {table.name: table for table in tables}
 
 
-def noises_table(kind, rows, **more):
-    """Make one of the tables of the first question: does a noise help at all?"""
-    return table_of(kind, rows[COLUMNS[kind]], section="noises", only_csv=tuple(MORE), **more)
-
-
-def rates_table(kind, rows, **more):
-    """Make one of the tables of single rates."""
-    return table_of(kind, rows[COLUMNS[kind]], section="statistics", only_csv=ONLY_CSV, **more)
-
-
 def table_of(kind, frame, name=None, section=None, **more):
-    """Make a Table as this module describes its kind; name and section may be kind."""
+    """Make a Table with the columns and the caption of its kind; name and section may be kind."""
+    frame = frame[COLUMNS.get(kind, list(frame))]
     return Table(name or kind, frame, CAPTIONS[kind], section or kind, **more)
 
 
-def in_words(compared, columns):
-    """Return comparisons as people read them, with names, differences and seeds in words."""
+def in_words(compared, kind):
+    """Return comparisons with the columns IN_WORDS of a kind of table."""
     names = compared[[*STUDY, "environment"]].to_numpy()
     names = [f"{study_name(*key)}, {environment}" for *key, environment in names]
     seeds = [seeds_of(*pair) for pair in compared[["n", "n_baseline"]].values]
     said = [verdicts.difference_in_words(row) for row in compared.itertuples()]
     view = compared.assign(difference=said, n=seeds)
     view["algorithm, environment"] = names
-    return view[columns]
+    return view[IN_WORDS[kind]]

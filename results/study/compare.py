@@ -6,7 +6,7 @@ from scipy import stats
 
 from analysis.comparisons import compare_all, results
 from analysis.runs import read_runs
-from analysis.statistics import at_least_minus_100, fieller
+from analysis.statistics import at_least_minus_100, fieller, holm
 from analysis.studies import make_studies
 from results.study import returns
 
@@ -86,15 +86,6 @@ def average_change(pairs):
     return change, low, change + above, p
 
 
-def holm(p):
-    """Return p-values corrected by Holm's method."""
-    p = np.asarray(p, float)
-    order = p.argsort()
-    corrected = np.empty(len(p))
-    corrected[order] = np.minimum(1, np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1)))
-    return corrected
-
-
 def comparisons(runs):
     """Compare each noise in a frame of read_returns with no noise: a row a comparison.
 
@@ -171,12 +162,9 @@ def in_looks(runs):
     return pd.DataFrame(rows)
 
 
-NAMES = {"std": "sd", "n_baseline": "n_without", "baseline_mean": "mean_without"}
-NAMES |= {
-    "baseline_std": "sd_without",
-    "percent_low": "low_percent",
-    "percent_high": "high_percent",
-}
+NAMES = {"std": "sd", "baseline_mean": "mean_without", "baseline_std": "sd_without"}
+NAMES |= {"percent_low": "low_percent", "percent_high": "high_percent"}
+NAMES |= {"n_baseline": "n_without", "noise_rate": "rate"}
 
 
 def by_the_tool(folder, environments, seeds, seeds_without):
@@ -200,7 +188,7 @@ def by_the_tool(folder, environments, seeds, seeds_without):
     columns = ["environment", "noise", "rate", "n", "mean", "sd", "n_without", "mean_without"]
     columns += ["sd_without", "difference", "difference_percent", "low_percent", "high_percent"]
     columns += ["effect_size", "p", "holm", "verdict"]
-    table = pd.concat([alone, together]).rename(columns=NAMES | {"noise_rate": "rate"})
+    table = pd.concat([alone, together]).rename(columns=NAMES)
     table["environment"] = table["environment"].str.split("-").str[0]
     return table[columns].reset_index(drop=True)
 

@@ -11,7 +11,7 @@ import pandas as pd
 
 from analysis.comparisons import compare_all, results
 from analysis.folders import SEARCH, script_name
-from analysis.luck import add_luck, draw_differences, highest
+from analysis.luck import add_luck, draw_differences
 from analysis.runs import KEYS, STUDY, read_runs
 from analysis.studies import make_studies
 from analysis.tables import COLUMNS, consistency_rows, early_rows
@@ -85,7 +85,7 @@ def add_luck_of_paper(best, seeds=PAPER_SEEDS):
         for row in rows.itertuples():
             n_noisy = PAPER_CONFIGURATIONS * [n]
             draws = draw_differences(row.baseline_std, n - 1, n, n_noisy, rng)
-            lucks[*key, row.environment] = highest(draws)
+            lucks[*key, row.environment] = draws.max(axis=0)
     return add_luck(best.assign(difference=best["noisy_mean"] - best["baseline_mean"]), lucks)
 
 
