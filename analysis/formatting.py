@@ -63,7 +63,7 @@ def percent(value, sign="+"):
     """Write a percentage: whole from 10 on, with a decimal below, without a sign if that is 0.0."""
     if abs(value) < 0.05:
         return "0.0 %"
-    return f"{value:{sign},.{0 if abs(value) >= 10 else 1}f} %"
+    return f"{value:{sign},.{0 if abs(value) >= 9.95 else 1}f} %"
 
 
 def percent_end(value):

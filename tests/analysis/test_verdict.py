@@ -200,6 +200,11 @@ def test_what_is_excluded_agrees_with_the_ends_of_both_intervals():
     assert analysis.formatting.text_of("percent_high", 1e-12) == "0.0"
 
 
+def test_a_percentage_that_is_rounded_to_ten_has_no_decimal():
+    said = [analysis.formatting.percent(x) for x in (9.94, 9.96, -9.96, 10.4, 0.04)]
+    assert said == ["+9.9 %", "+10 %", "-10 %", "+10 %", "0.0 %"]
+
+
 def test_a_p_above_the_level_does_not_look_like_it():
     said = [analysis.formatting.p_value(p) for p in (0.0496, 0.05, 0.0504, 0.051, 0.0004)]
     assert said == ["= 0.05", "= 0.05", "= 0.0504", "= 0.051", "< 0.001"]
