@@ -7,6 +7,7 @@ import pandas as pd
 
 from results.study import pooled
 from results.study.compare import (
+    LEVEL,
     average_change,
     compare,
     comparisons,
@@ -129,7 +130,7 @@ def harmful_noises(runs):
         paper = float(theirs["average_improvement_percent"])
         claim = f"{name} harms PPO, average"
         rows.append(row(claim, page, paper, change, [(change[0], p)], "runs: 25 + 50", claimed=-1))
-    worse = min(sum(p <= 0.05 for _, p in half) for half in (alone[:5], alone[5:]))
+    worse = min(sum(p <= LEVEL for _, p in half) for half in (alone[:5], alone[5:]))
     claim, ours = "Both harm PPO in every environment", f"{worse} of 5"
     rows.append(row(claim, page, "5 of 5", ours, alone, "runs: 25 + 50", claimed=-1))
     base = select(runs, "TD3", "HalfCheetah")
