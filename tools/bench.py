@@ -21,7 +21,6 @@ pairs on. CleanRL's pinned Gymnasium has -v4 environments
 (Humanoid-v4: 376 observations, -v5: 348). SBX gets the sizes of our networks, batches and updates;
 it logs nothing, and in PPO it normalizes neither observations nor rewards. RLtools, SAC and TD3 in
 C++, gets these sizes when it is compiled, and uses MKL if mkl and mkl-include are installed.
---jobs N compares N runs side by side, on a core each, with one alone.
 """
 
 import argparse
@@ -31,7 +30,6 @@ import itertools
 import json
 import os
 import runpy
-import shutil
 import signal
 import subprocess
 import sys
@@ -282,6 +280,8 @@ def compare(algo, env_id, options):
         ratios = [a / b for a, b in zip(programs[0].speeds, program.speeds, strict=True)]
         low, high = quantile_test(ratios).confidence_interval()  # of the median
         row = {
+            "script": algo,
+            "env_id": env_id,
             "program": program.name,
             "steps/s": median(program.speeds),
             "core %": 100 * median(program.shares),
@@ -293,26 +293,11 @@ def compare(algo, env_id, options):
     return rows
 
 
-def side_by_side(algo, env_id, options):
-    """Run one alone and several at once, alternately."""
-    alone, at_once = [], []
-    with started(ours(algo, env_id, options, job=job) for job in range(options.jobs)) as programs:
-        for _ in range(options.pairs):
-            measure(options, programs[0])
-            alone.append(programs[0].speeds[-1])
-            measure(options, *programs)
-            at_once.append(sum(program.speeds[-1] for program in programs))
-    efficiencies = [b / (a * options.jobs) for a, b in zip(alone, at_once, strict=True)]
-    speeds = {"alone": median(alone), f"{options.jobs} jobs": median(at_once)}
-    return [speeds | {"efficiency": median(efficiencies)}]
-
-
 def parse(argv):
     """Return the options; what follows -- is for the scripts."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.error = lambda message: parser.exit(2, f"error: {message}\n")
     add = parser.add_argument
     add("--algos", nargs="+", choices=ALGOS, default=ALGOS)
     add("--envs", nargs="+", default=["HalfCheetah-v5", "Humanoid-v5"], metavar="ENV_ID")
@@ -320,37 +305,16 @@ def parse(argv):
     add("--seconds", type=float, default=2.0, help="shortest length of a block (default: 2)")
     add("--clock", choices=("wall", "cpu"), default="wall")
     add("--against-cleanrl", type=Path, metavar="PATH", help="a checkout of CleanRL")
-    add("--cleanrl-python", metavar="PYTHON", help="with CleanRL's requirements")
+    help = "with CleanRL's requirements (default: this one)"
+    add("--cleanrl-python", metavar="PYTHON", default=sys.executable, help=help)
     add("--against-sbx", metavar="PYTHON", help="with sbx-rl")
     add("--against-rltools", metavar="PYTHON", help="with rltools, mkl and mkl-include; SAC, TD3")
     add("--against-checkout", type=Path, metavar="PATH", help="another version of this project")
     add("--blocks", type=Path, metavar="FILE", help="a csv file for the speed of every block")
-    add("--jobs", type=int, metavar="N", help="compare N runs side by side with one")
     end = argv.index("--") if "--" in argv else len(argv)
     options = parser.parse_args(argv[:end])
     options.flags = argv[end + 1 :]
     options.cores = sorted(os.sched_getaffinity(0), reverse=True)
-    for name, low in (("pairs", 1), ("seconds", 0.1), ("jobs", 2)):
-        value = getattr(options, name)
-        if value is not None and not value >= low:
-            parser.error(f"--{name} must be at least {low}, not {value}")
-    if options.jobs and options.jobs > (cores := len(options.cores)):
-        parser.error(f"--jobs {options.jobs} needs as many cores, and there are {cores}")
-    peers = ("cleanrl", "sbx", "rltools", "checkout")
-    others = [getattr(options, f"against_{peer}") for peer in peers]
-    if options.jobs and any([*others, options.blocks]):
-        parser.error("--jobs compares runs of this version only: leave out --against-..., --blocks")
-    if bool(options.against_cleanrl) != bool(options.cleanrl_python):
-        parser.error("--against-cleanrl and --cleanrl-python need each other")
-    files = {"cleanrl": "cleanrl/sac_continuous_action.py", "checkout": "sac_continuous_noisy.py"}
-    for name, file in files.items():
-        folder = getattr(options, f"against_{name}")
-        if folder and not (folder / file).is_file():
-            parser.error(f"--against-{name}: there is no {folder / file}")
-    pythons = (options.cleanrl_python, options.against_sbx, options.against_rltools)
-    for program in filter(None, pythons):
-        if not shutil.which(program):
-            parser.error(f"{program} is not a program")
     return options
 
 
@@ -359,11 +323,9 @@ def main(argv):
     from tabulate import tabulate
 
     options, rows = parse(argv), []
-    mode = side_by_side if options.jobs else compare
     for algo, env_id in itertools.product(options.algos, options.envs):
-        print(f"{mode.__name__} {algo} {env_id}", file=sys.stderr)
-        case = {"script": algo, "env_id": env_id}
-        rows += [case | row for row in mode(algo, env_id, options)]
+        print(f"measuring {algo} on {env_id}", file=sys.stderr)
+        rows += compare(algo, env_id, options)
     print(tabulate(rows, headers="keys", floatfmt=".4g"))
 
 

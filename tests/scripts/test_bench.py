@@ -3,7 +3,6 @@
 import contextlib
 import csv
 import json
-import os
 import sys
 from types import SimpleNamespace
 
@@ -74,23 +73,3 @@ def test_a_real_script_is_measured(monkeypatch, capsys):
     bench.main([*words, "--", "--no-compile"])
     script, env_id, program, speed, *_ = capsys.readouterr().out.splitlines()[-1].split()
     assert (script, env_id, program) == ("td3", "Pendulum-v1", "ours") and float(speed) > 0
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("--algos dqn", "invalid choice: 'dqn'"),
-        ("--seconds nan", "--seconds must be at least 0.1, not nan"),
-        ("--against-checkout .github", "there is no .github/sac_continuous"),
-        ("--against-cleanrl .", "need each other"),
-        ("--against-sbx ./no-python", "./no-python is not a program"),
-        ("--jobs 2 --against-checkout .", "runs of this version only"),
-    ],
-)
-def test_bad_arguments(arguments, message, monkeypatch, capsys):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1})
-    with pytest.raises(SystemExit) as exit_:
-        bench.main(arguments.split())
-    error = capsys.readouterr().err
-    assert exit_.value.code == 2
-    assert error.startswith("error: ") and message in error and error.count("\n") == 1
