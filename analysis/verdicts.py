@@ -53,9 +53,9 @@ def verdict(row, smallest_gain=None, metric=None):
     return UNCLEAR
 
 
-def significant(p):
-    """Tell whether a p-value is at most LEVEL, in spite of rounding errors."""
-    return round(p, 12) <= LEVEL
+def significant(p, level=LEVEL):
+    """Tell whether a p-value is at most the level, in spite of rounding errors."""
+    return round(p, 12) <= level
 
 
 def is_lopsided(n, n_baseline, most=MOST_RATIO):
@@ -129,12 +129,12 @@ def corrected(p, number, what):
     return f", corrected for {counted(number, what)} {p_text(p)}"
 
 
-def borderline(row):
-    """Say where the interval of a comparison and its p differ, or ""."""
+def borderline(row, level=LEVEL):
+    """Say where the interval of a comparison, of this level, and its p differ, or ""."""
     if pd.isna(row.difference_low):
         return ""
     excludes_zero = row.difference_low > 0 or row.difference_high < 0
-    if excludes_zero == significant(row.p):
+    if excludes_zero == significant(row.p, level):
         return ""
     return f" Borderline: the interval {'excludes' if excludes_zero else 'includes'} zero."
 

@@ -2,7 +2,6 @@
 
 import csv
 import itertools
-import math
 from pathlib import Path
 
 from analysis.choice import CHOICE_COLUMNS, choice_file
@@ -11,7 +10,7 @@ from analysis.folders import SUCCESS, rewritten
 from analysis.formatting import p_value, rounded, two_digits
 from analysis.power import detectable_shift
 from analysis.statistics import LEVEL
-from analysis.verdicts import POINTS, difference_in_words, excluded, smallest
+from analysis.verdicts import POINTS, borderline, difference_in_words, excluded, smallest
 from analysis.words import counted
 from noisy_wrappers import BASELINE
 from sweep import halving
@@ -156,16 +155,7 @@ def sentence(choice, verdict, unit=""):
         said += " than no noise"
     else:
         evidence += excluded(comparison, unit)
-    return f"{choice.name}: {said}: {evidence}.{borderline(verdict)}"
-
-
-def borderline(verdict):
-    """Say where the interval and p differ, or ""."""
-    low, high = verdict.comparison.difference_low, verdict.comparison.difference_high
-    excludes_zero = low > 0 or high < 0
-    if math.isnan(low) or excludes_zero == verdict.significant:
-        return ""
-    return f" Borderline: the interval {'excludes' if excludes_zero else 'includes'} zero."
+    return f"{choice.name}: {said}: {evidence}.{borderline(comparison, verdict.needed)}"
 
 
 def obstacle(choice):
