@@ -104,7 +104,9 @@ def missing(candidates, seeds, returns):
 
 def pair(winner, seeds, returns):
     """Return the returns of the winner and of the baseline on the fresh seeds."""
-    return tuple([returns[candidate, seed] for seed in seeds] for candidate in (winner, BASELINE))
+    noisy = tuple(returns[winner, seed] for seed in seeds)
+    baseline = tuple(returns[BASELINE, seed] for seed in seeds)
+    return noisy, baseline
 
 
 class Verdict(NamedTuple):

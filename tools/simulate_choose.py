@@ -99,15 +99,8 @@ def choose(noises, plan, draw_return):
             returns[noise, seed] = draw_return(noise)
 
 
-TESTS = {}  # of one choice: advance tests the earlier looks again whenever it is asked
-
-
-def once(x, y):
-    """Do a test that was not done before."""
-    key = (*x, None, *y)
-    if key not in TESTS:
-        TESTS[key] = permutation.permutation_t(x, y)
-    return TESTS[key]
+# For advance, which tests the earlier looks again whenever it is asked
+permutation_t = cache(permutation.permutation_t)
 
 
 def simulate(noises, plan, gain, draw=normal, spread=1.0, trials=1000, seed=0):
@@ -121,10 +114,11 @@ def simulate(noises, plan, gain, draw=normal, spread=1.0, trials=1000, seed=0):
         value = float(draw(rng, ()))
         return value if noise == BASELINE else spread * value + gain * (noise == NOISES[0])
 
-    quick = {"RANDOM_PARTITIONS": PARTITIONS, "partitions": ALL_PARTITIONS}
-    with mock.patch.multiple(permutation, **quick), mock.patch.object(looks, "permutation_t", once):
+    fewer = {"RANDOM_PARTITIONS": PARTITIONS, "partitions": ALL_PARTITIONS}
+    kept = mock.patch.object(looks, "permutation_t", permutation_t)
+    with mock.patch.multiple(permutation, **fewer), kept:
         for _ in range(trials):
-            TESTS.clear()
+            permutation_t.cache_clear()
             state, returns = choose(noises, plan, draw_return)
             claims = halving.judge(state, plan, returns).helps
             found = state.candidates == NOISES[:1]
