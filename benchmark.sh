@@ -131,10 +131,8 @@ done
 case ${PYTHON:-} in '' | /*) ;; */*) PYTHON=$caller/$PYTHON ;; esac
 [ -n "${PYTHON:-}" ] || [ ! -x .venv/bin/python ] || PYTHON=.venv/bin/python
 export PYTHON=${PYTHON:-python}
-# A module of the user's lies there, too. Without one the folder stays off the path: a file of it
-# could have the name of one of Python's own modules.
-own='(^| )[^ ]*[A-Za-z_][A-Za-z0-9_.]*:'
-[[ ! "${grid[*]}" =~ $own ]] || [ "$caller" = "$PWD" ] || export PYTHONPATH=${PYTHONPATH:+$PYTHONPATH:}$caller
+# A module of the user's lies there, too
+[ "$caller" = "$PWD" ] || export PYTHONPATH=${PYTHONPATH:+$PYTHONPATH:}$caller
 lacking=$("$PYTHON" -c "import sys, importlib.util as u
 print(*[name for name in sys.argv[1:] if not u.find_spec(name)], sep=', ')" \
   gymnasium mujoco torch tyro tensorboard 2>/dev/null) ||
@@ -144,7 +142,7 @@ print(*[name for name in sys.argv[1:] if not u.find_spec(name)], sep=', ')" \
 
 show() {
   SWEEP_EXECUTOR=$executor SWEEP_JOBS=$jobs SWEEP_HOSTS=$sshlogin OMP_NUM_THREADS=1 \
-    "$PYTHON" -m sweep "$1" "$caller" ${grid[@]+"${grid[@]}"}
+    "$PYTHON" -X faulthandler -m sweep "$1" "$caller" ${grid[@]+"${grid[@]}"}
 }
 [ $view != status ] || { show status; exit; }
 
@@ -152,7 +150,6 @@ show() {
 list_todo() {
   local status=0
   todo=$(show "${dry_run:-list}") || status=$?
-  [ "$status" -lt 131 ] || fail "Python was ended by signal $((status - 128)), as by an environment"
   [ "$status" -eq 0 ] || exit "$status"
   todo=$(printf '%s\n' "$todo" | grep -vxFf <(printf '%s\n' "$tried")) || [ $? -eq 1 ]
 }
@@ -181,7 +178,6 @@ case $executor in
       fail "--slurm-args has a quote that does not end: $slurm_args"
     [ -z "$words" ] || mapfile -t slurm_options < <(printf '%s\n' "$words") ;;
 esac
-command -v flock >/dev/null || fail "benchmark.sh needs flock (Debian: apt-get install util-linux)"
 
 sweep=$HOSTNAME-$$-$(date +%Y%m%d%H%M%S)
 logs=${first%/*}/logs list=${first%/*}/logs/lines-$sweep.tsv
@@ -220,8 +216,8 @@ run_todo() {
   mapfile -t folders < <(printf '%s\n' "$todo" | cut -f1 | sed 's,/[^/]*$,/logs,' | sort -u)
   reason=$( (mkdir -p "${folders[@]}" && printf '%s\n' "$todo" >"$list") 2>&1) ||
     fail "--runs-dir: cannot write to $logs: ${reason##*: }"
-  flock "$list" true 2>/dev/null ||
-    fail "--runs-dir: the file system of $logs has no locks, so two processes could write into one run"
+  flock "$list" true ||
+    fail "--runs-dir: cannot lock files in $logs, so two processes could write into one run"
   if [ "$executor" = slurm ]; then
     submit
     [ -n "$wait" ] || exit "$stopped"

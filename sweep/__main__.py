@@ -15,7 +15,6 @@ import os
 import shlex
 import shutil
 import sys
-import tempfile
 import time
 from collections import Counter
 from statistics import harmonic_mean
@@ -185,8 +184,6 @@ def show_stopped(args, runs, choices):
 def show_report(args, runs, choices):
     """Print what came out of a sweep; the exit status is 1 unless all runs are done."""
     progresses = show_progress(args, runs, over=True, everything=True)
-    unfinished = [p.log.path.parent for p in progresses if p.state != "done"]
-    check_disk(dict.fromkeys(unfinished))
     refused = {p.run.script.file: p.log.last_line for p in progresses if p.reason == "exit 2"}
     for script, reason in refused.items():
         print(f"{script} refused arguments, so no other seeds of these were started: {reason}")
@@ -199,7 +196,7 @@ def show_report(args, runs, choices):
         program = shlex.quote(from_caller(args, "analyze.py"))
         print(f"See the curves with: tensorboard --logdir {place}")
         print(f"Make tables and figures with: python {program} --runs-dir {place}")
-    return int(bool(unfinished))
+    return int(any(p.state != "done" for p in progresses))
 
 
 def show_progress(args, runs, over, everything=False):
@@ -221,16 +218,6 @@ def with_baselines(runs):
         kinds["--noise" in run.command].add((run.kind, run.seed))
     number = len(kinds[False])
     return f" ({number} of them without noise)" if kinds[True] not in (set(), kinds[False]) else ""
-
-
-def check_disk(folders):
-    """Say so if logs cannot be written: then nothing else tells why their runs were not started."""
-    for folder in filter(os.path.exists, folders):
-        try:
-            with tempfile.TemporaryFile(dir=folder) as file:
-                file.write(bytes(100_000))
-        except OSError as error:
-            print(f"error: cannot write to {folder}: {error.strerror}", file=sys.stderr)
 
 
 VIEWS = {

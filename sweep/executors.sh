@@ -42,7 +42,7 @@ run_one() {
   [ ! -e "$1/result.json" ] || return 0
   [ -z "${logged:-}" ] || exec >&9
   export OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 PYTHONUNBUFFERED=1
-  echo "# $(date '+%F %T') $HOSTNAME: $2" 2>/dev/null || return # the report says that the disk is full
+  echo "# $(date '+%F %T') $HOSTNAME: $2" || return # the disk is full, as bash says
   bash -c "exec $2" 2>&1 &
   local child=$! status=0
   trap : TERM INT
@@ -51,7 +51,7 @@ run_one() {
   wait "$child" || status=$?
   # analysis/logs.py reads the last line. What the run printed may have ended within one, as the
   # bar of a killed program does.
-  printf '\n# %s %s: exit=%s\n' "$(date '+%F %T')" "$HOSTNAME" "$status" 2>/dev/null || true
+  printf '\n# %s %s: exit=%s\n' "$(date '+%F %T')" "$HOSTNAME" "$status" || true
   [ "$status" -ne 2 ] || touch "$refusal" 2>/dev/null || true
   return "$status"
 }
