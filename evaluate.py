@@ -239,14 +239,10 @@ def refuse_foreign_module(player, name):
     module, colon, _ = name.partition("(")[0].rpartition(":")
     first, *rest = module.strip().split(".")
     spec = PathFinder.find_spec(first, noisy.module_path()) if colon else None  # executes nothing
-    here, folder = Path.cwd(), player.folder.resolve()
     for found in (spec.submodule_search_locations or [spec.origin]) if spec else ():
-        entry, top = Path(found).parent.resolve(), Path(found).resolve()
+        top = Path(found).resolve()
         place = Path(top, *rest).resolve()
-        # the project's folder may hold the runs, and packages that are on the module path
-        is_own = entry.is_relative_to(player.runs_dir) and (entry != here or entry == PROJECT)
-        forbidden = folder if is_own else player.runs_dir
-        if place.is_relative_to(forbidden) or folder.is_relative_to(top):
+        if place.is_relative_to(player.runs_dir) or player.folder.resolve().is_relative_to(top):
             raise ValueError(
                 f"{name} would be imported from {place}, in a folder of runs; "
                 "if you trust that module, move it to where your own ones are"

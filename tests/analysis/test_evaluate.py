@@ -553,15 +553,12 @@ def test_no_noise_is_imported_from_a_folder_of_runs(options, runs, monkeypatch, 
     assert main(Args((run_dir,), episodes=1)) == 0
 
 
-@pytest.mark.parametrize("runs_dir", [".", "runs"])
-def test_a_module_of_ones_own_is_imported(runs_dir, trained, tmp_path, monkeypatch):
-    """Also where the runs lie in the folder of the project, which is on the module path."""
-    run_dir = tmp_path / runs_dir / "run"
+def test_a_module_of_ones_own_is_imported(trained, tmp_path, monkeypatch):
+    """But for one that is a link into the folder of runs."""
+    run_dir = tmp_path / "runs/run"
     shutil.copytree(one(trained, "PPO"), run_dir)
-    register(tmp_path, f"own_{len(runs_dir)}", "")
-    other_environment(run_dir, f"own_{len(runs_dir)}:Mine-v0")
-    shutil.copy(ROOT / "ppo_continuous_noisy.py", tmp_path)
-    monkeypatch.setattr(evaluate, "PROJECT", tmp_path)
+    register(tmp_path, "own", "")
+    other_environment(run_dir, "own:Mine-v0")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", sys.path[:])
     assert main(Args((run_dir,), episodes=1)) == 0
