@@ -267,8 +267,6 @@ def check_players(players, conditions, bad, args):
                     raise ValueError(f"{args.drawing} is not among its render_modes, {modes}")
                 for condition in conditions:
                     condition.wrap(env)
-            if args.stores(player) and not os.access(player.folder, os.W_OK):
-                raise ValueError("cannot be written to; with another --seed nothing is stored")
             if not player.run.finished:
                 step = step_of(player)
                 print(f"{player.folder.name} is not finished: its policy of step {step} is tested")
@@ -428,8 +426,6 @@ def check_args(args):
     """End with an error where the options make no sense."""
     if args.render and args.video:
         fail("--render and --video exclude each other")
-    if args.video == Path():
-        fail("--video needs the name of a folder")
     if args.render and not has_display():
         fail("--render needs a display; --video FOLDER makes videos without one")
     for name, least in {"episodes": 1, "jobs": 1, "seed": 0}.items():

@@ -577,7 +577,6 @@ def test_a_module_of_ones_own_is_imported(trained, tmp_path, monkeypatch):
         ({"noise_rates": (0.5,)}, "--noise-rates without --noises"),
         ({"env_id": "Nowhere-v0"}, "there is no environment"),
         ({"env_id": ""}, "there is no environment"),
-        ({"video": Path("")}, "--video needs the name of a folder"),
         ({"noises": (f"{OBSERVATION[:-4]}(1, 2))",), "noise_rates": (1.0,)}, "has 2 numbers"),
         ({"episodes": 0}, "--episodes must be at least 1, not 0"),
         ({"seed": -1}, "--seed"),
@@ -591,13 +590,6 @@ def test_bad_arguments(runs, capsys, options, message, monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     refused(Args(**({"runs": (runs,)} | options)), message, runs, capsys)
-
-
-def test_runs_that_cannot_be_written_to_are_refused_before_they_are_played(
-    runs, capsys, monkeypatch
-):
-    monkeypatch.setattr(evaluate.os, "access", lambda path, mode: False)
-    refused(Args((one(runs, "PPO"),)), "cannot be written to; with another --seed", runs, capsys)
 
 
 FAILING = """
