@@ -60,12 +60,6 @@ def test_an_environment_that_sleeps():
     assert ask("toy_envs:Slow-v0", max_episode_steps=7).episode_steps == 7
 
 
-def test_an_environment_that_is_too_slow_is_timed_by_fewer_steps(monkeypatch, tmp_path):
-    monkeypatch.setattr(environment, "PATIENCE", 0.1)
-    shown = choose("Slow", "--runs-dir", tmp_path)
-    assert shown.code == 0 and re.search(r"\(only \d{1,2} steps were timed", shown.err)
-
-
 def test_without_a_time_limit_a_test_is_as_long_as_an_episode():
     assert ask("toy_envs:NoLimit-v0").episode_steps == 20
     assert ask("toy_envs:Endless-v0").episode_steps == 10_000
