@@ -57,19 +57,13 @@ def choices(args):
     pairs = list(itertools.product(args.algos, args.envs))
     plans = {pair: plan_for(args, *pair, len(pairs)) for pair in pairs}
     known = {env_id: remembered(args, env_id) for env_id in args.envs}
-    listed = args.view in ("list", "dry-run")
-    if listed:
+    if args.view in ("list", "dry-run"):
         refuse_other_baselines(args, plans)
-    noises = {env_id: untried(args, env_id, known[env_id].tried) for env_id in args.envs if listed}
-    noises = {env_id: new for env_id, new in noises.items() if new}
-    for env_id, answer in ask_all(args, noises).items():
-        known[env_id] = answer._replace(tried=known[env_id].tried | answer.tried)
-        left_out = in_words(reasons_against(args, answer))
-        if left_out and not args.noises:
-            print(f"{env_id}: left out: {left_out}", file=sys.stderr)
+        known |= ask_about_untried(args, known)
     found = [follow(args, *pair, known[pair[1]], plan) for pair, plan in plans.items()]
-    for env_id in noises if args.view == "list" else ():
-        remember(args, env_id, known[env_id])
+    if args.view == "list":
+        for env_id, environment in known.items():
+            remember(args, env_id, environment)
     problems = [f"{choice.name}: {choice.problem}" for choice in found if choice.problem]
     if len(problems) == len(found):
         fail("\nerror: ".join(problems), code=1)
@@ -129,6 +123,21 @@ def refuse_other_baselines(args, plans):
 
 
 # --------------------------------------------------------------------------- which noises can act
+
+
+def ask_about_untried(args, known):
+    """Ask the environments in which noises were never tried; return what is known of these now.
+
+    known: {env_id: Environment}, what earlier commands found.
+    """
+    noises = {env_id: untried(args, env_id, known[env_id].tried) for env_id in args.envs}
+    answers = ask_all(args, {env_id: new for env_id, new in noises.items() if new})
+    for env_id, answer in answers.items():
+        left_out = in_words(reasons_against(args, answer))
+        if left_out and not args.noises:
+            print(f"{env_id}: left out: {left_out}", file=sys.stderr)
+        answers[env_id] = answer._replace(tried=known[env_id].tried | answer.tried)
+    return answers
 
 
 def untried(args, env_id, tried):
