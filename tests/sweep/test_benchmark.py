@@ -444,40 +444,30 @@ def test_a_task_is_requeued_alone(array, requeued, no_slurm, tmp_path):
 
 
 @pytest.mark.slow
-def test_ctrl_c_while_arrays_are_submitted(slurm, tmp_path):
+def test_ctrl_c_while_arrays_are_submitted(no_slurm, tmp_path):
     """On a terminal Ctrl-C reaches sbatch, too: here its second call."""
-    calls, real = tmp_path / "calls", shutil.which("sbatch", path=PATH)
-    (tmp_path / "sbatch").write_text(
-        f"#!/bin/sh\necho >>{calls}\n[ $(wc -l <{calls}) = 1 ] || exec sleep 100\n"
-        f'exec {real} "$@"\n'
-    )
-    (tmp_path / "sbatch").chmod(0o755)
-    grid = [*GRID, "--runs-dir", tmp_path / "runs", "--executor", "slurm", *FOREVER]
+    env, asked = no_slurm
+    with open(tmp_path / "bin/sbatch", "a") as sbatch:
+        sbatch.write(f"[ $(grep -c sbatch {asked}) = 1 ] || exec sleep 100\n")
+    grid = ["baseline", *GRID[1:5], "--seeds", "1-6", "--runs-dir", tmp_path / "runs"]
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    env = slurm | {"PATH": f"{tmp_path}:{PATH}"}
-    sweep = start(*grid, env=env, start_new_session=True, **streams)
-    wait_for(lambda: calls.exists() and calls.read_text() == "\n\n", "the second call")
+    sweep = start(*grid, "--executor", "slurm", env=env, start_new_session=True, **streams)
+    wait_for(lambda: asked.exists() and asked.read_text().count("sbatch") == 2, "the second call")
     os.killpg(sweep.pid, signal.SIGINT)
     _, err = sweep.communicate(timeout=PATIENCE)
     assert sweep.returncode == 130 and "submitted" not in err and "error" not in err
-    wait_for(lambda: not output(["squeue", "--noheader"], slurm), "the first array's end")
+    assert set(asked.read_text().splitlines()[3:]) == {"scancel --clusters=big 12"}
 
 
 # THE COMMAND
 
 
-@pytest.mark.slow
 def test_a_clone_of_windows_runs(tmp_path):
     """Git for Windows writes the ends of lines as Windows has them, unless it is told not to."""
-    scripts = ["benchmark.sh", "Makefile", "analyze.py"]
-    (tmp_path / "a").mkdir()
-    for name in [".gitattributes", "README.md", *scripts]:
-        shutil.copy(ROOT / name, tmp_path / "a")
-    git = ["git", "-c", "core.autocrlf=true", "-c", "user.name=x", "-c", "user.email=x"]
-    for words in ("init -q a", "-C a add .", "-C a commit -qm x", "clone -q a b"):
-        subprocess.run([*git, *words.split()], cwd=tmp_path, check=True, capture_output=True)
-    assert b"\r" in (tmp_path / "b/README.md").read_bytes()
-    assert not [name for name in scripts if b"\r" in (tmp_path / "b" / name).read_bytes()]
+    subprocess.run(["git", "init", "-q", tmp_path], check=True)
+    shutil.copy(ROOT / ".gitattributes", tmp_path)
+    command = ["git", "-C", tmp_path, "check-attr", "eol", "benchmark.sh", "Makefile", "analyze.py"]
+    assert output(command, ENV).count(": eol: lf") == 3
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import argparse
 import csv
 import functools
+import itertools
 import os
 import re
 import shlex
@@ -41,7 +42,7 @@ def dry_run(*args):
     assert result.err.startswith(f"{len(lines):,} run")
     parser = argparse.ArgumentParser()
     parser.add_argument("python", choices=[sys.executable])
-    parser.add_argument("script", choices=[f"{name}_continuous_noisy.py" for name in ALGORITHMS])
+    parser.add_argument("script", choices=[f"{name}{ENDING}.py" for name in ALGORITHMS])
     for option in ("--env-id", "--runs-dir"):
         parser.add_argument(option, required=True)
     for option in ("--seed", "--total-timesteps"):
@@ -59,24 +60,20 @@ def dry_run(*args):
 
 def test_paper_grid():
     lines = dry_run("paper")
-    assert len(lines) == len({line.text for line in lines}) == 9100
-    assert len({line.folder for line in lines}) == 9100
     tables = (ROOT / "results" / "paper").glob("*.csv")
     rows = [row for path in tables for row in csv.DictReader(path.open())]
     noises = {row["noise_as_run"] for row in rows if "noise_as_run" in row}
-    assert len(noises) == 15
-    assert Counter(line.script[:3] for line in lines) == {"sac": 2275, "td3": 2275, "ppo": 4550}
-    assert Counter(line.env_id for line in lines) == {
-        f"{env}-v5": 1820 for env in ("HalfCheetah", "Hopper", "Humanoid", "Pusher", "Walker2d")
-    }
-    noisy = [line for line in lines if line.noise]
-    assert len(noisy) == 9000
-    assert Counter(*zip(*(x.noise for x in noisy), strict=True)) == dict.fromkeys(noises, 600)
     rates = ["0.01", "0.05", "0.1", "0.2", "0.5", "1.0"]
-    assert Counter(*zip(*(x.noise_rate for x in noisy), strict=True)) == dict.fromkeys(rates, 1500)
-    for algorithm, seeds in ALGORITHMS.items():
-        of = Counter(line.seed for line in lines if line.script.startswith(algorithm))
-        assert of == {seed: 455 for seed in range(1, seeds + 1)}
+    expected = {
+        (f"{algorithm}{ENDING}.py", f"{env}-v5", seed, noise)
+        for algorithm, seeds in ALGORITHMS.items()
+        for env in ("HalfCheetah", "Hopper", "Humanoid", "Pusher", "Walker2d")
+        for seed in range(1, seeds + 1)
+        for noise in [(), *itertools.product(noises, rates)]
+    }
+    found = {(x.script, x.env_id, x.seed, (*x.noise, *x.noise_rate)) for x in lines}
+    assert found == expected and len(noises) == 15
+    assert len(lines) == len({line.folder for line in lines}) == 9100
     assert {line.total_timesteps for line in lines} == {1_000_000}
     assert [line.seed for line in lines] == sorted(line.seed for line in lines)
 
@@ -422,8 +419,6 @@ def test_baselines_that_pay(noises, more, baselines):
     ("args", "message"),
     [
         ("custom --noises Foo(1) --noise-rates 1", "bad noise 'Foo(1)': unknown name; valid are"),
-        (f"best --noises {A}", "--noises needs --noise-rates, or a rate with each"),
-        (f"custom --noises {A[:-1]}", "bad noise 'RandomNormalNoisyReward(1': expected Name("),
         (f"custom --noises {A}", "--noises needs --noise-rates, or a rate with each"),
         ("custom --noise-rates 1", "--noise-rates needs --noises that have no rate of their own"),
         (f"custom --noises {A}@1+{A}", "give each of these noises a rate with @, or none"),
@@ -439,7 +434,6 @@ def test_baselines_that_pay(noises, more, baselines):
         ("demo -- --exp-name a\tb", "'a\\tb': a command is one line, so its words have no tabs"),
         ("demo --seeds 1-99999999999", "'1-99999999999' is more than 100,000 seeds"),
         (f"{C} --looks 13", "--looks must be from 1 to half of --confirm, and at most 50, not 13"),
-        (f"{C} --looks 0", "--looks must be from 1 to half of --confirm, and at most 50, not 0"),
         (f"{C} --confirm 600 --looks 300", "and at most 50, not 300"),
         ("best -- --exp-name mine", "--exp-name: several algorithms would write into the same"),
         ("demo --env-id Hopper-v5", "unknown option --env-id; did you mean --envs?"),
