@@ -551,26 +551,6 @@ def test_results_that_are_seen_late_are_waited_for(stub, tmp_path):
     assert result.code == 0 and "3 runs: 3 done" in result.out, result.out + result.err
 
 
-def test_a_failing_run_stops_its_choice_and_no_other(tmp_path, monkeypatch):
-    """The verdict comes once the noise that fails is excluded."""
-    command = [*CHOOSE[:2], "ppo", "sac", *CHOOSE[3:-1], "--confirm", "5", "--budget", "2"]
-    command += ["--runs-dir", str(tmp_path)]
-    with monkeypatch.context() as patch:
-        patch.setenv("STUB_FAILS", "*Dropout*ppo*")
-        play(*command)
-    said = view("report", *command)
-    left = "round 1 of 1: 2 of 2 configurations, seed 1; runs to do: 1"
-    assert said.code == 1 and f"PPO on Pendulum-v1, {left}" in said.out
-    assert '--exclude "RandomDropoutObservation(0.9)@1.0"' in said.out
-    assert verdicts(said.out)[-1].startswith("SAC on Pendulum-v1: all runs are done; the verdict")
-    assert not (tmp_path / "choice.csv").exists()
-    command += ["--exclude", "RandomDropoutObservation(0.90)@1"]
-    play(*command)
-    without = view("report", *command)
-    assert without.code == 0 and len(verdicts(without.out)) == 2, without.out + without.err
-    assert "Dropout" not in re.sub("SAC.*", "", (tmp_path / "choice.csv").read_text())
-
-
 # REPORTS AND ERRORS
 
 
@@ -635,20 +615,6 @@ def test_a_full_disk_is_told(small_disk, stub):
         result = run(*grid, env=stub | {"PYTHON": str(python)})
         assert result.code == code and "No space left on device\n" in result.err
         subprocess.run(fill, shell=True)
-
-
-# NAMES OF FOLDERS
-
-
-@pytest.mark.slow
-def test_names_of_folders(tmp_path, stub):
-    """Through a link to benchmark.sh, into a folder whose name needs quotes."""
-    (tmp_path / "bench").symlink_to(ROOT / "benchmark.sh")
-    grid = [*GRID, "--total-timesteps", "400", "--runs-dir", "my 'café' \x1b[31m"]
-    result = run(*grid, env=stub, cwd=tmp_path, script=tmp_path / "bench")
-    assert result.code == 0, result.out + result.err
-    assert "3 runs: 3 done" in result.out and "\x1b" not in result.out
-    assert len(list(tmp_path.glob("my 'café'*/*__*/result.json"))) == 3
 
 
 @pytest.mark.slow
@@ -771,20 +737,24 @@ def test_ctrl_c_on_a_terminal_and_the_progress_line(tmp_path, stub):
 
 @pytest.mark.slow
 def test_a_script_and_an_environment_in_the_callers_folder(tmp_path):
-    """They are found in the sweep, and where a line of the dry run is pasted into a shell."""
+    """They are found in the sweep, and where a line of the dry run is pasted into a shell.
+
+    Also through a link to benchmark.sh, and in a folder whose name needs quotes.
+    """
+    (tmp_path / "bench").symlink_to(ROOT / "benchmark.sh")
     text = "gymnasium.register('Mine-v0', 'gymnasium.envs.classic_control:PendulumEnv')\n"
     (tmp_path / "my_envs.py").write_text(f"import gymnasium\n{text}")
     text = "import my_envs, noisy_wrappers\nclass Args: pass\nprint('found them')\nexit(3)\n"
     (tmp_path / "redq_continuous_noisy.py").write_text(text)
     (tmp_path / "env").symlink_to(Path(sys.executable).parents[1])  # PYTHON may be relative, too
     python = Path("env/bin", Path(sys.executable).name)
-    here = {"cwd": tmp_path, "script": ROOT / "benchmark.sh", "env": ENV | {"PYTHON": str(python)}}
+    here = {"cwd": tmp_path, "script": tmp_path / "bench", "env": ENV | {"PYTHON": str(python)}}
     own = ["baseline", "--algos", "redq", "--envs", "my_envs:Mine", "--seeds", "1"]
-    own += ["--runs-dir", "my runs"]
+    own += ["--runs-dir", "my 'café' \x1b[31m"]
     swept = run(*own, **here)
     assert swept.code == 1 and re.search("exit 3 .*__redq_.*.log +found them", swept.out)
+    assert "\x1b" not in swept.out and list(tmp_path.glob("my 'café'*/logs/*.log"))
     line = run(*own, "--dry-run", **here).out
-    assert f" {tmp_path / python} " in line and f"--runs-dir '{tmp_path}/my runs'" in line
-    assert "--env-id my_envs:Mine-v0" in line
+    assert f" {tmp_path / python} " in line and "--env-id my_envs:Mine-v0" in line
     pasted = subprocess.run(line, shell=True, cwd=ROOT, capture_output=True, text=True)
     assert (pasted.returncode, pasted.stdout) == (3, "found them\n")

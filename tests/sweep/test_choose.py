@@ -378,16 +378,29 @@ def test_the_default_noises_and_those_of_the_paper(tmp_path):
     assert len(tried("--noises", "paper", "--noise-rates", "0.2")) == 15
 
 
-def test_what_a_report_advises(tmp_path):
-    args = arguments(f"--algos | ppo | --envs | Pendulum-v1 | {THREE}", tmp_path)
+def test_a_failing_run_stops_its_choice_and_no_other(tmp_path, monkeypatch):
+    """The verdict comes once the noise that fails is excluded."""
+    text = f"--algos | ppo | sac | --envs | Pendulum-v1 | {THREE}"
+    args = arguments(text, tmp_path)
     out = "\n".join(conclude(args))  # where nothing finishes, it is not the noise
     assert "leave PPO on Pendulum-v1 out: see --algos and --envs" in out and "--exclude" not in out
-    choice = train_due(args, 1)
-    path = choice.runs[choice.state.due[0]].folder / "eval.csv"
-    assert "\n".join(conclude(args)).count("--exclude") == 3
-    train_due(args)
-    path.write_text(path.read_text()[:-1])  # what is damaged is not to be retried
-    assert conclude(args)[-1].endswith("runs to do: 1.")
+    with monkeypatch.context() as patch:
+        patch.setenv("STUB_FAILS", "*Dropout*ppo*")
+        batches(args)
+    ppo, advice, sac = conclude(args)
+    assert "round 1 of 2: 3 of 3 configurations" in ppo and "runs to do: 2. These did not" in ppo
+    assert advice.endswith('leave it out: --exclude "RandomDropoutObservation(0.9)@1.0"')
+    assert sac == "SAC on Pendulum-v1: all runs are done; the verdict comes with the others"
+    for path in tmp_path.glob("search/*Mixup*ppo*/eval.csv"):
+        path.write_text(path.read_text()[:-1])  # what is damaged is not to be retried
+    assert [line.count("exclude") for line in conclude(args)] == [0, 1, 0]
+    for path in tmp_path.glob("search/*Mixup*ppo*/eval.csv"):
+        path.write_text(path.read_text() + "\n")
+    without = arguments(f"{text} | --exclude | RandomDropoutObservation(0.90)@1", tmp_path)
+    batches(without)
+    assert len(conclude(without)) == 2
+    rows = [row for row in read(tmp_path / "choice.csv") if row["algorithm"] == "PPO"]
+    assert rows and not [row for row in rows if "Dropout" in row["noise"]]
 
 
 @pytest.mark.slow
