@@ -141,8 +141,7 @@ print(*[name for name in sys.argv[1:] if not u.find_spec(name)], sep=', ')" \
   fail "'$PYTHON' lacks $lacking: set PYTHON, or install requirements.txt into .venv"
 
 show() {
-  SWEEP_EXECUTOR=$executor SWEEP_JOBS=$jobs SWEEP_HOSTS=$sshlogin OMP_NUM_THREADS=1 \
-    "$PYTHON" -X faulthandler -m sweep "$1" "$caller" ${grid[@]+"${grid[@]}"}
+  OMP_NUM_THREADS=1 "$PYTHON" -X faulthandler -m sweep "$1" "$caller" ${grid[@]+"${grid[@]}"}
 }
 [ $view != status ] || { show status; exit; }
 

@@ -5,7 +5,6 @@ takes until finished runs tell. `remember` keeps the answer, because `status` ma
 """
 
 import contextlib
-import heapq
 import itertools
 import json
 import math
@@ -21,7 +20,7 @@ import gymnasium as gym
 import noisy_wrappers as noisy
 from analysis.errors import fail, with_place
 from analysis.folders import read_json
-from analysis.words import counted, duration
+from analysis.words import duration
 from sweep.scripts import number
 
 # Seconds of learning for each step, without the environment's own, and what each number of an
@@ -183,7 +182,7 @@ def cost(args, done, todo):
     for kind in new:
         seconds[kind] = run_seconds(kinds[kind], answers[kind[1]])
     known = [seconds[run.kind] for run in todo if seconds[run.kind] is not None]
-    told = [time_left([known], args.jobs)] if known else []
+    told = [processor_time(sum(known))] if known else []
     unknown = sorted({algorithm for algorithm, env_id in kinds if not seconds[algorithm, env_id]})
     if unknown:
         told.append(f"what runs of {', '.join(unknown)} take is known once one is finished")
@@ -197,21 +196,9 @@ def mean_seconds(runs):
     return fmean(known) if known else None
 
 
-def time_left(batches, jobs):
-    """Say what batches of runs take, one batch after the other.
-
-    batches: the seconds of each run, batch by batch. jobs: runs at a time, None if unknown.
-    """
-    text = f"about {duration(sum(map(sum, batches)))} of processor time left"
-    if jobs:
-        clock = 0
-        for batch in batches:
-            ends = [0.0] * min(jobs, len(batch))
-            for seconds in batch:
-                heapq.heapreplace(ends, ends[0] + seconds)  # where the next place is free
-            clock += max(ends, default=0)
-        text += f", {duration(clock)} on the clock with {counted(jobs, 'run')} at a time"
-    return text
+def processor_time(seconds):
+    """Say what the runs that are left will take."""
+    return f"about {duration(seconds)} of processor time left"
 
 
 # --------------------------------------------------------------------------------------- the memory

@@ -72,7 +72,8 @@ def remarks(found, place):
     others = [one for one in found if one.differences]
     if others:
         counts = Counter(text for one in others for text in one.differences)
-        said = ", ".join(text for text, _ in counts.most_common(3)) + ", ..." * (len(counts) > 3)
+        said = ", ".join(text for text, _ in counts.most_common(3))
+        said += ", ..." if len(counts) > 3 else ""
         first = others[0].run.folder.name
         what = f"{runs_were(len(others))} made in {place} with other arguments: {said}"
         hindrances.append(f"{what} (as {first}); {ADVICE}")

@@ -113,7 +113,6 @@ def parse_args(view, caller, argv):
         if kept and kept != words:
             return parse_args(view, caller, kept)
     args.words, args.extra_words = words, [*args.options, *extra]
-    args.jobs = runs_at_a_time()
     args.metric = args.metric.replace("_", " ")
     args.default_noises = "--noises" not in given
     if args.noises == [[("paper", None)]]:
@@ -193,18 +192,6 @@ def spelt_as_stored(given):
     except ValueError as error:
         fail(f"--test-noise: {error}")
     return {"test_noise": list(noises), "test_noise_rate": list(rates)}
-
-
-def runs_at_a_time():
-    """Return how many runs go on at a time, None if unknown.
-
-    benchmark.sh, which reads the executor's options, tells it by environment variables.
-    """
-    jobs, hosts = os.environ.get("SWEEP_JOBS"), os.environ.get("SWEEP_HOSTS")
-    if jobs:
-        return int(jobs) * (hosts.count(",") + 1 if hosts else 1)
-    elsewhere = hosts or os.environ.get("SWEEP_EXECUTOR") == "slurm"
-    return None if elsewhere else len(os.sched_getaffinity(0))
 
 
 def unknown_option(name):

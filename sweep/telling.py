@@ -1,7 +1,6 @@
 """What `./benchmark.sh choose` says: its plan, where it stands, its verdicts."""
 
 import csv
-import itertools
 from pathlib import Path
 
 from analysis.choice import CHOICE_COLUMNS, choice_file
@@ -14,7 +13,7 @@ from analysis.verdicts import POINTS, borderline, difference_in_words, excluded,
 from analysis.words import counted
 from noisy_wrappers import BASELINE
 from sweep import halving
-from sweep.environment import time_left
+from sweep.environment import processor_time
 from sweep.looks import nominal_levels
 from sweep.options import from_caller
 
@@ -30,31 +29,32 @@ def before_a_batch(found, args):
     """
     if not any(choice.state.due for choice in found):
         return []
-    lines = [*map(describe, found), total(found, args)]
+    lines = [*map(describe, found), total(found)]
     if not any(choice.returns for choice in found):
         lines += dict.fromkeys(detectable_gain(choice.plan) for choice in found)
     return [*lines, f"runs, logs and the verdict are stored in {from_caller(args, args.runs_dir)}"]
 
 
-def total(found, args):
+def total(found):
     """Say how many runs all choices take, and what is left of them."""
     search = sum(sum(choice.batches[: -len(choice.plan.looks)]) for choice in found)
     confirm = sum(2 * choice.plan.looks[-1] for choice in found)
     finished = sum(len(choice.returns) for choice in found)
-    most = any(len(choice.plan.looks) > 1 for choice in found)
     runs = counted(search + confirm, "run")
-    text = f"at most {runs}" if most else f"{runs} in all"
-    text += f", {search:,} to search and {'up to ' * most}{confirm:,} to confirm; {finished:,} done"
+    if any(len(choice.plan.looks) > 1 for choice in found):
+        text = f"at most {runs}, {search:,} to search and up to {confirm:,} to confirm"
+    else:
+        text = f"{runs} in all, {search:,} to search and {confirm:,} to confirm"
+    text += f"; {finished:,} done"
     if any(choice.run_seconds is None for choice in found):
         return text
-    left = []  # of each choice, the batches that are left: the seconds of their runs
+    seconds = 0
     for choice in found:
         if choice.state.due:
-            done = len(choice.state.rounds) + max(1, choice.state.look)
-            runs = [len(choice.state.due), *choice.batches[done:]]
-            left.append([number * [choice.run_seconds] for number in runs])
-    batches = [sum(batch, []) for batch in itertools.zip_longest(*left, fillvalue=[])]
-    return f"{text}, {time_left(batches, args.jobs)}"
+            begun = len(choice.state.rounds) + max(1, choice.state.look)
+            left = len(choice.state.due) + sum(choice.batches[begun:])
+            seconds += left * choice.run_seconds
+    return f"{text}, {processor_time(seconds)}"
 
 
 def detectable_gain(plan):
@@ -106,7 +106,7 @@ def standing(found, args):
             scores = choice.state.rounds[-1].scores
             for noise in sorted(choice.state.candidates, key=scores.get, reverse=True):
                 yield f"  {rounded(scores[noise]):>10}  {noise}"
-    yield total(found, args)
+    yield total(found)
 
 
 # ------------------------------------------------------------------------------------- the verdicts

@@ -12,7 +12,7 @@ from views import finish, view
 
 from noisy_wrappers import BASELINE
 from sweep import environment
-from sweep.environment import Environment, ask, remember, remembered, run_seconds, time_left
+from sweep.environment import Environment, ask, remember, remembered, run_seconds
 from sweep.grid import make_run
 from sweep.options import parse_args
 
@@ -36,7 +36,6 @@ def planned(algorithm, env_id, *words):
 def short(monkeypatch, tmp_path):
     """Time environments for a moment, and keep answers away from the project."""
     monkeypatch.setattr(environment, "SECONDS", 0.01)
-    monkeypatch.setenv("SWEEP_JOBS", "2")
     monkeypatch.chdir(tmp_path)
 
 
@@ -151,36 +150,13 @@ def test_the_seconds_of_a_run():
     assert run_seconds(run, KNOWN) == pytest.approx(10 + learning + 100 + 0.3)
 
 
-def test_time_left():
-    text = time_left([[3600.0] * 5, [7200.0], []], 2)
-    assert text == "about 7.0 h of processor time left, 5.0 h on the clock with 2 runs at a time"
-    assert time_left([[400.0]], None) == "about 7 min of processor time left"
-    assert "1.0 h on the clock" in time_left([[3600.0] * 5], 10**14)
-
-
-def test_runs_at_a_time(monkeypatch):
-    for executor, jobs, hosts, expected in (
-        ("local", "3", "", 3),
-        ("parallel", "", "hostA,4/hostB", None),
-        ("parallel", "3", "hostA,4/hostB", 6),
-        ("slurm", "64", "", 64),
-    ):
-        monkeypatch.setenv("SWEEP_EXECUTOR", executor)
-        monkeypatch.setenv("SWEEP_JOBS", jobs)
-        monkeypatch.setenv("SWEEP_HOSTS", hosts)
-        assert parse_args("list", "/", ["paper"]).jobs == expected
-
-
 def test_a_plan_says_what_it_will_decide_and_what_it_costs(tmp_path):
     shown = choose("Slow", "--runs-dir", tmp_path)
     speed, left_out, first, total, gain, place = shown.err.splitlines()
     assert "RandomDynamics" in left_out and "Reward" in left_out
     assert re.fullmatch(r"toy_envs:Slow-v0: [\d.]+ ms a step", speed)
     assert "round 1 of 4: 14 of 14 configurations, seed 1" in first
-    hours, clock = re.search(
-        r"at most 92 runs, .*, about ([\d.]+) h of processor time left, ([\d.]+) h on the", total
-    ).groups()
-    assert float(clock) == pytest.approx(float(hours) / 2, rel=0.02)
+    assert re.match(r"at most 92 runs, .*, about [\d.]+ h of processor time left$", total)
     assert gain.startswith("25 fresh seeds confirm a true gain of 0.8 standard deviations")
     assert place == f"runs, logs and the verdict are stored in {tmp_path}"
 
@@ -192,7 +168,7 @@ def test_any_dry_run_says_what_it_costs_and_finished_runs_tell_better(tmp_path):
     assert shown.code == 0 and shown.out.count("\n") == 3
     speed, line = shown.err.splitlines()
     milliseconds = float(re.fullmatch(r"toy_envs:Slow-v0: ([\d.]+) ms a step", speed)[1])
-    minutes = re.match(r"3 runs, 3 to do; about ([\d.]+) min of processor time left, ", line)[1]
+    minutes = re.match(r"3 runs, 3 to do; about ([\d.]+) min of processor time left$", line)[1]
     expected = 3 * (10.4 + 14 * milliseconds) / 60  # 4,000 steps, and 100 episodes of tests
     assert float(minutes) == pytest.approx(expected, abs=0.5 + 0.1 * expected)
     assert view("list", *grid).err == "3 runs, 3 to do\n"
@@ -201,8 +177,7 @@ def test_any_dry_run_says_what_it_costs_and_finished_runs_tell_better(tmp_path):
     result = json.loads((first / "result.json").read_text())
     result |= {"wall_time_seconds": 9000, "processor_seconds": 3600}  # on a busy machine
     (first / "result.json").write_text(json.dumps(result))
-    left = "3 runs, 2 to do; about 2.0 h of processor time left, 1.0 h on the clock with 2 runs"
-    assert left in view("dry-run", *grid).err
+    assert "3 runs, 2 to do; about 2.0 h of processor time left" in view("dry-run", *grid).err
     finish(second, 4000, env_id="toy_envs:Slow-v0")  # it does not say how long it took
     assert "3 runs, 1 to do; about 1.0 h of processor" in view("dry-run", *grid).err
     # PPO's time tells nothing about TD3, which does not learn yet
