@@ -43,10 +43,12 @@ class Progress(NamedTuple):
     reason: str = ""  # why it is not done, "" where nothing is known yet
 
 
-def progress_of(run, over):
-    """Return a run's progress; where its sweep is over, no young log means that it is running."""
+def progress_of(run, found, over):
+    """Return the progress of a run in whose folder something was found.
+
+    over: its sweep is; then no young log means that it is running.
+    """
     log = read_log(run.folder)
-    found = look(run)
     if found.finished:
         return Progress(run, log, "done")
     if found.damage:
@@ -149,7 +151,7 @@ def watch(args, runs, choices):
     while os.getppid() == parent:
         if time.monotonic() - shown >= pause:
             shown = time.monotonic()
-            progresses = [progress_of(run, over=False) for run in runs]
+            progresses = [progress_of(run, look(run), over=False) for run in runs]
             # one that has no lock yet is starting: this sweep has begun it
             line = summary(
                 [p._replace(state=p.state.removeprefix("probably ")) for p in progresses]
@@ -163,8 +165,9 @@ def watch(args, runs, choices):
 
 def show_status(args, runs, choices):
     """Print how far a sweep is; the exit status is 1 where a run's files are damaged."""
-    progresses = show_progress(args, runs, over=False)
-    hindrances, notes = remarks(map(look, runs), from_caller(args, args.runs_dir))
+    found = list(map(look, runs))
+    progresses = show_progress(args, runs, found, over=False)
+    hindrances, notes = remarks(found, from_caller(args, args.runs_dir))
     for line in [*hindrances, *notes]:
         print(f"note: {line}")
     silent = [p for p in progresses if p.state == RUNNING and p.reason]
@@ -178,12 +181,12 @@ def show_status(args, runs, choices):
 
 def show_stopped(args, runs, choices):
     """Print where a sweep stands that was stopped."""
-    show_progress(args, runs, over=True)
+    show_progress(args, runs, map(look, runs), over=True)
 
 
 def show_report(args, runs, choices):
     """Print what came out of a sweep; the exit status is 1 unless all runs are done."""
-    progresses = show_progress(args, runs, over=True, everything=True)
+    progresses = show_progress(args, runs, map(look, runs), over=True, everything=True)
     refused = {p.run.script.file: p.log.last_line for p in progresses if p.reason == "exit 2"}
     for script, reason in refused.items():
         print(f"{script} refused arguments, so no other seeds of these were started: {reason}")
@@ -199,12 +202,12 @@ def show_report(args, runs, choices):
     return int(any(p.state != "done" for p in progresses))
 
 
-def show_progress(args, runs, over, everything=False):
+def show_progress(args, runs, found, over, everything=False):
     """Print the summary and the failed runs; return the progress of all.
 
     everything: also print what else is known to have ended, or not to.
     """
-    progresses = [progress_of(run, over) for run in runs]
+    progresses = [progress_of(run, one, over) for run, one in zip(runs, found, strict=True)]
     print(f"{from_caller(args, args.runs_dir)}: {summary(progresses)}")
     named = [p for p in progresses if p.state == "failed" or (everything and p.reason)]
     table("not finished:" if everything else "failed:", named, args)

@@ -26,7 +26,6 @@ from sweep.looks import Plan, looks_after, nominal_levels
 from sweep.memory import choice_key, keep_plans, plan_of
 from sweep.options import from_caller
 
-LOOKS_AT_MOST = 50  # of --looks: each needs an integral, which becomes inexact
 NO_SUCCESS = "it tells no `is_success` or `success`, as --metric success_rate needs"
 
 
@@ -82,10 +81,8 @@ def plan_for(args, algorithm, env_id, verdicts):
     share of the level.
     """
     kept = plan_of(args, algorithm, env_id)
-    most = min(LOOKS_AT_MOST, max(1, args.confirm // 2))
-    if args.looks is not None and not 1 <= args.looks <= most:
-        limits = f"from 1 to half of --confirm, and at most {LOOKS_AT_MOST}"
-        fail(f"--looks must be {limits}, not {args.looks}")
+    if args.looks is not None and not 1 <= args.looks <= max(1, args.confirm // 2):
+        fail(f"--looks must be from 1 to half of --confirm, not {args.looks}")
     asked = Plan(looks_after(args.confirm, args.looks), LEVEL / verdicts)
     if kept:
         if args.given & {"--confirm", "--looks"} and kept.looks != asked.looks:
