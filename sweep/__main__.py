@@ -216,11 +216,11 @@ def show_progress(args, runs, found, over, everything=False):
 
 def with_baselines(runs):
     """Say how many runs have no noise, where these have other seeds than those with noise."""
-    kinds = {True: set(), False: set()}
-    for run in runs:
-        kinds["--noise" in run.command].add((run.kind, run.seed))
-    number = len(kinds[False])
-    return f" ({number} of them without noise)" if kinds[True] not in (set(), kinds[False]) else ""
+    noisy = {(run.kind, run.seed) for run in runs if "--noise" in run.command}
+    clean = {(run.kind, run.seed) for run in runs if "--noise" not in run.command}
+    if not noisy or noisy == clean:
+        return ""
+    return f" ({len(clean)} of them without noise)"
 
 
 VIEWS = {

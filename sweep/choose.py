@@ -26,8 +26,6 @@ from sweep.looks import Plan, looks_after, nominal_levels
 from sweep.memory import choice_key, keep_plans, plan_of
 from sweep.options import from_caller
 
-NO_SUCCESS = "it tells no `is_success` or `success`, as --metric success_rate needs"
-
 
 class Choice(NamedTuple):
     """The choice of a noise for one algorithm and environment, as far as it has come."""
@@ -213,25 +211,32 @@ def follow(args, algorithm, env_id, environment, plan):
     seconds = mean_seconds(map(runs.get, returns))
     if seconds is None and environment.timed_steps:
         seconds = run_seconds(next(iter(runs.values())), environment)
-    results = set().union(*([0.0] if values is None else values for values in tests.values()))
     looks = [0, *plan.looks]
     batches = [number * seeds for number, seeds in sizes]
     batches += [2 * (after - before) for before, after in itertools.pairwise(looks)]
     kind = algorithm.upper(), env_id
-    choice = Choice(kind, len(tried), plan, batches, state, runs, returns, seconds)
-    over = state.rounds or not state.due  # the first batch
-    if over and args.metric == SUCCESS and all(values is None for values in tests.values()):
-        return choice._replace(problem=NO_SUCCESS)
-    if over and len(results) == 1:
-        return choice._replace(problem=all_equal(args, *results, len(returns)))
-    return choice
+    first_batch_is_over = state.rounds or not state.due
+    problem = why_tests_say_nothing(args, tests) if first_batch_is_over else ""
+    return Choice(kind, len(tried), plan, batches, state, runs, returns, seconds, problem)
 
 
-def all_equal(args, value, runs):
-    """Say that a choice cannot continue whose tests all have one result."""
+def why_tests_say_nothing(args, tests):
+    """Return why further runs would say nothing about noise, or "".
+
+    tests: the results of each run's tests, None where they tell no success.
+    """
+    results = set()
+    for values in tests.values():
+        results.update([0.0] if values is None else values)
+    if args.metric == SUCCESS and all(values is None for values in tests.values()):
+        return "it tells no `is_success` or `success`, as --metric success_rate needs"
+    if len(results) > 1:
+        return ""
+    [value] = results
     return (
-        f"{what_all_runs_do(value, args.metric)} in {args.total_timesteps:,} steps (runs: {runs}), "
-        "so further runs would say nothing about noise; change --total-timesteps, or leave this out"
+        f"{what_all_runs_do(value, args.metric)} in {args.total_timesteps:,} steps "
+        f"(runs: {len(tests)}), so further runs would say nothing about noise; change "
+        "--total-timesteps, or leave this out"
     )
 
 
