@@ -128,9 +128,9 @@ def ask_about_untried(args, known):
     noises = {env_id: untried(args, env_id, known[env_id].tried) for env_id in args.envs}
     answers = ask_all(args, {env_id: new for env_id, new in noises.items() if new})
     for env_id, answer in answers.items():
-        left_out = in_words(reasons_against(args, answer))
-        if left_out and not args.noises:
-            print(f"{env_id}: left out: {left_out}", file=sys.stderr)
+        if not args.noises:
+            for noise, reason in reasons_against(args, answer).items():
+                print(f"{env_id}: left out: {noise} ({reason})", file=sys.stderr)
         answers[env_id] = answer._replace(tried=known[env_id].tried | answer.tried)
     return answers
 
@@ -162,15 +162,6 @@ def is_on_rewards(noise):
     return any(parse_noise(part).wrapper.kind == "reward" for part in noise.split(" + "))
 
 
-def in_words(reasons):
-    """Name noises with the reasons against them, those with one reason together."""
-    noises_of = {}
-    for noise, reason in reasons.items():
-        reason = reason.removeprefix(noise.partition("(")[0]).strip()  # of several, often
-        noises_of.setdefault(reason, []).append(noise)
-    return "; ".join(f"{', '.join(noises)} ({reason})" for reason, noises in noises_of.items())
-
-
 def candidates(args, algorithm, env_id, environment=None):
     """Return the configurations to choose from, each once, but for those that cannot act there.
 
@@ -187,7 +178,8 @@ def candidates(args, algorithm, env_id, environment=None):
     against = reasons_against(args, environment) if environment else {}
     left_out = {noise.noise: against[noise.noise] for noise in found if noise.noise in against}
     if args.noises and left_out:
-        fail(f"--noises: these cannot act in {env_id}: {in_words(left_out)}")
+        reasons = "; ".join(f"{noise} ({reason})" for noise, reason in left_out.items())
+        fail(f"--noises: these cannot act in {env_id}: {reasons}")
     found = [noise for noise in found if noise.noise not in left_out]
     if not found:
         fail("there is no noise to choose from")
