@@ -47,7 +47,7 @@ def look(planned, with_curve=False):
     sha256 = run.config.get("script_sha256")
     other_text = bool(planned.script and sha256) and sha256 != planned.script.sha256
     finished = run.finished and not differences
-    return Found(finished, "", run, differences, "", other_text)
+    return Found(finished=finished, run=run, differences=differences, other_text=other_text)
 
 
 def differences_of(run, planned):
