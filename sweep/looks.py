@@ -61,17 +61,8 @@ def bounds(looks, level):
     found, grid, density, before, already = [], None, None, 0.0, 0.0
     for time, error in zip(times, spent, strict=True):
         step = sqrt(time - before)
-
-        def beyond(bound, step=step, grid=grid, density=density, time=time):
-            """Return the probability to pass the upper bound at this look, and not before."""
-            if grid is None:
-                return scipy.special.ndtr(-bound)
-            tail = scipy.special.ndtr((grid - bound * sqrt(time)) / step)
-            return scipy.integrate.trapezoid(density * tail, grid)
-
-        bound = scipy.optimize.brentq(
-            lambda b, f=beyond, e=error - already: f(b) - e, 0, 40, xtol=1e-10
-        )
+        known = error - already, time, step, grid, density
+        bound = scipy.optimize.brentq(excess, 0, 40, known, xtol=1e-10)
         limit = min(bound, WIDTH) * sqrt(time)
         new = np.linspace(-limit, limit, POINTS)
         if grid is None:
@@ -82,6 +73,14 @@ def bounds(looks, level):
         found.append(float(bound))
         grid, before, already = new, time, error
     return tuple(found)
+
+
+def excess(bound, error, time, step, grid, density):
+    """Return the chance to pass an upper bound at a look, and not before, less `error`."""
+    if grid is None:
+        return scipy.special.ndtr(-bound) - error
+    tail = scipy.special.ndtr((grid - bound * sqrt(time)) / step)
+    return scipy.integrate.trapezoid(density * tail, grid) - error
 
 
 @cache
