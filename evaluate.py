@@ -267,6 +267,8 @@ def check_players(players, conditions, bad, args):
                     raise ValueError(f"{args.drawing} is not among its render_modes, {modes}")
                 for condition in conditions:
                     condition.wrap(env)
+            if args.stores(player) and not os.access(player.folder, os.W_OK):
+                raise ValueError("cannot be written to; with another --seed nothing is stored")
             if not player.run.finished:
                 step = step_of(player)
                 print(f"{player.folder.name} is not finished: its policy of step {step} is tested")

@@ -522,6 +522,11 @@ def test_bad_arguments(runs, capsys, options, message, monkeypatch):
     refused(Args(**({"runs": (runs,)} | options)), message, runs, capsys)
 
 
+def test_runs_that_cannot_be_written_to_are_not_played(runs, capsys, monkeypatch):
+    monkeypatch.setattr(evaluate.os, "access", lambda path, mode: False)
+    refused(Args((one(runs, "PPO"),)), "cannot be written to; with another --seed", runs, capsys)
+
+
 FAILING = """
 import os
 
