@@ -201,7 +201,7 @@ def follow(args, algorithm, env_id, environment, plan):
         fail(f"--budget {budget} is too large: the best would run with {last_seed} seeds")
     state, runs, returns, tests = walk(args, algorithm, env_id, tried, budget, plan)
     seconds = mean_seconds(map(runs.get, returns))
-    if seconds is None and environment.timed_steps:
+    if seconds is None and environment.step_seconds:
         seconds = run_seconds(next(iter(runs.values())), environment)
     looks = [0, *plan.looks]
     batches = [number * seeds for number, seeds in sizes]

@@ -36,7 +36,6 @@ class Environment(NamedTuple):
     """What is known of an environment."""
 
     step_seconds: float  # of a step with random actions and its share of a reset
-    timed_steps: int
     episode_steps: int  # of a test: the time limit; without one, what the timed episodes had
     observed: int  # numbers in an observation
     bounded: bool  # are its actions? SAC and TD3 need that
@@ -57,10 +56,9 @@ def ask(env_id, configurations=(), max_episode_steps=None, env_kwargs=()):
         made = gym.make(env_id, disable_env_checker=True, **options)
         declared = made.spec.max_episode_steps
         with noisy.make_flat(made, STEP_LIMIT) as env:
-            seconds, steps, length, rewards = time_steps(env)
+            seconds, length, rewards = time_steps(env)
             return Environment(
                 step_seconds=seconds,
-                timed_steps=steps,
                 episode_steps=declared or length,
                 observed=math.prod(env.observation_space.shape),
                 bounded=noisy.is_bounded(env.action_space),
@@ -70,7 +68,7 @@ def ask(env_id, configurations=(), max_episode_steps=None, env_kwargs=()):
 
 
 def time_steps(env):
-    """Return seconds a step, the steps timed, an episode's length and how many rewards there were.
+    """Return seconds a step, an episode's length and how many different rewards there were.
 
     Each step bears its share of a reset: an episode is as long as those that ended while it was
     timed, or as the time limit if none did. Different rewards are counted up to MANY.
@@ -96,7 +94,7 @@ def time_steps(env):
         if ended := terminated or truncated:
             episodes, last_end = episodes + 1, len(steps)
     length = last_end / episodes if episodes else env.spec.max_episode_steps
-    return fmean(steps) + fmean(resets) / length, len(steps), math.ceil(length), len(rewards)
+    return fmean(steps) + fmean(resets) / length, math.ceil(length), len(rewards)
 
 
 def why_unfit(env, configuration):
@@ -213,10 +211,10 @@ def remember(args, env_id, environment):
 
 
 def remembered(args, env_id):
-    """Return what was found when an environment was asked last, or one without timed steps."""
+    """Return what was found when an environment was asked last; 0 seconds a step: nothing."""
     with contextlib.suppress(OSError, ValueError, TypeError):  # there is no file, or half of one
         return Environment(*json.loads(file_of(args, env_id).read_text()))
-    return Environment(math.nan, 0, 0, 0, False, {})
+    return Environment(0.0, 0, 0, False, {})
 
 
 def file_of(args, env_id):

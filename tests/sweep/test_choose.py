@@ -357,7 +357,7 @@ def test_the_readme_says_what_it_takes_by_default(tmp_path):
     for algorithm, announced in zip(("ppo", "sac"), hours, strict=True):
         words = ["choose", "--algos", algorithm, "--envs", "Hopper", "--runs-dir", str(tmp_path)]
         args = parse_args("status", "/", words)
-        known = Environment(0.05e-3, 200, 1000, 11, True, {})
+        known = Environment(0.05e-3, 1000, 11, True, {})
         remember(args, "Hopper-v5", known)
         choices = choose.choices(args)
         assert telling.total(choices).startswith(f"at most {runs} runs, ")
