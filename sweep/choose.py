@@ -125,23 +125,19 @@ def ask_about_untried(args, known):
 
     known: {env_id: Environment}, what earlier commands found.
     """
-    noises = {env_id: untried(args, env_id, known[env_id].tried) for env_id in args.envs}
-    answers = ask_all(args, {env_id: new for env_id, new in noises.items() if new})
+    untried = {}
+    for env_id in args.envs:
+        whole = candidates(args, args.algos[0], env_id)
+        new = [noise for noise in whole if noise.noise not in known[env_id].tried]
+        if new:
+            untried[env_id] = new
+    answers = ask_all(args, untried)
     for env_id, answer in answers.items():
         if not args.noises:
             for noise, reason in reasons_against(args, answer).items():
                 print(f"{env_id}: left out: {noise} ({reason})", file=sys.stderr)
         answers[env_id] = answer._replace(tried=known[env_id].tried | answer.tried)
     return answers
-
-
-def untried(args, env_id, tried):
-    """Return the configurations whose noises were never tried in an environment.
-
-    A noise that was refused is tried again if it is named all the same.
-    """
-    whole = candidates(args, args.algos[0], env_id)
-    return [n for n in whole if n.noise not in tried or (args.noises and tried[n.noise])]
 
 
 def reasons_against(args, environment):
