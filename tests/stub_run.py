@@ -83,7 +83,7 @@ def pretend_to_train(total_timesteps, checkpoint):
     checkpoint.unlink(missing_ok=True)
 
 
-def train(argv):
+def parser():
     parser = argparse.ArgumentParser()
     parser.add_argument("script")
     parser.add_argument("--env-id", required=True)
@@ -95,7 +95,11 @@ def train(argv):
     parser.add_argument("--exp-name")
     parser.add_argument("--gamma", type=float, default=0.99)
     parser.add_argument("--eval-frequency", type=int, default=100)
-    args, others = parser.parse_known_args(argv)
+    return parser
+
+
+def train(argv):
+    args, others = parser().parse_known_args(argv)
     args.noise_rate = [rate if ":" in rate else float(rate) for rate in args.noise_rate]
     script = ROOT / args.script
     algorithm = script.name.removesuffix("_continuous_noisy.py")

@@ -15,6 +15,7 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+import stub_run
 import tyro
 from views import ROOT, finish, folders, locked, log_of, view
 
@@ -40,19 +41,11 @@ def dry_run(*args):
     assert result.code == 0, result.err
     lines = [line.split("\t") for line in result.out.splitlines()]
     assert result.err.startswith(f"{len(lines):,} run")
-    parser = argparse.ArgumentParser()
-    parser.add_argument("python", choices=[sys.executable])
-    parser.add_argument("script", choices=[f"{name}{ENDING}.py" for name in ALGORITHMS])
-    for option in ("--env-id", "--runs-dir"):
-        parser.add_argument(option, required=True)
-    for option in ("--seed", "--total-timesteps"):
-        parser.add_argument(option, required=True, type=int)
-    parser.add_argument("--noise", nargs="+", default=[])
-    parser.add_argument("--noise-rate", nargs="+", default=[])
-    return [
-        parser.parse_known_args(shlex.split(text), argparse.Namespace(text=text, folder=folder))[0]
-        for folder, text in lines
-    ]
+    parser, found = stub_run.parser(), []
+    for folder, text in lines:
+        given = argparse.Namespace(text=text, folder=folder)
+        found.append(parser.parse_known_args(shlex.split(text)[1:], given)[0])
+    return found
 
 
 # THE RUNS
