@@ -56,7 +56,7 @@ ABLATION += [
     (f"RandomUniformNoisyObservation(-{b}, {b})", 1.0) for b in (0.0001, 0.001, 0.01, 0.1, 1.0)
 ]
 # Times as many seeds without noise as with it, at most: with more, a test of few seeds claims too
-# much where noise widens the spread, and the analysis gives no verdict (analysis/verdicts.py)
+# much where noise widens the spread, and the analysis warns (MOST_RATIO in analysis/verdicts.py)
 MOST_BASELINES = 2.6
 # Compiling would take longer than learning, which the other options make fast
 DEMO_OPTIONS = ["--no-compile", "--learning-rate=2e-3"]

@@ -20,8 +20,9 @@ import tyro
 from views import ROOT, finish, folders, locked, log_of, view
 
 import noisy_wrappers
-from analysis import logs
+from analysis import logs, verdicts
 from sweep import scripts
+from sweep.grid import MOST_BASELINES
 
 ALGORITHMS = {"sac": 5, "td3": 5, "ppo": 10}  # seeds
 SCALE = "RandomUniformScaleReward(0.5, 1.5)"
@@ -401,6 +402,7 @@ def test_baselines_that_pay(noises, more, baselines):
     lines = dry_run(*grid)
     assert [line.seed for line in lines if not line.noise] == baselines
     assert Counter(line.seed for line in lines if line.noise) == dict.fromkeys([1, 2, 3], noises)
+    assert MOST_BASELINES == verdicts.MOST_RATIO  # above which the analysis warns
     said = "" if baselines == [1, 2, 3] else f" ({len(baselines)} of them without noise)"
     assert view("list", *grid).err == f"{len(lines)} runs{said}, {len(lines)} to do\n"
 
