@@ -15,6 +15,7 @@ from analysis import effects, style
 from analysis.folders import RETURN, SUCCESS
 from analysis.formatting import seeds_between, seeds_of, slug
 from analysis.heatmap import heatmaps
+from analysis.power import LEVEL
 from analysis.runs import KEYS, rows_of
 from analysis.statistics import SEEDS_FOR_INTERVAL
 from noisy_wrappers import BASELINE, rate_order
@@ -120,7 +121,7 @@ def spread(runs, band):
     std = pd.DataFrame(np.atleast_2d(runs)).std(axis=1).to_numpy()
     if band == STD:
         return np.nan_to_num(std)
-    return np.nan_to_num(special.stdtrit(np.maximum(1, n - 1), 0.975) * std / np.sqrt(n))
+    return np.nan_to_num(special.stdtrit(np.maximum(1, n - 1), 1 - LEVEL / 2) * std / np.sqrt(n))
 
 
 def curve(ax, x, runs, band, **look):

@@ -10,6 +10,7 @@ import numpy as np
 import scipy
 
 from analysis.permutation import columns
+from analysis.power import LEVEL
 from analysis.statistics import PERCENT_OF_SPAN, normal_quantile, satterthwaite
 
 SEEDS_FOR_IQM, SEEDS_FOR_PROBABILITY = 3, 4  # with fewer there is no interval: docs/statistics.md
@@ -87,7 +88,7 @@ def newcombe_interval(p, n, m):
     Unlike the percentile bootstrap it does not collapse to a point at p = 0 or 1.
     https://doi.org/10.1002/sim.2324
     """
-    z, k = normal_quantile(0.975), (n + m) / 2 - 1
+    z, k = normal_quantile(1 - LEVEL / 2), (n + m) / 2 - 1
 
     def gap(t):
         variance = t * (1 - t) * (1 + k * (1 - t) / (2 - t) + k * t / (1 + t)) / (n * m)

@@ -5,7 +5,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-from results.study import show
+import pandas as pd
+
+from results.study import picture, show
 
 RESULTS = Path(show.__file__).parents[1]
 PAGES = [*sorted(RESULTS.glob("*.md")), RESULTS / "data/README.md", RESULTS / "tables/README.md"]
@@ -46,3 +48,13 @@ def test_a_comparison_has_formats(tmp_path, monkeypatch, capsys):
     assert out[2] == "| 3 + 4 | 1,234.6 ± 2.0 | -9.0 ± 1.0 | 0.012 |"
     assert out[3] == "| – | – | – | 0.5 |"
     assert show.formatted("{a:+z.0f}", {"a": "-0.2"}) == "+0"
+
+
+def test_the_first_page_says_what_the_claims_say():
+    text = " ".join((RESULTS.parent / "README.md").read_text().split())
+    claims = pd.read_csv(show.TABLES / "claims.csv")
+    claims.columns = ["claim", "paper", "ours", "covered", "verdict", "runs"]
+    for environment, row in picture.best_noises(claims).items():
+        change, low, high = re.match(picture.OURS, row.ours).groups()
+        gain = f"{change.lstrip('+')} % [{low}, {high}]"
+        assert (gain if row.verdict == "confirmed" else f"{high} % on {environment}") in text
