@@ -73,7 +73,8 @@ def no_finished_run(runs_dir):
     """End with an error that says where there are finished runs, if that is near `runs_dir`."""
     if is_run(runs_dir):
         fail(f"{runs_dir} is a run itself: name the folder that it is in")
-    folders = {path.parents[1] for path in runs_dir.glob("*/**/result.json") if is_run(path.parent)}
+    results = runs_dir.glob("*/*/**/result.json")  # runs_dir itself has damaged ones at most
+    folders = {path.parents[1] for path in results if is_run(path.parent)}
     folders = sorted({str(path.parent if is_phase(path) else path) for path in folders})
     where = f"; there are some in {', '.join(folders)}: name it with --runs-dir" if folders else ""
     fail(f"no finished run in {runs_dir}{where}")

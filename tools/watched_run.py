@@ -5,6 +5,7 @@ import copy
 import functools
 import importlib.util
 import io
+import itertools
 import os
 import re
 import subprocess
@@ -86,6 +87,8 @@ class Trial:
 
     def train(self, name, **kwargs):
         """Return a short run, watched, in a folder of runs."""
+        if "episodes" in kwargs:
+            kwargs["updates"] = len(self.run.updates)
         return train(self.path, self.options, self.folder / name, **kwargs)
 
     def refuses(self, **changed):
@@ -129,13 +132,14 @@ class Trial:
         return result.stdout
 
 
-def train(path, options, runs_dir, episodes=0, **changed):
+def train(path, options, runs_dir, episodes=0, updates=0, **changed):
     """Train by a script, imported anew as in a new process.
 
-    It is stopped when it has learned with each of its updates, and after a number of episodes.
+    It is stopped when it has learned with a number of updates, and after a number of episodes.
     Return what was seen:
     - `updates`, for each loss the network that it learns, its parameters before the first update,
       the curves and the gradient of the first, the inputs of the last
+    - `idle`, {name: (network, optimizer)} of the losses whose update was never called
     - `with_gradient`, the ids of parameters that had a gradient in any update
     - `start`, the step at which it began, and `episodes`, how many ended
     - `places`, where observations were returned: {bytes: [(episode, step, at a time limit), ...]}
@@ -145,12 +149,12 @@ def train(path, options, runs_dir, episodes=0, **changed):
     """
     spec = importlib.util.spec_from_file_location(path.stem, path)
     sys.modules[path.stem] = script = importlib.util.module_from_spec(spec)
-    seen = SimpleNamespace(script=script, updaters=0, updates=[], gaps=[], places={})
+    seen = SimpleNamespace(script=script, idle={}, updates=[], gaps=[], places={})
     seen.episodes, seen.with_gradient, said = 0, set(), io.StringIO()
 
     def stop():
         seen.episodes += 1
-        return seen.episodes >= episodes > 0 and len(seen.updates) == seen.updaters
+        return seen.episodes >= episodes > 0 and len(seen.updates) >= updates
 
     if str(path.parent) not in sys.path:
         sys.path.append(str(path.parent))  # for what it imports
@@ -196,7 +200,7 @@ def watch_updates(updater, seen):
         check(
             stepped <= known, f"{text}, by old gradients: give it this network's parameters alone"
         )
-        seen.updaters += 1
+        seen.idle[own.name] = (network, optimizer)
 
         def watched(*inputs):
             if not hasattr(own, "first"):
@@ -209,6 +213,7 @@ def watch_updates(updater, seen):
             seen.with_gradient |= moved
             if not hasattr(own, "first"):
                 seen.updates.append(own)
+                seen.idle.pop(own.name, None)
                 own.before = before
                 own.first = curves | {name: p.grad.clone() for name, p in parameters.items()}
             return curves
@@ -243,31 +248,47 @@ def tensors_among(inputs):
     return [x for given in lists for x in given if torch.is_tensor(x)]
 
 
+def keys(batch):
+    """Return the rows of a tensor as `places` has them."""
+    return [row.tobytes() for row in batch.float().cpu().numpy()]
+
+
 def raw_observations(inputs, places):
     """Return the batches that have observations as the environment returned them."""
     batches = [x for x in tensors_among(inputs) if x.ndim == 2]
-    return [x for x in batches if any(row.tobytes() in places for row in x.numpy())]
+    return [x for x in batches if any(key in places for key in keys(x))]
 
 
 def check_transitions(name, inputs, places):
     """Check that next observations are later ones, and that no time limit counts as an end.
 
-    That is seen where an update is given both as the environment returned them. Of two vectors of
-    flags, as terminated and truncated, nothing is said.
+    That is seen where an update is given two batches of observations, s before s', and two numbers
+    for each row at least, such as rewards. Nothing is said of rows that the environment did not
+    return (those of a model, or relabelled), and nothing of two vectors of flags or discounts.
     """
-    raw, at_limit = raw_observations(inputs, places), []
-    if len(raw) != 2:
+    raw = raw_observations(inputs, places)
+    size = len(raw[0]) if raw else 0
+    numbers = [x for x in tensors_among(inputs) if x.shape in ((size,), (size, 1))]
+    if len(raw) != 2 or len(raw[1]) != size or len(numbers) < 2:
         return
-    for row, next_row in zip(*raw, strict=True):
-        before, after = (places.get(x.numpy().tobytes(), []) for x in (row, next_row))
-        later = [b for a in before for b in after if a.episode == b.episode and a.step < b.step]
-        advice = "store what step() returned, before reset(), and test in test_env alone"
-        check(later, f"{name}() is given a next observation that does not come later: {advice}")
-        at_limit.append(any(place.at_limit for place in later))
-    vectors = [x.tolist() for x in tensors_among(inputs) if x.shape == (len(at_limit),)]
-    flags = [x for x in vectors if set(x) <= {0, 1}]
-    is_end = any(at_limit) and flags == [at_limit]
-    check(not is_end, f"{name}() takes a time limit for an end: store `terminated` alone")
+    rows, at_limit = [], []
+    for row, (key, next_key) in enumerate(zip(keys(raw[0]), keys(raw[1]), strict=True)):
+        if key in places and next_key in places:
+            pairs = itertools.product(places[key], places[next_key])
+            later = [b for a, b in pairs if a.episode == b.episode and a.step < b.step]
+            advice = "give s before s'; store what step() returned, before reset(); "
+            advice += "test in test_env alone"
+            check(later, f"{name}() is given a next observation that does not come later: {advice}")
+            rows.append(row)
+            at_limit.append(any(place.at_limit for place in later))
+    columns = [x.flatten().tolist() for x in numbers]
+    few = [column for column in columns if len(set(column)) <= size // 2]  # flags or discounts
+    if len(few) == 1 and any(at_limit):
+        values = [few[0][row] for row in rows]
+        is_flag = set(values) <= {0, 1} and values == at_limit
+        is_discount = [value == 0 for value in values] == at_limit
+        advice = "store `terminated` alone"
+        check(not (is_flag or is_discount), f"{name}() takes a time limit for an end: {advice}")
 
 
 def watch_environment(learn, seen):
@@ -318,7 +339,8 @@ def watch_networks(resume, seen):
     """Return a script's Run.resume(), which notes the state and the step."""
 
     def watched_resume(run, state):
-        networks = {name: x for name, x in state.items() if isinstance(x, torch.nn.Module)}
+        modules = {name: x for name, x in state.items() if isinstance(x, torch.nn.Module)}
+        networks = {name: x for name, x in modules.items() if any(True for _ in x.parameters())}
         seen.networks = {name: (x, copy.deepcopy(x.state_dict())) for name, x in networks.items()}
         others = {name: x for name, x in state.items() if name not in networks}
         seen.others = {name: (x, as_bytes(x.state_dict())) for name, x in others.items()}
@@ -342,8 +364,9 @@ def left_behind(seen):
     The tensors of a target move as those of the learned network do that it is a copy of; of another
     one, all parameters move. What is to stay as it is needs no place in the state.
     """
+    idle = [part for parts in seen.idle.values() for part in parts]
     for name, (part, begun) in seen.others.items():
-        if as_bytes(part.state_dict()) == begun:
+        if part not in idle and as_bytes(part.state_dict()) == begun:
             yield f"{name!r} never changes: update it, or leave it out of `state`"
     learned = [update.network for update in seen.updates]
     names = {}
@@ -351,7 +374,7 @@ def left_behind(seen):
         if network in names:
             yield f"{name!r} is {names[network]!r} itself: copy it"
         names.setdefault(network, name)
-        if network in learned:
+        if network in learned or network in idle:
             continue
         moving, of = {key for key, _ in network.named_parameters()}, ""
         for other, (leader, leader_begun) in seen.networks.items():

@@ -81,6 +81,10 @@ def test_a_run_is_no_folder_of_runs(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(analyze.Args(runs_dir=folder))
     assert capsys.readouterr().err.endswith("is a run itself: name the folder that it is in\n")
+    (folder / "eval.csv").write_text("damaged")
+    with pytest.raises(SystemExit):  # the folder is named once: it has no other finished runs
+        main(analyze.Args(runs_dir=tmp_path))
+    assert capsys.readouterr().err == f"error: no finished run in {tmp_path}\n"
 
 
 @pytest.mark.parametrize(

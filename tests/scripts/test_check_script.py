@@ -1,12 +1,15 @@
 """tools/check_script.py: each of its lines turns red where a script is broken for it."""
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
 import check_script
+import numpy as np
 import pytest
 import torch
 import torch._inductor.config
+import watched_run
 from check_script import BrokenError, Trial
 
 ROOT = Path(__file__).parents[2]
@@ -220,3 +223,51 @@ def test_an_option_of_the_grid_is_none_of_the_scripts_in_a_sweep(words, tmp_path
     options = [*words.split(), "--hidden=64", "--env-kwargs", "g:1"]
     trial = Trial(Path("my_continuous_noisy.py"), options, tmp_path)
     assert trial.own_options == ["--hidden=64", "--env-kwargs", "g:1"]
+
+
+EPISODES = [[0.1, 0.2, 0.3], [1.1, 1.2, 1.3, 1.4]]  # each ends at the time limit
+PLACES = {
+    np.float32([x, 0]).tobytes(): [SimpleNamespace(episode=i, step=t, at_limit=x == episode[-1])]
+    for i, episode in enumerate(EPISODES)
+    for t, x in enumerate(episode)
+}
+BEFORE, AFTER = [0.1, 0.2, 1.1, 1.2, 1.3], [0.2, 0.3, 1.2, 1.3, 1.4]
+REWARDS, AT_LIMIT = [1.0, 2.0, 3.0, 4.0, 5.0], [0.0, 1.0, 0.0, 0.0, 1.0]
+DISCOUNTS = [0.9 * (1 - x) for x in AT_LIMIT]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "numbers", "said"),
+    [
+        (BEFORE, AFTER, [REWARDS, [0.0] * 5], ""),
+        (BEFORE, [0.3, 0.3, *AFTER[2:]], [REWARDS, [0.0] * 5], ""),  # some steps later
+        ([9.0, *BEFORE[1:]], [-9.0, *AFTER[1:]], [REWARDS, [0.0] * 5], ""),  # of a model
+        (BEFORE, AFTER, [REWARDS, [0.0] * 5, AT_LIMIT], ""),  # terminated, and truncated
+        (BEFORE, AFTER, [REWARDS, [0.9] * 5, AT_LIMIT], ""),  # a discount, and truncated
+        (BEFORE, AFTER[1:], [REWARDS, AT_LIMIT], ""),  # the batches of a discriminator
+        (AFTER, BEFORE, [], ""),  # an inverse model
+        (BEFORE, AFTER, [REWARDS, AT_LIMIT], "takes a time limit for an end"),
+        (BEFORE, AFTER, [REWARDS, DISCOUNTS], "takes a time limit for an end"),
+        (AFTER, BEFORE, [REWARDS, [0.0] * 5], "give s before s'"),
+        (BEFORE, BEFORE, [REWARDS, [0.0] * 5], "does not come later"),
+        (BEFORE, [0.2, 1.1, *AFTER[2:]], [REWARDS, [0.0] * 5], "before reset()"),
+    ],
+)
+@pytest.mark.parametrize("shape", [(-1,), (-1, 1)])
+def test_transitions_are_those_of_the_environment(before, after, numbers, said, shape):
+    batch = [torch.tensor([(x, 0.0) for x in column]) for column in (before, after)]
+    batch += [torch.tensor(column).reshape(shape) for column in numbers]
+    if said:
+        with pytest.raises(BrokenError, match=re.escape(said)):
+            watched_run.check_transitions("loss", [batch, 0.99], PLACES)
+    else:
+        watched_run.check_transitions("loss", [batch, 0.99], PLACES)
+
+
+@pytest.mark.slow
+def test_an_option_may_leave_an_update_out(tmp_path):
+    trial = broken(tmp_path, "sac")
+    trial.options = ["--no-autotune"]
+    assert "nothing learns by temperature_loss()" in check_script.trains(trial)
+    check_script.follows(trial)
+    check_script.resumes(trial)
