@@ -211,12 +211,14 @@ stop() { # EXIT_STATUS
 # reaches every run once.
 run_todo() {
   local reason guard watch
+  command -v flock >/dev/null || fail "benchmark.sh needs flock (Debian: apt-get install util-linux)"
   [ "$executor" != slurm ] || array_limit
   mapfile -t folders < <(printf '%s\n' "$todo" | cut -f1 | sed 's,/[^/]*$,/logs,' | sort -u)
   reason=$( (mkdir -p "${folders[@]}" && printf '%s\n' "$todo" >"$list") 2>&1) ||
     fail "--runs-dir: cannot write to $logs: ${reason##*: }"
   flock "$list" true ||
     fail "--runs-dir: cannot lock files in $logs, so two processes could write into one run"
+  [ "${grid[0]}" != choose ] || show begin
   if [ "$executor" = slurm ]; then
     submit
     [ -n "$wait" ] || exit "$stopped"

@@ -112,6 +112,8 @@ def marks_of(rows, with_seeds):
     for word in (BETTER, WORSE, UNCLEAR):
         if word in found or (word == UNCLEAR and found - {BETTER, WORSE}):
             marks[word] = mark_of(word)
+    if rows["verdict"].isna().any():  # of lopsided numbers of seeds, or `choose` has not judged it
+        marks["no verdict"] = mark_of(None)
     if with_seeds:
         marks["one seed"] = Line2D([], [], color="0.4", marker=".", markersize=3, linestyle="")
         marks["not found in 80 % of cases"] = Patch(color="0.88")
@@ -119,8 +121,8 @@ def marks_of(rows, with_seeds):
 
 
 def mark_of(verdict):
-    """Return the mark of a verdict: filled where it is clear."""
-    color = style.COLORS.get(verdict, style.UNCLEAR)
+    """Return the mark of a verdict: filled where it is clear, grey where there is none."""
+    color = style.COLORS.get(verdict, style.UNCLEAR) if isinstance(verdict, str) else "0.4"
     face = color if verdict in style.COLORS else "white"
     return Line2D([], [], color=color, marker="o", markerfacecolor=face, linestyle="-")
 

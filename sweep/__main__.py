@@ -138,6 +138,13 @@ def show_list(args, runs, choices):
         print(line, file=sys.stderr)
 
 
+def begin(args, runs, choices):
+    """Keep what a choice's next batch of runs fixes, just before they start."""
+    from sweep import choose
+
+    choose.begin(args, choices)
+
+
 def watch(args, runs, choices):
     """Show the summary until benchmark.sh ends: on a terminal one line that is rewritten.
 
@@ -227,6 +234,7 @@ VIEWS = {
     "list": show_list,
     "dry-run": show_list,
     "status": show_status,
+    "begin": begin,
     "stopped": show_stopped,
     "report": show_report,
     "watch": watch,

@@ -66,10 +66,14 @@ def choices(args):
         fail("\nerror: ".join(problems), code=1)
     for problem in problems:  # the others go on
         print(f"warning: {problem}", file=sys.stderr)
-    if args.view == "list":
-        confirmed = [pair for pair, choice in zip(plans, found, strict=True) if choice.state.look]
-        keep_plans(args, {choice_key(args, *pair): plans[pair] for pair in confirmed})
     return [choice for choice in found if not choice.problem]
+
+
+def begin(args, found):
+    """Keep what the runs that start now fix: the command, and the plans of confirmations."""
+    confirmed = [choice for choice in found if choice.state.look]
+    keys = [choice_key(args, choice.kind[0].lower(), choice.kind[1]) for choice in confirmed]
+    keep_plans(args, {key: one.plan for key, one in zip(keys, confirmed, strict=True)})
 
 
 def plan_for(args, algorithm, env_id, verdicts):
@@ -86,8 +90,8 @@ def plan_for(args, algorithm, env_id, verdicts):
         if args.given & {"--confirm", "--looks"} and kept.looks != asked.looks:
             fail(
                 f"{algorithm.upper()} on {env_id}: its confirmation has begun, with "
-                f"{kept.looks[-1]} seeds and {len(kept.looks)} looks, and keeps them: leave out "
-                "--confirm and --looks, or use another --runs-dir"
+                f"{kept.looks[-1]} seeds and {counted(len(kept.looks), 'look')}, and keeps them: "
+                "leave out --confirm and --looks, or use another --runs-dir"
             )
         return kept
     fewest = next(n for n in itertools.count(4) if is_enough(n, args.looks, asked.level))

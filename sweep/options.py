@@ -198,7 +198,8 @@ def unknown_option(name):
     """Say what to write instead of an option that the grid does not have."""
     ours = [scripts.read(path) for path in scripts.scripts_in(scripts.PROJECT).values()]
     of_scripts = {scripts.spelt(option) for script in ours for option in script.options}
-    if name in of_scripts - GIVEN_BY_THE_GRID.keys():
+    of_scripts -= GIVEN_BY_THE_GRID.keys()
+    if name in of_scripts or re.sub("^--no-", "--", name) in of_scripts:
         return f"{name} is an option of the scripts: put it at the end, after --"
     known = [*map(scripts.spelt, OPTIONS), *EXECUTOR_OPTIONS]
     hint = scripts.did_you_mean(name, known) or "; ./benchmark.sh --help lists them"

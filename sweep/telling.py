@@ -141,7 +141,7 @@ def sentence(choice, verdict, unit=""):
         seeds = f"stopped after {verdict.seeds} of {verdict.planned} planned fresh seeds"
     evidence = f"{seeds}, {difference_in_words(comparison, unit)}, p {p_value(comparison.p)}"
     evidence += smallest(comparison)
-    if verdict.needed < LEVEL:
+    if round(verdict.needed, 6) < LEVEL:
         evidence += f", needed: {two_digits(verdict.needed)}"
         evidence += f" (level shared by {share} verdicts)" if share else ""
     said = f"{winner} could not be shown to help"
@@ -168,7 +168,10 @@ def obstacle(choice):
         text += " These did not finish; run the same command again to retry them."
     if failed and not choice.returns:  # then it is not the noise
         return text + f"\n  If none ever finishes, leave {choice.name} out: see --algos and --envs"
-    for noise in dict.fromkeys(noise for noise, _ in failed if noise != BASELINE):
+    noises = dict.fromkeys(noise for noise, _ in failed)
+    if BASELINE in noises:  # then it is not the noise, either
+        return text
+    for noise in noises:
         excluded = "+".join(f"{name}@{rate}" for name, rate in zip(*noise.texts, strict=True))
         text += f'\n  If it fails every time, leave it out: --exclude "{excluded}"'
     return text

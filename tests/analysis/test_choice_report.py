@@ -95,3 +95,10 @@ def test_a_confirmation_has_the_verdict_of_the_choice(gain, survives, verdict, t
     tables = run(tmp_path)
     [said] = tables["noises"]["verdict"]
     assert said == verdict or (pd.isna(said) and not verdict)
+
+
+def test_a_confirmation_that_is_not_judged_yet_is_drawn(tmp_path):
+    write_choice(tmp_path / "runs")
+    (tmp_path / "runs/choice.csv").unlink()
+    assert run(tmp_path, drawn=True)["statistics"]["verdict"].isna().all()
+    assert (tmp_path / "results/report.html").exists()

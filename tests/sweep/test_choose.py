@@ -409,7 +409,9 @@ def test_what_was_fixed_beforehand_is_kept(tmp_path, capsys):
     def listed(text):
         args = arguments(text, tmp_path)
         args.view = "list"
-        return choose.choices(args)
+        found = choose.choices(args)
+        choose.begin(args, found)
+        return found
 
     [choice] = listed(f"{one} | --confirm | 10")
     assert choice.plan == Plan((5, 10), 0.05)
@@ -444,6 +446,8 @@ def test_a_status_finds_the_options_of_the_choice(tmp_path):
     words = ["--algos", "ppo", "sac", "--envs", "Pendulum", "--noises", f"{A}@1", "--confirm", "6"]
     words += ["--runs-dir", tmp_path]
     assert view("list", "choose", *words, "--", "--gamma", "0.9").code == 0
+    assert not (tmp_path / "choice.json").exists()  # nothing has begun
+    assert view("begin", "choose", *words, "--", "--gamma", "0.9").code == 0
     asked = ("--algos ppo --envs Pendulum-v1", "--algos sac --envs Pendulum", "--algos sac", "")
     shown = [view("status", "choose", *text.split(), "--runs-dir", tmp_path) for text in asked]
     assert all(one.code == 0 and "24 runs in all" in one.out for one in shown)

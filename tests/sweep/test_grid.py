@@ -431,6 +431,7 @@ def test_baselines_that_pay(noises, more, baselines):
         (f"{C} --looks 13", "--looks must be from 1 to half of --confirm, not 13"),
         ("best -- --exp-name mine", "--exp-name: several algorithms would write into the same"),
         ("demo --env-id Hopper-v5", "unknown option --env-id; did you mean --envs?"),
+        ("demo --no-compile", "--no-compile is an option of the scripts: put it at the end"),
         ("demo --gamma 0.9", "--gamma is an option of the scripts: put it at the end, after --"),
         ("demo --runs-dir=-x", "--runs-dir must be a path"),
         ("--algos sac demo", "unknown preset '--algos'"),
