@@ -90,6 +90,9 @@ def read_entry(folder, phase):
     except DamageError as error:
         return Entry("", "corrupt", str(error), error.run)
     if not run.finished:
+        log = read_log(folder)
+        if has_failed(log):
+            return Entry("", "failed", log.last_line, run)
         return Entry("", "unfinished", "no result.json", run)
     return Entry("", "finished", "", run)
 
@@ -179,8 +182,13 @@ def failed_without_a_folder(runs_dir):
     return [
         Entry(str(path.relative_to(runs_dir)), "failed", log.last_line)
         for path, log in logs.items()
-        if log.exit_status not in (None, 0, *STOPPED)
+        if has_failed(log)
     ]
+
+
+def has_failed(log):
+    """Tell whether a run's log says that it ended, neither well nor stopped."""
+    return log.exit_status not in (None, 0, *STOPPED)
 
 
 def missing_runs(entries):

@@ -105,7 +105,7 @@ def test_every_run_left_out_has_its_own_reason(tmp_path):
     assert "3 more" in short["run"].iloc[0]
 
 
-def test_a_run_that_failed_before_it_had_a_folder_is_listed(tmp_path):
+def test_runs_that_failed_are_listed_also_without_a_folder(tmp_path):
     for phase in ("", "search", "confirmation"):
         (tmp_path / phase / "logs").mkdir(parents=True)
     (tmp_path / "logs/a__1.log").write_text(f"{BEGUN}error: no\n# 2026 host: exit=2\n")
@@ -114,8 +114,11 @@ def test_a_run_that_failed_before_it_had_a_folder_is_listed(tmp_path):
     for code in (0, 130, 143):  # finished or stopped; its folder was moved or deleted afterwards
         (tmp_path / f"logs/a__{code}.log").write_text(f"{BEGUN}x\n# now host: exit={code}\n")
     (tmp_path / "logs/a__run.log").write_text(f"{BEGUN}compiling ...\n")  # it is starting
+    folder = write_run(tmp_path, [1], finished=False)  # this one had a folder
+    (tmp_path / f"logs/{folder.name}.log").write_text(text)
     table = left_out(read_runs(tmp_path))
     assert table[["status", "run", "reason"]].to_numpy().tolist() == [
+        ["failed", folder.name, "KeyError: 'x'"],
         ["failed", "a__1", "error: no"],
         ["failed", "search/a__2", "KeyError: 'x'"],
     ]
