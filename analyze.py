@@ -225,7 +225,7 @@ def analyse(args, entries, choice):
         robustness=robustness,
         overview=overview_of(entries, studies),
         problems=f"Runs left out: {number.sum():,} ({counts})." if len(number) else "",
-        notes=[*incomplete_note(number), *lopsided_notes(compared), *notes, *unreadable],
+        notes=[*incomplete_note(number, compared), *lopsided_notes(compared), *notes, *unreadable],
         versions=version_notes(entries),
     )
 
@@ -236,10 +236,13 @@ def not_alone(rates, noises):
     return rates[~pd.MultiIndex.from_frame(rates[KEYS]).isin(keys)]
 
 
-def incomplete_note(number):
-    """Yield a note where a sweep is not complete; number: of the runs left out, by status."""
+def incomplete_note(number, compared):
+    """Yield a note where a sweep with noise is not complete.
+
+    number: of the runs left out, by status.
+    """
     due = {status: n for status, n in number.items() if status in MORE_TO_COME}
-    if due:
+    if due and not compared.noises.empty:
         counts = ", ".join(f"{n:,} {status}" for status, n in due.items())
         yield (
             f"this sweep is not complete ({counts}): more runs are due, and a verdict now is an "
