@@ -16,7 +16,8 @@ An unfinished run that is named itself plays its latest policy, and nothing of i
 A policy is played by the script that trained it, which config.json names: the file of that name in
 the current folder, or else in this one. The script, and the module of an environment or of a noise,
 as in my_envs:MyEnv-v0, are imported from your own path, never from a folder of runs. Runs that
-cannot be tested are listed; the exit status is 1 then, and 2 if there are no others.
+cannot be tested, or fail while they play, are listed; the exit status is 1 then, and 2 if none
+could begin to play.
 """
 
 import hashlib
@@ -27,8 +28,10 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
-from concurrent.futures import ProcessPoolExecutor
+from collections import Counter
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib.machinery import PathFinder
@@ -51,6 +54,7 @@ from analysis.runs import study_name, study_of, usual_config, where_tested
 from analysis.statistics import mean_std
 
 PROJECT = Path(__file__).resolve().parent
+STORED = "what was played is stored, but nothing with another --seed"
 SCRIPTS = {}  # path -> the module, and the SHA-256 of its text
 
 
@@ -131,7 +135,7 @@ def find_players(paths):
             fail(f"{path} is neither a run nor a folder of runs")
         for folder in found:
             named[folder.resolve()] = named.get(folder.resolve(), False) or is_run
-    players, damaged, unfinished = [], {}, 0
+    players, damaged, left_out = [], {}, Counter()
     for folder, is_named in named.items():
         phase = folder.parent.name if folders.is_phase(folder.parent) else ""
         try:
@@ -144,9 +148,9 @@ def find_players(paths):
         if run and (run.finished or (is_named and os.path.exists(folder / "policy.pt"))):
             players.append(Player(run))
         else:
-            unfinished += 1
-    if unfinished:
-        print(f"unfinished runs are left out: {unfinished}")
+            left_out[" (not tested yet)" if is_named else ""] += 1
+    for reason, number in left_out.items():
+        print(f"unfinished runs are left out: {number}{reason}")
     return players, damaged
 
 
@@ -195,6 +199,8 @@ def load(player, render_mode=None):
 
     Raises ValueError if a run cannot be tested, besides what its environment raises.
     """
+    if not os.path.exists(player.folder / "policy.pt"):
+        raise ValueError("there is no policy.pt")
     script, _ = import_script(player)
     run = player.run
     steps = {"max_episode_steps": run.args.get("max_episode_steps")}
@@ -273,7 +279,7 @@ def check_players(players, conditions, bad, args):
                 step = step_of(player)
                 print(f"{player.folder.name} is not finished: its policy of step {step} is tested")
             stored[player] = read_episodes(player.folder) if args.stores(player) else {}
-        except Exception as error:  # any but a ValueError is of the user's environment
+        except (Exception, SystemExit) as error:  # but for a ValueError, of the user's environment
             bad[player.folder] = with_place(error, ValueError)
     for script in sorted(changed):
         text = f"{script} has changed since some of these runs were trained"
@@ -292,19 +298,13 @@ def tell(bad):
 
 
 def play(player, condition, args):
-    """Play episodes, and store them; or draw one. Return them as read_episodes does."""
+    """Play episodes, or draw one. Return them as read_episodes does."""
     with load(player, args.drawing) as (env, policy):
         env = condition.wrap(env)
         if args.video:
             name = f"{player.folder.name}__{player.name(condition)}.mp4"
             return record(env, policy, args.seed, args.video / name)
-        episodes = noisy.play(env, policy, 1 if args.render else args.episodes, args.seed)
-    if args.stores(player):
-        try:
-            store_episodes(player.folder, (condition, player.elsewhere), episodes)
-        except (OSError, DamageError) as error:
-            fail(f"cannot write to {player.folder}: {error}", code=1)
-    return episodes
+        return noisy.play(env, policy, 1 if args.render else args.episodes, args.seed)
 
 
 def record(env, policy, seed, path):
@@ -320,11 +320,18 @@ def record(env, policy, seed, path):
 
 
 def attempt(task, args):
-    """Return what `play` returns of a task, (player, condition), or in words why it cannot."""
+    """Play a task, (player, condition), and store it; return the episodes, or why it failed."""
+    player, condition = task
     try:
-        return play(*task, args)
-    except Exception as error:  # of the environment, or of any library that draws
+        episodes = play(player, condition, args)
+    except (Exception, SystemExit) as error:  # of the environment, or of any library that draws
         return with_place(error, (noisy.NotFiniteError, noisy.SpaceError))
+    if args.stores(player):
+        try:
+            store_episodes(player.folder, (condition, player.elsewhere), episodes)
+        except (OSError, DamageError) as error:
+            fail(f"cannot write to {player.folder}: {error}", code=1)
+    return episodes
 
 
 def play_all(tasks, args):
@@ -369,7 +376,8 @@ def names_of(players):
 def print_table(players, conditions, stored, episodes):
     """Print mean and sample standard deviation over seeds: one table for each noise of the test.
 
-    Two noises that were combined with several numbers of each are matrices instead.
+    Two noises that were combined with several numbers of each are matrices instead. Of runs with
+    the same arguments and seed the first one counts, as in analyze.py.
     """
     trained = {}
     for player, name in zip(players, names_of(players), strict=True):
@@ -377,10 +385,14 @@ def print_table(players, conditions, stored, episodes):
         where = where_tested(run.environment, player.elsewhere)
         noise = run.configuration.noise or "no noise"
         row = where, name, noise, run.configuration.noise_rate
-        trained.setdefault(row, []).append(player)
+        seeds = trained.setdefault(row, {})
+        first = seeds.setdefault(run.seed, player)
+        if first is not player:
+            print(f"duplicate: {player.folder} is left out, because {first.folder} counts")
 
     def cell(seeds, condition):
-        return mean_return([stored[one][condition, one.elsewhere] for one in seeds], episodes)
+        played = [stored[one][condition, one.elsewhere] for one in seeds.values()]
+        return mean_return(played, episodes)
 
     found = matrices(conditions)
     arranged = {one for matrix in found for one in matrix.cells.values()} - {noisy.BASELINE}
@@ -424,6 +436,15 @@ def has_display():
     return not subprocess.run(line, capture_output=True).returncode
 
 
+def check_writable(folder):
+    """End with an error if no file can be written into a folder, or where it would be made."""
+    there = next(path for path in (folder, *folder.parents) if os.path.exists(path))
+    try:
+        tempfile.TemporaryFile(dir=there).close()
+    except OSError as error:
+        fail(f"--video: cannot write to {folder}: {error.strerror}")
+
+
 def check_args(args):
     """End with an error where the options make no sense."""
     if args.render and args.video:
@@ -465,6 +486,7 @@ def main(args):
     os.environ["OMP_NUM_THREADS"] = "1"  # before the scripts import PyTorch; processes inherit it
     if args.video:
         args.video = Path(os.path.expanduser(args.video))
+        check_writable(args.video)
         if not has_display():  # before any environment: dm_control reads it when it is imported
             os.environ.setdefault("MUJOCO_GL", "egl")
     try:
@@ -476,7 +498,7 @@ def main(args):
     stored = check_players(players, conditions, bad, args)
     tell(bad)
     if not stored:
-        return 2 if bad else fail(f"there is no finished run in {', '.join(map(str, args.runs))}")
+        return 2 if bad else fail(f"there is nothing to test in {', '.join(map(str, args.runs))}")
     if args.seed != Args.seed and not args.drawing:
         print(f"--seed {args.seed} is not the default: everything is played, nothing is stored")
     tasks = [
@@ -505,4 +527,7 @@ if __name__ == "__main__":
     try:
         sys.exit(main(tyro.cli(Args, description=__doc__)))
     except KeyboardInterrupt:
-        fail("stopped; what was played is stored, but nothing with another --seed", code=130)
+        fail(f"stopped; {STORED}", code=130)
+    except BrokenExecutor:
+        why = "a process ended abruptly (out of memory, or a crash of an environment?)"
+        fail(f"{why}; {STORED}: run the same command again, with fewer --jobs", code=1)

@@ -305,7 +305,7 @@ def test_the_table_of_known_returns(capsys):
     ]:
         folder, configuration = Path(str(len(seen))), Configuration.parse(noise, rate)
         names = "PPO", "ppo_continuous_noisy.py", "E", "ppo_continuous_noisy", configuration
-        run = Run(folder, "", {"args": {}}, *names, BASELINE, 1, 1, "0.4")
+        run = Run(folder, "", {"args": {}}, *names, BASELINE, len(seen), 1, "0.4")
         # A third episode is stored and not asked for; the second number is the length.
         seen[evaluate.Player(run)] = {
             (condition, ""): np.array([(value, 1, math.nan) for value in (*values, 1000)])
@@ -570,6 +570,80 @@ def test_what_fails_is_told_and_the_rest_is_kept(options, told, runs, tmp_path):
     assert list(videos.iterdir()) == [videos / f"{second.name}__clean.mp4"]
     none = tmp_path / "none"
     assert run(first, "--video", none, cwd=tmp_path).returncode == 1 and not none.exists()
+
+
+EXITING = """
+import os
+import sys
+
+
+class Exiting(gym.ActionWrapper):
+    def action(self, action):
+        {end}
+
+
+gym.register("Exiting-v0", lambda **given: Exiting(gym.make("InvertedPendulum-v5", **given)))
+"""
+
+
+@pytest.mark.parametrize(
+    ("code", "status"), [("sys.exit('no licence')\n", 2), (EXITING, 1)], ids=["imported", "played"]
+)
+def test_an_environment_that_exits_is_one_that_fails(
+    code, status, runs, tmp_path, monkeypatch, capsys
+):
+    run_dir, module = one(runs, "PPO"), f"exiting{status}"
+    register(tmp_path, module, "import sys\n" + code.format(end="sys.exit('no licence')"))
+    other_environment(run_dir, f"{module}:Exiting-v0")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", sys.path[:])
+    assert main(Args((run_dir,), episodes=1)) == status
+    assert main(Args((run_dir, one(runs, "TD3")), episodes=1)) == 1
+    out, err = capsys.readouterr()
+    assert err.count(f"SystemExit: no licence ({tmp_path / module}.py, line ") == 2
+    assert "TD3" in out and "PPO" not in out
+
+
+@pytest.mark.slow
+def test_a_process_that_is_killed_is_told_in_one_line(runs, tmp_path):
+    first, second = sorted(runs.glob("*ppo_continuous_noisy*"))
+    register(tmp_path, "killed", EXITING.format(end="os.kill(os.getpid(), 9)"))
+    other_environment(first, "killed:Exiting-v0")
+    result = run(first, second, "--episodes", 1, "--jobs", 2, cwd=tmp_path)
+    assert (result.returncode, result.stdout) == (1, "")
+    assert re.fullmatch("error: a process ended abruptly .* with fewer --jobs\n", result.stderr)
+
+
+def test_runs_without_a_policy_are_told_before_any_environment_is_made(runs, monkeypatch, capsys):
+    folders = sorted(runs.glob("*ppo_continuous_noisy*"))
+    for folder in folders:
+        (folder / "policy.pt").unlink()
+    monkeypatch.setattr(gym, "make", None)
+    refused(Args(tuple(folders)), r"_s1\S+ and 1 more: there is no policy\.pt$", runs, capsys)
+
+
+def test_a_named_run_without_a_test_is_told(runs, capsys):
+    run_dir = one(runs, "PPO")
+    for name in ("result.json", "policy.pt"):
+        (run_dir / name).unlink()
+    with pytest.raises(SystemExit, match="2"):
+        main(Args((run_dir,)))
+    out, err = capsys.readouterr()
+    assert out == "unfinished runs are left out: 1 (not tested yet)\n"
+    assert err == f"error: there is nothing to test in {run_dir}\n"
+
+
+def test_a_folder_for_videos_that_cannot_be_made_is_told_at_once(runs, capsys):
+    refused(Args((runs,), video=Path("/proc/x/y")), "--video: cannot write to /proc", runs, capsys)
+
+
+def test_a_copied_run_is_no_seed(runs, capsys):
+    run_dir = one(runs, "PPO")
+    shutil.copytree(run_dir, runs / "copy")
+    main(Args((run_dir, runs / "copy"), episodes=1))
+    told, *table = capsys.readouterr().out.splitlines()
+    assert told == f"duplicate: {runs / 'copy'} is left out, because {run_dir} counts"
+    assert re.split(r" {2,}", table[-1])[4] == "1"
 
 
 def test_another_environment(runs, capsys):
