@@ -14,6 +14,7 @@ from noisy_wrappers import (
     RandomNormalNoisyObservation,
     RandomNormalNoisyReward,
     make_noisy,
+    set_progress,
 )
 
 BAD_NUMBERS = [math.nan, -math.inf, True, "0.5", None, [0.5], 1j, 10**400]
@@ -57,7 +58,7 @@ def test_bad_parameters(name, good, parameters, values):
             assert isinstance(value, tuple) or repr(value) in message, message
 
 
-def test_noise_rate_is_writable_and_checked():
+def test_rate_and_progress_are_writable_and_checked():
     env = RandomNormalNoisyReward(constant_env(), 0, 0.3)
     for rate in (1, 0.0, np.float32(0.5), 1.0):
         env.noise_rate = rate
@@ -65,6 +66,8 @@ def test_noise_rate_is_writable_and_checked():
     for bad in (-0.1, 1.1, math.nan, True, "1", None):
         with pytest.raises(ValueError, match="noise_rate"):
             env.noise_rate = bad
+        with pytest.raises(ValueError, match="fraction"):
+            set_progress(env, bad)
         assert env.noise_rate == 1.0
 
 

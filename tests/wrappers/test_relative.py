@@ -3,7 +3,6 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
 from cases import OBSERVATION_CASES, REWARD_CASES, GenericEnv, build, rollout, streams
 from test_actions import actions_env
 
@@ -51,24 +50,6 @@ def test_relative_golden(text, rate):
         noisy += changed
         assert ("noise" in got[4]) == changed
     assert env.times_applied == noisy > 0 and env.opportunities == len(received)
-
-
-def test_what_it_has_estimated_is_resumed(tmp_path):
-    for text in (
-        "RandomNormalNoisyObservation(0.1, relative=True)",
-        "RandomObservationBias(0.1, relative=True)",
-        "RandomUniformNoisyReward(-0.1, 0.1, relative=True)",
-    ):
-        env = build(text, gym.wrappers.TimeLimit(units_env(), 20), 0.7)
-        rollout(env, seed=3, steps=200)
-        torch.save(env.state_dict(), tmp_path / "state.pt")
-        expected = rollout(env, steps=50, seed=4)
-        other = build(text, gym.wrappers.TimeLimit(units_env(), 20), 0.7)
-        other.reset(seed=8)
-        other.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
-        got = rollout(other, steps=50, seed=4)
-        np.testing.assert_array_equal([step[0] for step in got], [step[0] for step in expected])
-        assert [step[1] for step in got] == [step[1] for step in expected]
 
 
 def test_actions_are_perturbed_in_halves_of_their_range():

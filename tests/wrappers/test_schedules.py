@@ -1,7 +1,5 @@
 """Noise rates that change during training."""
 
-import math
-
 import gymnasium as gym
 import pytest
 from cases import A, B, constant_env
@@ -53,18 +51,3 @@ def test_a_vector_of_environments():
     for function in (noise_statistics, wrap, tell):
         with pytest.raises(TypeError, match="needs a single gymnasium.Env, not a .*VectorEnv"):
             function(envs)
-
-
-@pytest.mark.parametrize("fraction", [-0.1, 1.1, math.nan, "0.5", None])
-def test_bad_progress(fraction):
-    env = RandomNormalNoisyReward(constant_env(), "1:0", 1.0)
-    with pytest.raises(ValueError, match="fraction"):
-        set_progress(env, fraction)
-
-
-def test_a_rate_that_was_assigned_is_resumed():
-    env, resumed = (RandomNormalNoisyReward(constant_env(), 0.5, 0.1) for _ in range(2))
-    env.noise_rate = 0.9
-    resumed.load_state_dict(env.state_dict())
-    resumed.reset()
-    assert resumed.noise_rate == 0.9

@@ -19,7 +19,7 @@ from cases import (
     streams,
 )
 
-from noisy_wrappers import RandomNormalNoisyReward
+from noisy_wrappers import EnvState, RandomNormalNoisyReward
 
 
 def pattern(steps):
@@ -93,14 +93,22 @@ def test_copies_continue_alike(text, duplicate):
     assert (twin.times_applied, twin.opportunities) == (env.times_applied, env.opportunities)
 
 
-@pytest.mark.parametrize("text", BASES)
-def test_state_dict_continues_the_streams(text, tmp_path):
-    env = build(text, constant_env(), 0.5)
-    rollout(env, seed=6)
-    torch.save(env.state_dict(), tmp_path / "state.pt")
+RELATIVE = [
+    "RandomNormalNoisyObservation(0.3, relative=True)",
+    "RandomUniformNoisyReward(-0.1, 0.1, relative=True)",
+    "RandomObservationBias(0.3, relative=True)",
+]
+
+
+@pytest.mark.parametrize("text", BASES + RELATIVE)
+def test_a_state_is_resumed(text, tmp_path):
+    """The streams, the counters, what a noise has estimated, and a rate that was assigned."""
+    env, other = (build(text, gym.wrappers.TimeLimit(GenericEnv(), 12), 0.5) for _ in range(2))
+    env.noise_rate = 0.7
+    rollout(env, seed=6, steps=150)
+    torch.save(EnvState(env).state_dict(), tmp_path / "state.pt")
     expected = rollout(env)
-    other = build(text, constant_env(), 0.5)
     rollout(other, seed=99, steps=7)
-    other.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
+    EnvState(other).load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
     assert same(rollout(other), expected)
     assert other.state_dict() == env.state_dict()
