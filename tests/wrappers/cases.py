@@ -53,7 +53,6 @@ NOISES = [
     "RandomObservationBias(0.3)",
     "RandomObservationDelay(1, 3)",
 ]
-DYNAMICS = "RandomDynamics(0.5, 1.5)"
 # One of each base class, and of those that have a mechanism of their own.
 BASES = [
     "RandomNormalNoisyObservation(0.3)",
@@ -62,7 +61,6 @@ BASES = [
     "RandomEarlyTermination(3, 9)",
     *NOISES[-5:],
 ]
-STEP_BASES = [text for text in BASES if "Normal" in text or "Mixup" in text]
 
 BOX = gym.spaces.Box(-1, 1, (3,), np.float32)
 
@@ -183,7 +181,7 @@ def build(text, env, rate):
 
 def registered(text):
     """A registered environment that a noise can work on, and an action."""
-    if text == DYNAMICS:
+    if "Dynamics" in text:
         return "Cart-v0", np.array([0.5, 0.5], np.float32)
     if "Action" in text:
         return "Pendulum-v1", np.array([0.5], np.float32)

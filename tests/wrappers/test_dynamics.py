@@ -10,8 +10,6 @@ from cases import MODEL, Cart, GenericEnv, rollout, same, streams
 
 from noisy_wrappers import RandomDynamics, RandomNormalNoisyReward, SpaceError, make_noisy
 
-FIELDS = ("body_mass", "geom_friction", "dof_damping", "dof_armature", "actuator_gear")
-
 
 def values(model):
     """All arrays of a model, and its statistics."""
@@ -30,14 +28,12 @@ def changed(before, model):
     return {name for name in after if after[name].tobytes() != before[name].tobytes()}
 
 
-@pytest.mark.parametrize(
-    ("env_id", "fields"),
-    [("Hopper-v5", FIELDS), ("Cart-v0", (*FIELDS, "jnt_stiffness", "actuator_gainprm"))],
-)
-def test_an_episode_that_is_not_chosen_is_the_bare_environment(env_id, fields):
+def test_an_episode_that_is_not_chosen_is_the_bare_environment():
     """Bit for bit, after chosen episodes: nothing piles up, nothing is left."""
-    env = gym.make(env_id)
-    model, action = env.unwrapped.model, np.full(env.action_space.shape, 0.3, np.float32)
+    fields = ("body_mass", "geom_friction", "dof_damping", "dof_armature", "actuator_gear")
+    fields += ("jnt_stiffness", "actuator_gainprm")
+    env = gym.make("Cart-v0")
+    model, action = env.unwrapped.model, np.float32([0.3, 0.3])
     bare = rollout(env, seed=5, steps=20, action=action)
     nominal = values(model)
     noisy = RandomDynamics(env, 1.0, 0.5, 1.5, fields=fields)

@@ -9,7 +9,6 @@ from cases import NOISES, A, B, C, build, constant_env, layers, rollout
 from noisy_wrappers import (
     BASELINE,
     Configuration,
-    RandomNormalNoisyReward,
     make_noisy,
     noise_statistics,
     noise_wrappers,
@@ -85,6 +84,7 @@ def test_canonical_notation():
 @pytest.mark.parametrize(
     ("noises", "rates"),
     [([], [0.1]), ([A], []), ([A], [0.1, 0.2]), ([A, B, C], [0.1, 0.2]), (["Nothing(1)"], [0.0])]
+    + [(A, [0.5]), ([A], 0.5), ([A], "1:0")]  # no lists
     + [([A], [rate]) for rate in (1.1, math.nan, "0.5:", "1:2", "a:b", "0.5", "1:0.5:0", "nan:0")],
 )
 def test_bad_noises_and_rates(noises, rates):
@@ -93,14 +93,6 @@ def test_bad_noises_and_rates(noises, rates):
     lines = str(error.value).split("\n  ")
     assert "\n" not in lines[0]
     assert lines[1:] == (signatures() if "Nothing" in str(noises) else [])
-
-
-def test_noises_and_rates_are_lists():
-    for noises, rates, name in [(A, [0.5], "noises"), ([A], 0.5, "rates"), ([A], "1:0", "rates")]:
-        with pytest.raises(ValueError, match=f"^{name} must be a list, for example"):
-            canonical(noises, rates)
-    with pytest.raises(ValueError, match="bad noise <class"):
-        canonical([RandomNormalNoisyReward], [0.5])
 
 
 def test_make_noisy_order():
