@@ -15,7 +15,6 @@ import hashlib
 import json
 import os
 import random
-import re
 import signal
 import subprocess
 import sys
@@ -49,18 +48,6 @@ def tests_of(*run):
 def stop():
     """Return the number of the signal that has come: none in the process of a test."""
     return 0
-
-
-def other_options(words):
-    """Return the options that no argument of the parser is, as {name: value}."""
-    options = {}
-    for word in words:
-        if word.startswith("--"):
-            name, _, value = word[2:].replace("-", "_").partition("=")
-            options[name] = value or True
-        else:
-            options[name] = float(word) if re.fullmatch(r"-?[\d.e+-]+", word) else word
-    return options
 
 
 def pretend_to_train(total_timesteps, checkpoint):
@@ -99,7 +86,7 @@ def parser():
 
 
 def train(argv):
-    args, others = parser().parse_known_args(argv)
+    args = parser().parse_args(argv)
     args.noise_rate = [rate if ":" in rate else float(rate) for rate in args.noise_rate]
     script = ROOT / args.script
     algorithm = script.name.removesuffix("_continuous_noisy.py")
@@ -115,7 +102,6 @@ def train(argv):
         sys.exit(2)
     config = {"algorithm": algorithm.upper(), "versions": {"noisy_wrappers": __version__}}
     config["args"] = vars(args) | {"eval_episodes": EPISODES, "exp_name": exp_name}
-    config["args"] |= other_options(others)
     del config["args"]["script"]
     config["script"] = script.name
     config["script_sha256"] = hashlib.sha256(script.read_bytes()).hexdigest()

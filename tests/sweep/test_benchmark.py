@@ -472,15 +472,6 @@ def test_a_list_needs_no_room_for_temporary_files(small_disk):
     assert result.code == 0 and result.out.count("\n") == 9100, result.err
 
 
-@pytest.mark.slow
-def test_a_reader_that_leaves_starts_no_sweep(tmp_path):
-    command = f"./benchmark.sh paper --dry-run --runs-dir {tmp_path / 'runs'} | head -n 1"
-    words = ["bash", "-o", "pipefail", "-c", command]
-    process = subprocess.run(words, cwd=ROOT, env=ENV, capture_output=True, text=True)
-    assert process.returncode == 0 and process.stdout.count("\n") == 1
-    assert not (tmp_path / "runs").exists()
-
-
 # CHOOSE
 
 CHOOSE = ["choose", "--algos", "ppo", "--envs", "Pendulum-v1", "--noise-rates", "1", "--confirm"]
@@ -499,13 +490,9 @@ def verdicts(out):
     return re.findall("^[A-Z0-9]+ on .*", out, flags=re.MULTILINE)
 
 
-def play(*command):
-    return batches(parse_args("status", "/", command))
-
-
 def undisturbed(folder, *command):
     """What a choice leaves behind, and says, if its runs are made in this process."""
-    play(*command, "--runs-dir", str(folder))
+    batches(parse_args("status", "/", [*command, "--runs-dir", str(folder)]))
     said = verdicts(view("report", *command, "--runs-dir", folder).out)  # writes choice.csv
     return *chosen(folder), said
 
@@ -579,15 +566,6 @@ def test_the_end_of_a_run_is_a_line_of_its_own(tmp_path):
     assert "  exit 255 " in view("status", "--runs-dir", tmp_path).out
 
 
-def test_a_file_system_without_locks_is_one_line(tmp_path, stub):
-    (tmp_path / "flock").write_text("#!/bin/sh\necho no locks >&2\nexit 71\n")
-    (tmp_path / "flock").chmod(0o755)
-    env = stub | {"PATH": f"{tmp_path}:{PATH}"}
-    result = run("demo", "--runs-dir", tmp_path / "runs", env=env)
-    assert (result.code, result.out) == (2, "") and "cannot lock files in " in result.err
-    assert not list(tmp_path.glob("runs/*/config.json"))
-
-
 @pytest.fixture
 def small_disk(tmp_path):
     """A file system of 300 kB."""
@@ -619,15 +597,6 @@ def test_a_process_that_a_run_leaves_behind_holds_up_no_sweep(tmp_path, stub):
     for pid in left:
         os.kill(pid, signal.SIGKILL)
     assert result.code == 0 and "3 done" in result.out and len(left) == 3
-
-
-@pytest.mark.slow
-def test_a_crash_of_an_environment_is_told(tmp_path):
-    text = "import gymnasium, os; gymnasium.register('Abort-v0', lambda **_: os.abort())"
-    (tmp_path / "aborting.py").write_text(text)
-    words = ["choose", "--algos", "ppo", "--envs", "aborting:Abort-v0", "--dry-run"]
-    result = run(*words, cwd=tmp_path, script=ROOT / "benchmark.sh")
-    assert result.code == 134 and f'"{tmp_path}/aborting.py", line 1' in result.err
 
 
 @pytest.mark.slow

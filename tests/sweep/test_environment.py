@@ -109,21 +109,15 @@ def test_noise_on_rewards_that_take_few_values_is_left_out(tmp_path):
         assert "Reward(" in choose("Count", *words, "--noises", named).out
 
 
-def test_what_a_users_module_prints_is_no_command(tmp_path, monkeypatch):
-    text = "import noisy_wrappers\nprint('loaded!')\n\n\nclass Loud(noisy_wrappers.RewardNoise):\n"
-    text += "    def _perturb(self, reward):\n        return reward\n"
-    (tmp_path / "loud_noises.py").write_text(text)
-    monkeypatch.syspath_prepend(tmp_path)
-    words = ["--noises", "loud_noises:Loud()@1", "--confirm", "4", "--runs-dir", tmp_path]
-    shown = choose("Talks", *words)  # the environment prints, too
-    assert shown.code == 0 and "loaded!" in shown.err and "reset!" in shown.err
-    assert shown.out.count("\n") == 8 and "!" not in shown.out
+def test_what_an_environment_prints_is_no_command(tmp_path):
+    shown = choose("Talks", "--runs-dir", tmp_path)
+    assert shown.code == 0 and "reset!" in shown.err and "!" not in shown.out
 
 
 @pytest.mark.slow
 def test_what_native_code_prints_is_no_command(tmp_path):
     (tmp_path / "native_envs.py").write_text(
-        "import os\n\nos.write(1, b'pybullet build time\\n')\n"
+        "import os\n\nprint('loaded')\nos.write(1, b'pybullet build time\\n')\n"
     )
     words = ["custom", "--algos", "ppo", "--envs", "native_envs:Hopper-v5", "--seeds", "1"]
     env = os.environ | {"PYTHONPATH": "/x", "PYTHON": sys.executable}
@@ -149,13 +143,10 @@ def test_the_seconds_of_a_run():
 
 
 def test_a_plan_says_what_it_will_decide_and_what_it_costs(tmp_path):
-    shown = choose("Slow", "--runs-dir", tmp_path)
-    speed, *_, first, total, gain, place = shown.err.splitlines()
-    assert re.fullmatch(r"toy_envs:Slow-v0: [\d.]+ ms a step", speed)
-    assert "round 1 of 4: 14 of 14 configurations, seed 1" in first
-    assert re.match(r"at most 92 runs, .*, about [\d.]+ h of processor time left$", total)
-    assert gain.startswith("25 fresh seeds confirm a true gain of 0.8 standard deviations")
-    assert place == f"runs, logs and the verdict are stored in {tmp_path}"
+    said = choose("Slow", "--runs-dir", tmp_path).err
+    assert "round 1 of 4: 14 of 14 configurations, seed 1" in said
+    assert re.search(r"at most 92 runs, .*, about [\d.]+ h of processor time left\n", said)
+    assert "25 fresh seeds confirm a true gain of 0.8 standard deviations" in said
 
 
 def test_any_dry_run_says_what_it_costs_and_finished_runs_tell_better(tmp_path):

@@ -126,11 +126,6 @@ def test_a_report_quotes_the_folder(tmp_path):
     assert result.code == 1 and "damaged" in result.out and not result.err
 
 
-def test_a_command_takes_the_path_of_a_users_modules_along(monkeypatch):
-    monkeypatch.setenv("PYTHONPATH", "/own")
-    assert "\tenv PYTHONPATH=/own " in view("list", "demo").out
-
-
 def test_spellings_and_rate_zero_are_one_run():
     noises = ["RandomUniformScaleReward(.5, 1.5)", "RandomUniformScaleReward(0.50, high=1.5)"]
     grid = ["--algos=SAC", "--envs", "Hopper-v5", "Hopper-v5", "--seeds", "3", "3", "--seeds", "4"]
