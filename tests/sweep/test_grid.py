@@ -121,9 +121,6 @@ def test_a_report_quotes_the_folder(tmp_path):
     [folder] = folders(*grid)
     finish(folder, env_id="Pendulum-v1")
     assert f"analyze.py --runs-dir '{tmp_path}/a b'\n" in view("report", *grid).out
-    (folder / "result.json").write_text("{")  # which is no fault of the disk
-    result = view("report", *grid)
-    assert result.code == 1 and "damaged" in result.out and not result.err
 
 
 def test_spellings_and_rate_zero_are_one_run():

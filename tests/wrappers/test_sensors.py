@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from cases import GenericEnv, constant_env, numbered_env, rollout, streams
+from cases import GenericEnv, numbered_env, rollout, streams
 
 from noisy_wrappers import RandomMixupObservation, RandomObservationBias, RandomObservationDelay
 
@@ -48,14 +48,6 @@ def test_delay_golden(rate):
         delays.append(drawn if gate.random() < rate else 0)
         assert seen == [max(0, t - delays[-1]) for t in range(1, 9)]
     assert set(delays) == {1, 2, 3} | ({0} if rate < 1 else set())
-
-
-def test_only_a_bias_leaves_the_space():
-    space = gym.spaces.Box(-1, 1, (3,), np.float32)
-    assert RandomObservationDelay(GenericEnv(space), 1.0, 1).observation_space == space
-    assert np.isinf(RandomObservationBias(GenericEnv(space), 1.0, 1).observation_space.high).all()
-    with pytest.raises(ValueError, match="scale has 2 numbers"):
-        RandomObservationBias(constant_env(), 1.0, (1.0, 2.0))
 
 
 def test_a_lost_packet_holds_the_last_one_that_arrived():
