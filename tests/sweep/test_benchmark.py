@@ -464,6 +464,16 @@ def test_a_clone_of_windows_runs(tmp_path):
     assert output(command, ENV).count(": eol: lf") == 3
 
 
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 300 kB."""
+    command = ["mount", "-t", "tmpfs", "-o", "size=300k", "none", tmp_path]
+    if subprocess.run(command, capture_output=True).returncode:
+        pytest.skip("may not mount a file system")
+    yield tmp_path
+    subprocess.run(["umount", "--recursive", "--lazy", tmp_path], check=True)
+
+
 @pytest.mark.slow
 def test_a_list_needs_no_room_for_temporary_files(small_disk):
     subprocess.run(f"dd if=/dev/zero of={small_disk}/filler bs=1k 2>/dev/null", shell=True)
@@ -551,9 +561,6 @@ def test_status_without_a_grid_reads_the_folder(tmp_path):
     assert empty.code == 2 and f"error: no runs in {tmp_path}/none" in empty.err
 
 
-# LOCKS AND DISKS
-
-
 def test_the_end_of_a_run_is_a_line_of_its_own(tmp_path):
     """What a killed program printed may have ended within one."""
     folder, words = tmp_path / "a__b__c", "sh -c 'printf 45%%; kill -9 $$'"
@@ -564,29 +571,6 @@ def test_the_end_of_a_run_is_a_line_of_its_own(tmp_path):
     assert failed.endswith(" 45%")
     log_of(folder).write_text("# now host: exit=255\n")  # of sys.exit(-1)
     assert "  exit 255 " in view("status", "--runs-dir", tmp_path).out
-
-
-@pytest.fixture
-def small_disk(tmp_path):
-    """A file system of 300 kB."""
-    command = ["mount", "-t", "tmpfs", "-o", "size=300k", "none", tmp_path]
-    if subprocess.run(command, capture_output=True).returncode:
-        pytest.skip("may not mount a file system")
-    yield tmp_path
-    subprocess.run(["umount", "--recursive", "--lazy", tmp_path], check=True)
-
-
-@pytest.mark.slow
-def test_a_full_disk_is_told(small_disk, stub):
-    grid = [*GRID, "--total-timesteps", "400", "--runs-dir", small_disk / "runs", "--jobs", "1"]
-    fill = f"dd if=/dev/zero of={small_disk}/filler bs=1k 2>/dev/null"
-    python = small_disk / "python"  # the first thing that a run does is to fill the disk
-    python.write_text(Path(stub["PYTHON"]).read_text().replace(") exec", f") {fill}; exec", 1))
-    python.chmod(0o755)
-    for code in (1, 2):  # after the first runs, and before any
-        result = run(*grid, env=stub | {"PYTHON": str(python)})
-        assert result.code == code and "No space left on device\n" in result.err
-        subprocess.run(fill, shell=True)
 
 
 @pytest.mark.slow

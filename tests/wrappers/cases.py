@@ -9,7 +9,8 @@ from gymnasium.utils.env_checker import data_equivalence
 
 from noisy_wrappers import WRAPPERS
 
-# a noise, and its formula(noise generator, o_t, o_(t-1)) for three numbers
+# A noise, and its formula(noise generator, o_t, o_(t-1)) for three numbers; a recursive one has
+# what was seen at t-1 instead.
 OBSERVATION_CASES = {
     "RandomNormalNoisyObservation(0.3)": lambda g, o, _: o + g.normal(0, 0.3, 3),
     "RandomNormalNoisyObservation((0.3, 0.0, 2.0), loc=-0.5)": (
@@ -22,6 +23,7 @@ OBSERVATION_CASES = {
     ),
     "RandomMixupObservation(0.3)": lambda g, o, previous: 0.3 * o + 0.7 * previous,
     "RandomMixupObservation(0.0)": lambda g, o, previous: previous,
+    "RandomMixupObservation(0.0, recursive=True)": lambda g, o, seen: seen,  # a lost packet
     "RandomDropoutObservation(0.3)": lambda g, o, _: (g.random(3) < 0.3) * o,
 }
 

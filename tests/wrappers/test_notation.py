@@ -163,9 +163,8 @@ def test_it_is_ordered_by_noise_and_by_its_rates_as_numbers():
     assert sorted(texts[::-1], key=rate_order) == texts
 
 
-def test_spellings_of_one_configuration_are_one():
-    config = Configuration.read(["RandomUniformScaleReward(.50, high=1.5)", ENDING], ["1:0", 0.05])
-    assert config == Configuration.read([ENDING, SCALE], [0.05, "1.0:0.0"])
+def test_what_stands_in_sentences_csv_files_and_names_of_files():
+    config = Configuration.read([ENDING, SCALE], [0.05, "1.0:0.0"])
     assert config.wrappers == ["RandomEarlyTermination", "RandomUniformScaleReward"]
     assert str(config) == f"{ENDING} + {SCALE} at 0.05 + 1.0 to 0.0"
     assert config.columns == (f"{ENDING} + {SCALE}", "0.05 + 1.0:0.0")

@@ -1,11 +1,11 @@
-"""Sensors as they fail: a bias and a delay of an episode, and a packet that is lost."""
+"""Sensors as they fail: a bias and a delay of an episode."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from cases import GenericEnv, numbered_env, rollout, streams
 
-from noisy_wrappers import RandomMixupObservation, RandomObservationBias, RandomObservationDelay
+from noisy_wrappers import RandomObservationBias, RandomObservationDelay
 
 
 @pytest.mark.parametrize(("rate", "scale"), [(0.4, 0.3), (1.0, (0.3, 0.0, 2.0))])
@@ -48,14 +48,3 @@ def test_delay_golden(rate):
         delays.append(drawn if gate.random() < rate else 0)
         assert seen == [max(0, t - delays[-1]) for t in range(1, 9)]
     assert set(delays) == {1, 2, 3} | ({0} if rate < 1 else set())
-
-
-def test_a_lost_packet_holds_the_last_one_that_arrived():
-    """As docs/wrappers.md has it: RandomMixupObservation(0.0, recursive=True)."""
-    env = RandomMixupObservation(numbered_env(), 0.5, 0.0, recursive=True)
-    gate, _ = streams(RandomMixupObservation, seed=4)
-    env.reset(seed=4)
-    held = 1
-    for number in range(2, 60):
-        held = held if gate.random() < 0.5 else number
-        assert env.step(0)[0][0] == held
