@@ -3,9 +3,10 @@
 import re
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
 import torch
-from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import Monitor
 
 from noisy_wrappers import RandomEarlyTermination, parse_noise
 
@@ -48,9 +49,5 @@ def test_the_page_names_only_what_there_is():
 
 
 def test_early_termination_is_refused_outside_of_a_monitor():
-    kwargs = {
-        "wrapper_class": RandomEarlyTermination,
-        "wrapper_kwargs": {"noise_rate": 1, "low": 5},
-    }
     with pytest.raises(ValueError, match="RandomEarlyTermination needs to be inside"):
-        make_vec_env("Pendulum-v1", 1, **kwargs)
+        RandomEarlyTermination(Monitor(gym.make("Pendulum-v1")), 1.0, 5)
