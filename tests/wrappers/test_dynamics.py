@@ -230,6 +230,7 @@ def test_other_episodes_are_those_of_an_environment_that_randomizes_itself(own, 
 
 
 def test_several_at_once_with_other_fields():
+    """Equal wrappers in a stack draw different noise: positions are part of the seed."""
     names = ["RandomDynamics(0.8, 1.2, fields=('body_mass',))"]
     names += ["RandomDynamics(0.5, 2.0, fields=('dof_damping', 'dof_armature'))"]
     env = make_noisy(Cart(), names, [0.6])

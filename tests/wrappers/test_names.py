@@ -71,13 +71,6 @@ def test_env_kwargs():
             parse_env_kwargs(bad)
 
 
-def test_canonical_env_id():
-    toy = "toy_envs:Tiny-v0"
-    pairs = {"Hopper": "Hopper-v5", "Hopper-v4": "Hopper-v4", toy: toy, "toy_envs:Tiny": toy}
-    for env_id, canonical in pairs.items():
-        assert canonical_env_id(env_id) == canonical
-
-
 def test_unknown_environments():
     module = "No module named 'no_such_module'"
     reasons = {"Hoper-v5": "Did you mean: `Hopper`", "no_such_module:Env-v0": module}

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from cases import BASES, GenericEnv, build, constant_env, registered, rollout, same, streams
+from cases import BASES, GenericEnv, build, constant_env, registered, rollout, same
 
 from noisy_wrappers import EnvState, RandomNormalNoisyReward
 
@@ -27,20 +27,6 @@ def test_same_seed_same_noise(text):
     patterns = [pattern(steps) for steps in (first, rollout(env, seed=2), rollout(env))]
     assert patterns[0] != patterns[1] != patterns[2] != patterns[0]
     assert np.random.get_state()[1].tobytes() == before
-
-
-def test_equal_wrappers_in_a_stack_draw_different_noise():
-    inner = RandomNormalNoisyReward(constant_env(0.0), 1.0, 0.3)
-    middle = gym.wrappers.TimeLimit(inner, 1000)  # positions count noise wrappers only
-    outer = RandomNormalNoisyReward(middle, 1.0, 0.3)
-    outer.reset(seed=7)
-    rewards = [outer.step(0)[1] for _ in range(20)]
-    (_, inner_noise), (_, outer_noise) = (
-        streams(RandomNormalNoisyReward, 7, position) for position in (0, 1)
-    )
-    both = [(inner_noise.normal(0, 0.3), outer_noise.normal(0, 0.3)) for _ in range(20)]
-    assert rewards == [a + b for a, b in both]
-    assert all(a != b for a, b in both)
 
 
 def test_a_lower_rate_perturbs_a_subset_of_the_steps():
