@@ -1,13 +1,12 @@
 """analyze.py as a command: its options, its errors, what it prints and writes."""
 
-import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from sweeps import NAN, RESULTS, SCALE, main, row, run, small_sweep, write_pairs, write_run
+from sweeps import NAN, SCALE, main, run, small_sweep, write_pairs, write_run
 
 import analyze
 
@@ -33,17 +32,6 @@ def test_the_same_bytes_again_also_from_shuffled_folders(tmp_path):
     for path in first:
         for other in ("second", "third"):
             assert path.read_bytes() == (tmp_path / other / path.name).read_bytes(), path.name
-
-
-def test_odd_sweeps_are_analysed_too(tmp_path):
-    """A label longer than a file name may be, and no formula; one run without noise."""
-    name = r"$\frac$" + 30 * "a_long_name_"
-    write_run(tmp_path / "runs", [1.0], folder="b", exp_name=name)
-    write_run(tmp_path / "runs", [1.0], folder="c", noise=SCALE, rate=0.1, exp_name=name)
-    write_run(tmp_path / "runs", [2.0], folder="d")
-    tables = run(tmp_path, drawn=True)
-    assert len(list((tmp_path / "results").glob("curves_*_column.svg"))) == 2
-    assert row(tables["summary_SAC"], exp_name="sac_continuous_noisy")["mean"] == 2
 
 
 @pytest.mark.parametrize("case", ["no folder", "no runs", "none finished", "no place"])
@@ -98,56 +86,18 @@ def test_numbers_that_make_no_sense_are_refused(option, value, tmp_path, capsys)
     assert f"--{option.replace('_', '-')} must be " in capsys.readouterr().err
 
 
-@pytest.mark.slow
-def test_a_reader_that_stops_early_is_no_error(tmp_path):
-    write_run(tmp_path / "runs", [1])
-    words = f"{sys.executable} {analyze.__file__} --runs-dir {tmp_path}/runs"
-    # The reader is gone before the first line is printed, so the pipe is broken for certain.
-    script = f"set -o pipefail; {words} | true"
-    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True)
-    assert done.stderr == "" and done.returncode == 0
-
-
-@pytest.mark.parametrize("width", [70, 100, 140])
+@pytest.mark.parametrize("width", [70, 80, 140])
 def test_what_is_printed_fits_the_terminal(width, tmp_path, capsys, monkeypatch):
-    long = "RandomNormalNoisyObservation(1.0)"
-    write_pairs(tmp_path, [1.0, 2, 3], [1.0, 2, 3], long, 1.0)
-    write_pairs(tmp_path, [], [1.0, 2, 2], long, 0.5)
-    write_run(tmp_path, [5.0], noise=long, rate=1.0, seed=4, finished=False)
+    """And the verdicts have room, however long the names of what was compared are."""
+    noise = "RandomNormalNoisyObservation(0.1, relative=True)"
+    where = {"env": "InvertedPendulum-v5", "exp_name": "my_longer_experiment"}
+    write_pairs(tmp_path, [1.0, 2, 3], [1.0, 2, 4], noise, 0.1, **where)
+    write_pairs(tmp_path, [], [1.0, 2, 2], noise, 0.5, **where)
+    write_run(tmp_path, [5.0], noise=noise, rate=1.0, seed=4, finished=False, **where)
     monkeypatch.setattr(analyze, "terminal_width", lambda: width)
     monkeypatch.chdir(tmp_path)
     main(analyze.Args(runs_dir=Path(".")))
-    lines = capsys.readouterr().out.splitlines()
-    assert width - 20 < max(map(len, lines)) <= width
-    assert lines[0].startswith("SAC: 1 noise in 1 environment: 0 better, 0 worse, 1 no clear")
-    [head] = [line for line in lines if line.startswith("algorithm,  ")]  # wrapped before the noise
-    assert ("difference" in head) == (width > 70) and ("luck" in head) == (width > 100)
-    assert lines[-1] == "Open results/report.html"
-
-
-def test_a_terminal_of_80_columns_has_the_verdicts(tmp_path, capsys, monkeypatch):
-    """However long the names of what was compared are."""
-    where = {"env": "InvertedPendulum-v5", "exp_name": "my_longer_experiment"}
-    for rate in (0.1, 0.2, 0.5, 1.0):
-        noise = {"noise": "RandomNormalNoisyObservation(0.1, relative=True)", "rate": rate}
-        write_pairs(tmp_path, [] if rate > 0.1 else [1.0, 2, 3], [1.0, 2, 4], **noise, **where)
-    monkeypatch.setattr(analyze, "terminal_width", lambda: 80)
-    main(analyze.Args(runs_dir=tmp_path))
-    _, table = capsys.readouterr().out.split("against no noise:\n\n")
-    assert table.startswith("verdict              noise  ") and "environment" in table
-    assert "\nno clear difference  RandomNormalNoisyObservation(0.1,  SAC" in table
-
-
-def test_committed_runs_had_the_noise_that_their_names_say():
-    """Each wrapper acted as often as a binomial sample at its rate would, up to 4 deviations."""
-    folders = sorted((RESULTS / "data/runs").iterdir())
-    assert folders
-    for folder in folders:
-        args = json.loads((folder / "config.json").read_text())["args"]
-        result = json.loads((folder / "result.json").read_text())
-        names = [text.partition("(")[0] for text in args["noise"]]
-        assert list(result["noise_applied"]) == names, folder
-        counts = result["noise_applied"].values()
-        for rate, (applied, calls) in zip(args["noise_rate"], counts, strict=True):
-            deviation = (calls * rate * (1 - rate)) ** 0.5
-            assert abs(applied - calls * rate) <= 4 * deviation, (folder, applied, calls)
+    printed = capsys.readouterr().out
+    assert width - 20 < max(map(len, printed.splitlines())) <= width
+    _, table = printed.split("against no noise:\n\n")
+    assert table.startswith("verdict ") and "\nno clear difference " in table
