@@ -17,7 +17,7 @@ from analysis.studies import make_studies
 from noisy_wrappers import BASELINE, Configuration
 
 OTHER = "RandomUniformScaleReward(0.8, 1.2)"
-ENVS = ["HalfCheetah-v5", "Hopper-v5", "Humanoid-v5", "Pusher-v5", "Walker2d-v5"]
+ENVS = ["Ant-v5", "Hopper-v5", "my_envs:WarehousePickAndPlace-v12", "Pusher-v5", "Walker2d-v5"]
 
 
 def texts(items):
@@ -94,13 +94,10 @@ def test_effects_are_rows_with_filled_marks_where_verdicts_are_clear(tmp_path):
             write_run(tmp_path, [100 + seed], env=env, seed=seed)
             write_run(tmp_path, [factor * (100 + seed)], env=env, seed=seed, noise=noise, rate=0.1)
             write_run(tmp_path, [100 + seed], env=env, seed=seed, noise=noise, rate=0.2)
-    drawing = drawn_of(tmp_path)["effects_SAC"]
-    figure = drawing.draw()
+    figure = drawn_of(tmp_path)["effects_SAC"].draw()
     assert titles(figure) == ["Hopper-v5\nn = 5", "Walker2d-v5\nn = 5"]
     first = figure.axes[0]
     assert texts(first.get_yticklabels()) == ["0.10", "0.20", "0.10", "0.20"]
-    assert [text.replace("\n", "") for text in texts(first.texts)] == [ENDING, SCALE]
-    assert "Filled marks are clear verdicts." in drawing.caption
     places, looks = list(first.get_yticks()), []
     for ax in figure.axes:
         marks = [line for line in ax.lines if line.get_marker() == "o"]
@@ -108,24 +105,21 @@ def test_effects_are_rows_with_filled_marks_where_verdicts_are_clear(tmp_path):
         looks.append(found)
     better, worse = analysis.style.BETTER, analysis.style.WORSE
     assert looks == [{2: better, 3: "white"}, {0: worse, 1: "white"}]
-    assert texts(figure.legends[0].get_texts()) == ["better", "worse", "no clear difference"]
 
 
 @pytest.mark.parametrize(("seeds", "reach"), [(3, 30), (4, 30), (5, None)])
 def test_few_seeds_are_shown_with_room_for_what_could_be_found(seeds, reach, tmp_path):
     spread = 10 * np.arange(seeds)
     write_pairs(tmp_path, 100 + spread, 101 + spread)
-    drawing = drawn_of(tmp_path)["effects_SAC"]
-    [ax] = drawing.draw().axes
+    [ax] = drawn_of(tmp_path)["effects_SAC"].draw().axes
     dots = [line.get_xdata().tolist() for line in ax.lines if line.get_marker() == "."]
     if reach is None:
-        assert not dots and "five, small dots" not in drawing.caption
+        assert not dots
         return
     assert dots == [
         pytest.approx(spread - spread.mean()),
         pytest.approx(1 + spread - spread.mean()),
     ]
-    assert texts(ax.get_yticklabels()) == ["no noise", "0.10"] and "small dots" in drawing.caption
     low, high = ax.get_xlim()
     assert low < -reach and high > reach
 
@@ -143,41 +137,32 @@ def test_effects_of_many_configurations_have_a_line_a_noise(tmp_path):
     assert mark.get_markerfacecolor() == analysis.style.BETTER
 
 
-def test_a_long_name_is_broken_between_its_words_or_anywhere():
-    fitted = analysis.style.fitted
-    assert fitted("WarehousePickAndPlace-v12", 0.9) == "WarehousePick\nAndPlace-v12"
-    assert fitted("RandomUniformNoisyReward(-0.1, 0.1)", 1.7).split("\n")[1] == "(-0.1, 0.1)"
-    lines = fitted(60 * "A", 1).split("\n")
-    assert "".join(lines) == 60 * "A" and all(analysis.style.inches_of(x) <= 1 for x in lines)
-    assert analysis.style.short("my_company.envs:Warehouse-v12") == "Warehouse-v12"
-
-
 def test_curves_have_the_noise_units_and_n(tmp_path):
     small_sweep(tmp_path)
     drawings = drawn_of(tmp_path)
     figure = drawings["curves_SAC_RandomUniformScaleReward_0.5_1.5"].draw()
     lines = ["no noise", "rate 0.05", "rate 0.20"]
     assert texts(figure.legends[0].get_texts()) == lines
-    assert figure.legends[0].get_title().get_text() == SCALE
     assert titles(figure) == ["Hopper-v5\nn = 4", "Pusher-v5\nn = 4"]
-    below, beside = texts(figure.texts)
-    assert below == "training steps when tests were due (thousands)" and "return" in beside
     hopper = [line for line in figure.axes[0].lines if line.get_linewidth() > 1]
     assert hopper[1].get_ydata().tolist() == pytest.approx([29, 58, 87, 116, 145])
-    assert {line.get_linestyle() for line in hopper} == {"-"}
     assert len({line.get_color() for line in hopper}) == 3
     best = drawings["best_curves_SAC"].draw()
     assert f"{SCALE} at rate 0.05" in texts(best.legends[0].get_texts())
 
+
+def test_curves_have_only_what_was_run(tmp_path):
+    """No panel where a noise was not tried, and no line of the baseline that a search lacks."""
+    small_sweep(tmp_path)
     [study], _ = make_studies(read_runs(tmp_path))
-    for config in study.finals:  # an environment without this noise has no panel
+    for config in study.finals:
         study.finals[config][:, 0] = NAN if config.noise == ENDING else 1.0
     assert titles(analysis.figures.noise_figure(study, ENDING)) == ["Pusher-v5\nn = 4"]
-    # nor has a rate that was not tried, or the baseline of a search, a line
     study.finals[Configuration.parse(SCALE, 0.05)][:, 0] = NAN
     study.finals[BASELINE][:] = NAN
     figure = analysis.figures.noise_figure(study, SCALE)
-    assert texts(figure.legends[0].get_texts()) == lines[1:] and len(figure.axes) == 2
+    assert texts(figure.legends[0].get_texts()) == ["rate 0.05", "rate 0.20"]
+    assert len(figure.axes) == 2
 
 
 @pytest.mark.parametrize("band", ["interval", "std"])
@@ -213,27 +198,26 @@ def test_parameters_are_points_side_by_side(tmp_path):
     whisker = ax.containers[1].lines[2][0].get_segments()[0][:, 1]
     assert whisker == pytest.approx([60 - half, 60 + half], rel=1e-4)
     assert texts(ax.get_xticklabels()) == ["none", "0.05", "0.50"]
-    assert titles(figure) == ["Hopper-v5\nn = 5"]
     assert texts(figure.legends[0].get_texts()) == ["no noise", SCALE, OTHER]
 
 
 def test_parameters_of_a_search_show_no_baseline(tmp_path):
-    """Also of a module of one's own that begins with an underscore."""
-    noises = ["_mine:Foo(1)", "_mine:Foo(2)"]
-    for noise, seed in product(noises, (1, 2)):
-        write_run(tmp_path, [10 * seed], seed=seed, noise=noise, rate=0.5)
-    drawing = drawn_of(tmp_path)["parameters_SAC__mine_Foo"]
-    figure = drawing.draw()
+    noises = [SCALE, OTHER]
+    for noise in noises:
+        write_run(tmp_path, [10], noise=noise, rate=0.5)
+    figure = drawn_of(tmp_path)["parameters_SAC_RandomUniformScaleReward"].draw()
     assert texts(figure.axes[0].get_xticklabels()) == ["0.50"]
-    assert texts(figure.legends[0].get_texts()) == noises and "dotted" not in drawing.caption
+    assert texts(figure.legends[0].get_texts()) == noises
 
 
 def test_figures_of_experiments_with_similar_names_have_names_of_their_own(tmp_path):
-    for name, seed in product(("lr 1", "lr_1"), (1, 2)):
-        more = {"seed": seed, "exp_name": name}
-        write_run(tmp_path, [10], folder=f"{name}-{seed}", **more)
-        write_run(tmp_path, [9], folder=f"{name}-{seed}-p", noise=SCALE, rate=0.1, **more)
-    assert {"effects_SAC_lr_1", "effects_SAC_lr_1_again"} <= drawn_of(tmp_path).keys()
+    """Names that are one as a file's, and one that is longer than a file's may be."""
+    for name in ("lr 1", "lr_1", 30 * "a_long_name_"):
+        write_run(tmp_path, [10], folder=name[:9], exp_name=name)
+        write_run(tmp_path, [9], folder=f"{name[:9]}-p", noise=SCALE, rate=0.1, exp_name=name)
+    names = drawn_of(tmp_path).keys()
+    assert {"effects_SAC_lr_1", "effects_SAC_lr_1_again"} <= names
+    assert max(map(len, names)) < 200
 
 
 def test_committed_figures_are_those_that_a_page_shows():
