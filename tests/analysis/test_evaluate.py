@@ -411,20 +411,15 @@ def edit_config(run_dir, **values):
     (run_dir / "config.json").write_text(json.dumps(config | values))
 
 
-def other_environment(run_dir, env_id="Reacher-v5"):
+def other_environment(run_dir, env_id):
     args = json.loads((run_dir / "config.json").read_text())["args"]
     edit_config(run_dir, args=args | {"env_id": env_id})
 
 
 BAD_RUNS = {
-    "policy.pt is not a policy for Reacher-v5": other_environment,
-    "policy.pt is not a policy for InvertedPendulum-v5": lambda run_dir: (
-        run_dir / "policy.pt"
-    ).write_bytes(b"x"),
-    "robustness.csv: ": lambda run_dir: (run_dir / "robustness.csv").write_text("a,b\n1,2\n"),
-    "RuntimeError: not today .*broken.py, line 2": lambda run_dir: other_environment(
-        run_dir, "broken:Mine-v0"
-    ),
+    "policy.pt is not a policy": lambda folder: (folder / "policy.pt").write_bytes(b"x"),
+    "robustness.csv: ": lambda folder: (folder / "robustness.csv").write_text("a,b\n1,2\n"),
+    "not today .*broken.py, line 2": lambda folder: other_environment(folder, "broken:Mine-v0"),
 }
 
 
@@ -447,6 +442,7 @@ FOREIGN = {
     "a package": ("runs/dl/__init__.py", "runs.dl:Mine-v0", "."),
     "called from the run": ("runs/dl/{run}/evil.py", "evil:Mine-v0", "runs/dl/{run}"),
     "through a link": ("runs/dl/evil.py", "link.evil:Mine-v0", "."),
+    "a link itself": ("runs/dl/evil.py", "linked:Mine-v0", "."),
     "not even a late import": ("runs/dl/my_physics.py", "InvertedPendulum-v5", "runs/dl"),
 }
 
@@ -458,6 +454,7 @@ def test_no_module_is_imported_from_a_folder_of_runs(place, trained, tmp_path, m
     shutil.copytree(one(trained, "PPO"), tmp_path / "runs/dl/run")
     (tmp_path / file).write_text("raise SystemExit('imported')")
     (tmp_path / "link").symlink_to("runs/dl")
+    (tmp_path / "linked.py").symlink_to("runs/dl/evil.py")
     other_environment(tmp_path / "runs/dl/run", env_id)
     monkeypatch.chdir(tmp_path / cwd)
     monkeypatch.setattr(sys, "path", sys.path[:])
@@ -484,7 +481,6 @@ def test_no_noise_is_imported_from_a_folder_of_runs(options, runs, monkeypatch, 
 
 
 def test_a_module_of_ones_own_is_imported(trained, tmp_path, monkeypatch):
-    """But for one that is a link into the folder of runs."""
     run_dir = tmp_path / "runs/run"
     shutil.copytree(one(trained, "PPO"), run_dir)
     register(tmp_path, "own", "")
@@ -493,10 +489,6 @@ def test_a_module_of_ones_own_is_imported(trained, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "path", sys.path[:])
     assert main(Args((run_dir,), episodes=1)) == 0
     assert len(stored(run_dir)) == 1
-    (run_dir / "evil.py").write_text("raise SystemExit('imported')")
-    (tmp_path / "link.py").symlink_to(run_dir / "evil.py")
-    other_environment(run_dir, "link:Mine-v0")
-    assert main(Args((run_dir,), episodes=1)) == 2
 
 
 @pytest.mark.parametrize(
@@ -506,7 +498,6 @@ def test_a_module_of_ones_own_is_imported(trained, tmp_path, monkeypatch):
         ({"noises": (ACTION,), "noise_rates": ("1:0",)}, "constant rates"),
         ({"noise_rates": (0.5,)}, "--noise-rates without --noises"),
         ({"env_id": "Nowhere-v0"}, "there is no environment"),
-        ({"env_id": ""}, "there is no environment"),
         ({"noises": (f"{OBSERVATION[:-4]}(1, 2))",), "noise_rates": (1.0,)}, "has 2 numbers"),
         ({"episodes": 0}, "--episodes must be at least 1, not 0"),
         ({"seed": -1}, "--seed"),
@@ -548,28 +539,19 @@ gym.register("Failing-v0", lambda **given: Failing(gym.make("InvertedPendulum-v5
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("options", "told"),
-    [
-        (["--noises", "RandomNormalNoisyAction(1e9)", OBSERVATION], "p1.0_Normal.*too strong"),
-        (["--video", "videos"], "clean: RuntimeError: nothing to see with egl"),
-    ],
-)
-def test_what_fails_is_told_and_the_rest_is_kept(options, told, runs, tmp_path):
+def test_what_fails_is_told_and_the_rest_is_kept(runs, tmp_path):
     register(tmp_path, "failing", FAILING)
     first, second = sorted(runs.glob("*ppo_continuous_noisy*"))
     other_environment(first, "failing:Failing-v0")
-    result = run(first, second, *options, "--episodes", 2, "--jobs", 2, cwd=tmp_path)
+    noises = "--noises", "RandomNormalNoisyAction(1e9)", OBSERVATION
+    result = run(first, second, *noises, "--episodes", 2, "--jobs", 2, cwd=tmp_path)
     assert result.returncode == 1 and "Failing" not in result.stdout
-    line = rf"error: {re.escape(str(first))}: {told} \(.*failing.py, line \d+\)\n"
-    assert re.fullmatch(line, result.stderr)
-    if "--video" not in options:
-        assert [len(stored(run_dir)) for run_dir in (first, second)] == [4, 6]
-        return
-    videos = tmp_path / "videos"
-    assert list(videos.iterdir()) == [videos / f"{second.name}__clean.mp4"]
-    none = tmp_path / "none"
-    assert run(first, "--video", none, cwd=tmp_path).returncode == 1 and not none.exists()
+    told = rf"error: {re.escape(str(first))}: p1.0_Normal.*too strong \(.*failing.py, line \d+\)\n"
+    assert re.fullmatch(told, result.stderr)
+    assert [len(stored(run_dir)) for run_dir in (first, second)] == [4, 6]
+    result = run(first, "--video", "videos", cwd=tmp_path)
+    assert result.returncode == 1 and not (tmp_path / "videos").exists()
+    assert "clean: RuntimeError: nothing to see with egl" in result.stderr
 
 
 EXITING = """
@@ -666,16 +648,12 @@ def test_another_environment(runs, capsys):
 
 
 def refused(args, message, runs, capsys):
-    """One line, exit status 2, nothing written."""
+    """Exit status 2, an error, nothing played or written."""
     before = files(runs)
     try:
         code = main(args)
     except SystemExit as exit:
         code = exit.code
     out, err = capsys.readouterr()
-    assert (code, out) == (2, "")
-    first, *others = err.splitlines()
-    assert first.startswith("error: ") and re.search(message, first)
-    assert all(line.startswith("  Random") for line in others)  # the list of the wrappers
-    assert bool(others) == ("unknown name" in message)
-    assert files(runs) == before
+    assert (code, out) == (2, "") and files(runs) == before
+    assert re.match(f"error: .*{message}", err)
