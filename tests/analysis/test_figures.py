@@ -17,7 +17,7 @@ from analysis.studies import make_studies
 from noisy_wrappers import BASELINE, Configuration
 
 OTHER = "RandomUniformScaleReward(0.8, 1.2)"
-ENVS = ["Ant-v5", "Hopper-v5", "my_envs:WarehousePickAndPlace-v12", "Pusher-v5", "Walker2d-v5"]
+ENVS = ["Ant-v5", "Hopper-v5", "my_envs:Warehouseconveyorpicking-v1", "Pusher-v5", "Walker2d-v5"]
 
 
 def texts(items):

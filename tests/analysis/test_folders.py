@@ -71,11 +71,3 @@ def test_of_a_damaged_run_is_known_what_can_be_read(tmp_path):
     with pytest.raises(DamageError, match=r"^config.json is no JSON object") as raised:
         read_run(folder)
     assert raised.value.run is None
-
-
-@pytest.mark.parametrize("name", ["SAC/../x", "", None, ["SAC"]])
-def test_an_algorithm_names_files(name, tmp_path):
-    folder = write_run(tmp_path, [1.0])
-    change(folder, algorithm=name)
-    with pytest.raises(DamageError, match="algorithm is"):
-        read_run(folder)

@@ -13,10 +13,9 @@ import analysis.robustness
 import analyze
 import evaluate
 import ppo_continuous_noisy as ppo
-from analysis.folders import RETURN, SUCCESS
+from analysis.folders import SUCCESS
 from analysis.runs import finished, read_runs
 from analysis.studies import make_studies
-from analysis.verdicts import what_all_runs_do
 
 ENV = "FetchReach-v4"
 PUSH, OTHER = "RandomNormalNoisyAction(0.3)", "RandomNormalNoisyObservation(0.1)"
@@ -50,19 +49,13 @@ def test_the_verdict_is_in_percentage_points(runs_dir, capsys):
     assert re.search(f"{found} percentage points of success, p = 0.048", said)
     assert not re.search(r"\(\+\d+ %\)", said)
     assert "note: left out, because they never tell success: Hopper-v5\n" in said
-    for name in ("best.csv", "noises.csv", "summary_SAC.csv"):
-        lines = (out / name).read_text().splitlines()
-        names = lines[0].split(",")
-        for line in lines[1:]:
-            cells = dict(zip(names, re.split(r",(?![^(]*\))", line), strict=True))
-            assert not any(cells[name] for name in names if name.endswith("_percent"))
-    report = (out / "report.html").read_text()
-    assert "Final test success rate of every configuration" in report
-    figure = next(out.glob("curves_*.svg")).read_text()
-    assert "test success rate (%)" in figure and "sum of rewards" not in figure
+    for name in ("best", "noises", "summary_SAC"):
+        table = pd.read_csv(out / f"{name}.csv")
+        assert len(table) and table.filter(regex="_percent$").isna().all(axis=None)
+    assert "test success rate (%)" in next(out.glob("curves_*.svg")).read_text()
 
 
-def test_success_is_beside_the_return(runs_dir, capsys):
+def test_success_is_beside_the_return(runs_dir):
     tables = run(runs_dir.parent)
     found = row(tables["success"], noise=SCALE)
     assert found[["mean", "baseline_mean", "difference", "n"]].tolist() == [90, 50, 40, 5]
@@ -150,25 +143,10 @@ def test_robustness_is_judged_by_success(tmp_path, capsys):
                 (folder / "robustness.csv").write_text(header + text)
     analyze.main(analyze.Args(root, tmp_path / "out", metric="success_rate"))
     said = capsys.readouterr().out
-    assert (
-        f"trained with {SCALE} at rate 1.00: more robust over 1 of 1 test condition (+40 [" in said
-    )
+    assert "more robust over 1 of 1 test condition (+40 [" in said
     assert "] percentage points of success, p = 0.0079" in said
     scores = pd.read_csv(tmp_path / "out/robustness_score.csv")
     assert scores["difference"].tolist() == [40] and scores["conditions"].tolist() == [1]
     assert scores.filter(regex="percent$").isna().all(axis=None)
     table = pd.read_csv(tmp_path / "out/robustness.csv")
     assert table["mean"].tolist() == [100, 44, 100, 84]
-    page = (tmp_path / "out/report.html").read_text()
-    assert "The success rate under every test condition" in page
-    assert "in percentage points. A dot marks" in page
-
-
-@pytest.mark.parametrize(
-    ("value", "metric", "said"),
-    [(0, SUCCESS, "no run ever solves"), (100, SUCCESS, "all runs solve the task in every test")]
-    + [(40, SUCCESS, "a success rate of 40 %"), (-50, RETURN, "return -50.00")],
-)
-def test_what_all_runs_do(value, metric, said):
-    """What was learned, it cannot tell."""
-    assert said in what_all_runs_do(value, metric)
