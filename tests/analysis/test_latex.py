@@ -44,16 +44,11 @@ def test_what_rows_share_is_said_once():
     assert rows_of(text) == ["Hopper-v5 & A & 5", " & B & 5", "Ant-v5 & B & 5"]
 
 
-def test_a_wide_table_leaves_columns_out_and_says_so_and_a_long_one_goes_on():
-    columns = {"noise": [f"Random{i}" for i in range(100)], "effect_size": [1.5] * 100}
-    columns |= {f"a column {i}": ["some words here"] * 100 for i in range(9)}
-    columns["difference"] = [1.0] * 100
-    text = table_of(columns, 5.5)
-    [left_out] = re.findall("% no room for: (.*) \\(see t.csv\\)", text)
-    assert left_out.startswith("effect size, a column 8") and "noise" not in left_out
+def test_a_long_table_goes_on_in_others():
+    text = table_of({"noise": [f"Random{i}" for i in range(100)]})
     tables = text.count(r"\begin{table*}")
     assert tables == text.count(r"\end{table*}") > 2 and text.count("(continued)") == tables - 1
-    assert len(re.findall("Random[0-9]+ &", text)) == 100
+    assert len(re.findall(r"Random[0-9]+ \\\\", text)) == 100
 
 
 @pytest.mark.parametrize("corrected", ["p_adjusted", "p_holm"])

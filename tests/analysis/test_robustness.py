@@ -4,18 +4,16 @@ import gzip
 import json
 import re
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from sweeps import row, run, write_run
 
-import analysis.robustness
 from analysis.folders import RETURN
 from analysis.heatmap import heatmaps
 from analysis.matrices import matrices
-from analysis.robustness import is_clean
+from analysis.robustness import analyse_robustness, is_clean, read_robustness
 from analysis.runs import finished, read_runs
 from noisy_wrappers import BASELINE, Configuration, split_noises
 
@@ -70,7 +68,7 @@ def test_score_and_conditions_by_hand(tmp_path, capsys):
     write_tests(tmp_path / "runs", HOPPER, "Hopper-v5")
     tables = run(tmp_path)
     scores = tables["robustness_score"]
-    assert list(scores.columns) == analysis.robustness.SCORE_COLUMNS and len(scores) == 2
+    assert len(scores) == 2
 
     push = row(scores, noise=PUSH)  # not under its own noise, nor under that of rewards
     assert push["environment"] == "Hopper-v5"
@@ -202,33 +200,34 @@ def test_conditions_and_episodes_that_a_run_lacks_do_not_count(tmp_path, capsys)
     assert "the first 4 count, which begin alike" in capsys.readouterr().out
 
 
-def test_compressed_damaged_and_unfinished_runs(tmp_path, capsys):
+def test_damaged_and_unfinished_runs(tmp_path, capsys):
+    """They do not count; and without a baseline there is nothing to compare with."""
     write_tests(tmp_path / "runs", HOPPER, "Hopper-v5")
-    first = run(tmp_path)
-    for path in (tmp_path / "runs").glob("*/robustness.csv"):
-        Path(f"{path}.gz").write_bytes(gzip.compress(path.read_bytes()))
-        path.unlink()
-    pd.testing.assert_frame_equal(first["robustness"], run(tmp_path)["robustness"])
-    capsys.readouterr()
-    bad_disk = next((tmp_path / "runs").glob(f"*{PUSH}*__1")) / "robustness.csv.gz"
-    packed = bytearray(bad_disk.read_bytes())
+    damaged, unfinished, *_ = (tmp_path / "runs").glob(f"*{PUSH}*")
+    path = damaged / "robustness.csv"
+    packed = bytearray(gzip.compress(path.read_bytes()))
     packed[60:63] = bytes(255 - byte for byte in packed[60:63])
-    bad_disk.write_bytes(packed)
-    (next((tmp_path / "runs").glob(f"*{PUSH}*__2")) / "result.json").unlink()
+    (damaged / "robustness.csv.gz").write_bytes(packed)
+    path.unlink()
+    (unfinished / "result.json").unlink()
     assert row(run(tmp_path)["robustness_score"], noise=PUSH)["n"] == 2
-    said = f"{bad_disk.parent.name} has no tests of robustness: robustness.csv.gz: "
+    said = f"{damaged.name} has no tests of robustness: robustness.csv.gz: "
     assert said in capsys.readouterr().out
     for path in (tmp_path / "runs").glob("*baseline*"):
         shutil.rmtree(path)
-    assert run(tmp_path)["robustness_score"].empty  # nothing to compare with
+    assert run(tmp_path)["robustness_score"].empty
+
+
+def tables_of(runs_dir):
+    """Return the tables of the tests of a folder of runs, and their sentences."""
+    found, _ = read_robustness(finished(read_runs(runs_dir)))
+    return analyse_robustness(found)
 
 
 def test_heatmap(tmp_path):
     write_tests(tmp_path, HOPPER, "Hopper-v5")
-    found, _ = analysis.robustness.read_robustness(finished(read_runs(tmp_path)))
-    tables, _ = analysis.robustness.analyse_robustness(found)
-    [(label, caption, draw)] = heatmaps(tables["robustness"].frame, RETURN)
-    assert label == "heatmap PPO Hopper-v5"
+    tables, _ = tables_of(tmp_path)
+    [(*_, draw)] = heatmaps(tables["robustness"].frame, RETURN)
     ax = draw().axes[0]
     rows = [label.get_text().replace("\n", "") for label in ax.get_yticklabels()]
     columns = [label.get_text().replace("\n", "") for label in ax.get_xticklabels()]
@@ -239,7 +238,7 @@ def test_heatmap(tmp_path):
     assert numbers[columns.index("clean"), 2] == "+10"
     dots = {tuple(np.round(line.get_xydata()[0] + (-0.36, 0.28)).astype(int)) for line in ax.lines}
     same = {(columns.index(f"{PUSH}, 1.00"), 1), (columns.index(f"{SENSOR}, 0.20"), 2)}
-    assert dots == same and "A dot marks" in caption
+    assert dots == same
 
 
 def test_robustness_of_another_experiment_is_apart(tmp_path):
@@ -248,10 +247,9 @@ def test_robustness_of_another_experiment_is_apart(tmp_path):
         config = json.loads(path.read_text())
         config["args"]["exp_name"] = "other"
         path.write_text(json.dumps(config))
-    found, _ = analysis.robustness.read_robustness(finished(read_runs(tmp_path)))
-    tables, sentences = analysis.robustness.analyse_robustness(found)
+    tables, sentences = tables_of(tmp_path)
     assert tables["robustness_score"].frame.empty and not sentences
-    assert set(found["exp_name"]) == {"ppo_continuous_noisy", "other"}
+    assert set(tables["robustness"].frame["exp_name"]) == {"ppo_continuous_noisy", "other"}
 
 
 def test_a_clean_return_of_zero_is_compared_in_units_of_the_return(tmp_path):
@@ -263,7 +261,7 @@ def test_a_clean_return_of_zero_is_compared_in_units_of_the_return(tmp_path):
     }
     write_tests(tmp_path / "runs", table, "Hopper-v5")
     write_tests(tmp_path / "runs", zero, "Maze-v0")
-    tables = run(tmp_path, drawn=True)
+    tables = run(tmp_path)
     push = tables["robustness_score"].query("noise == @PUSH").set_index("environment")
     assert push.loc["Maze-v0", "difference"] == push.loc["Hopper-v5", "difference"]
     assert push.loc["Maze-v0", "p"] == push.loc["Hopper-v5", "p"]
@@ -271,7 +269,6 @@ def test_a_clean_return_of_zero_is_compared_in_units_of_the_return(tmp_path):
     assert scores.loc["Maze-v0"].isna().all() and scores.loc["Hopper-v5"].notna().all()
     together = row(tables["robustness_together"], noise=PUSH)
     assert together["p"] == pytest.approx(2 / 70**2) and np.isnan(together["score_percent"])
-    assert (tmp_path / "results/robustness_heatmap_PPO_Maze-v0.svg").exists()
 
 
 # Two noises with one number each
@@ -325,24 +322,15 @@ def test_heatmap_of_a_matrix(tmp_path):
     twice = {test: [2 * value for value in values] for test, values in means.items()}
     table = {("", 0.0): means, ("RandomDynamics(0.5, 2.0)", 1.0): twice}
     write_tests(tmp_path, table, "Hopper-v5", (1, 2))
-    found, _ = analysis.robustness.read_robustness(finished(read_runs(tmp_path)))
-    tables, _ = analysis.robustness.analyse_robustness(found)
-    _, (label, caption, draw) = heatmaps(tables["robustness"].frame, RETURN)
-    assert label.startswith("matrix PPO on Hopper-v5 RandomDynamics(x, x) + RandomActionDelay(y)")
-    assert "(seeds: 2): mean return" in caption
+    tables, _ = tables_of(tmp_path)
+    _, (*_, draw) = heatmaps(tables["robustness"].frame, RETURN)
     *panels, _ = draw(6.75).axes
-    assert [ax.get_title().replace("\n", "") for ax in panels] == [
-        "trained without noise",
-        "trained with RandomDynamics(0.5, 2.0), 1.00",
-    ]
     for ax, factor in zip(panels, (1, 2), strict=True):
         shown = ax.images[0].get_array().filled(np.nan)
         expected = factor * (10.0 * np.arange(3)[:, None] - np.arange(3))
         expected[2, 2] = np.nan
         np.testing.assert_array_equal(shown, expected)
         assert ax.images[0].get_clim() == (-4, 40)
-        texts = {text.get_position(): float(text.get_text()) for text in ax.texts}
-        assert texts[1, 2] == factor * 19 and len(texts) == 8
 
 
 def test_a_harmless_noise_is_a_test_condition(tmp_path):
