@@ -26,6 +26,12 @@ def stacked(*environments):
     return table
 
 
+def cells_of(page, line):
+    """Return the numbers in the cells of a table's line that begins so."""
+    [cells] = re.findall(rf"^\| {line} \| (.*) \|$", page, re.MULTILINE)
+    return [float(cell.rstrip(" %")) for cell in cells.split(" | ")]
+
+
 # ---------------------------------------------------------------------------- the permutation test
 
 
@@ -105,10 +111,8 @@ def test_random_divisions_where_there_are_too_many(monkeypatch):
 
 def test_infinite_ts_of_two_environments_cancel():
     x, y = stacked([1, 1, 1], [0, 0, 0]), stacked([0, 0, 0], [1, 1, 1])
-    t, p, _ = statistics.permutation_t(x, y)
-    assert t == pytest.approx(0) and p == 1
     found = statistics.compare(x, y)
-    assert found.p == 1 and np.isnan(found.effect_size)
+    assert found.t == pytest.approx(0) and found.p == 1 and np.isnan(found.effect_size)
 
 
 def test_an_environment_where_runs_hardly_differ_decides_no_more_than_others():
@@ -116,11 +120,9 @@ def test_an_environment_where_runs_hardly_differ_decides_no_more_than_others():
     worse = [(rng.normal(60, 10, 5), rng.normal(100, 10, 5)) for _ in range(4)]
     for spread in (0, 1e-6, 0.01):
         better = 201 + spread * rng.normal(size=5), 200 + spread * rng.normal(size=5)
-        comparison = statistics.compare(
-            *(stacked(*side) for side in zip(*worse, better, strict=True))
-        )
-        assert comparison.t < 0 and comparison.effect_size < -1
-        assert comparison.p < 0.01
+        x, y = (stacked(*side) for side in zip(*worse, better, strict=True))
+        found = statistics.compare(x, y)
+        assert found.t < 0 and found.effect_size < -1 and found.p < 0.01
 
 
 # ------------------------------------------------------------------------------------- comparisons
@@ -280,10 +282,8 @@ def test_coverage_of_success_is_what_the_page_says():
                     _, _, low, high = statistics.contrast(samples, [1, -1], episodes=10)
                     inside += low - 1e-9 <= 100 * (with_noise - without) <= high + 1e-9
                 cells.append(inside / 10)
-            rates = f"{100 * with_noise:.0f} % and {100 * without:.0f} %"
-            [line] = re.findall(rf"^\| {name} \| {rates} \| (.*) \|$", page, re.MULTILINE)
-            said = [float(cell.rstrip(" %")) for cell in line.split(" | ")]
-            assert said == pytest.approx(cells, abs=2), (name, rates)
+            line = f"{name} \\| {100 * with_noise:.0f} % and {100 * without:.0f} %"
+            assert cells_of(page, line) == pytest.approx(cells, abs=2), line
 
 
 # ------------------------------------------------------------------------------ what a run returns
@@ -314,13 +314,16 @@ def test_a_curve_reaches_a_target_with_the_runs_that_are_there():
 # ------------------------------------------------------------------------------------------- power
 
 
+def divisions(n, m, rng):
+    """Return all divisions into n and m values, or 999 random ones where there are many."""
+    few = n + m <= 10
+    return permutation.partitions(n, m) if few else permutation.random_partitions(n, m, 999, rng)
+
+
 @pytest.mark.parametrize(("n", "m"), [(4, 4), (3, 5), (5, 5), (10, 5), (10, 10), (40, 40)])
 def test_the_detectable_shift_is_found_in_80_percent_of_the_cases(n, m):
     rng = np.random.default_rng(3)
-    exact = n + m <= 10
-    chosen = (
-        permutation.partitions(n, m) if exact else permutation.random_partitions(n, m, 999, rng)
-    )
+    chosen = divisions(n, m, rng)
     values = rng.standard_normal((n + m, 1500))
     values[:n] += statistics.detectable_shift(n, m)
     above, _ = permutation.tails(permutation.welch_t(values, chosen))
@@ -364,20 +367,12 @@ def simulated(n, m, draw, spread, draws=2000):
     """Percent of comparisons of equal means, n against m, with p <= 0.05; coverage of intervals."""
     rng = np.random.default_rng(n)
     values = np.concatenate([spread * draw(rng, (n, draws)), draw(rng, (m, draws))])
-    few = n + m <= 10
-    chosen = permutation.partitions(n, m) if few else permutation.random_partitions(n, m, 999, rng)
-    shares = permutation.tails(permutation.welch_t(values, chosen))
+    shares = permutation.tails(permutation.welch_t(values, divisions(n, m, rng)))
     x, y = values[:n], values[n:]
     variances = [z.var(axis=0, ddof=1) / len(z) for z in (x, y)]
     _, half = statistics.satterthwaite(variances, np.array([[n], [m]]))
     covered = abs(x.mean(axis=0) - y.mean(axis=0)) <= half
     return 100 * (2 * np.minimum(*shares) <= 0.05 + 1e-12).mean(), 100 * covered.mean()
-
-
-def cells_of(page, line):
-    """Return the numbers in the cells of a table's line that begins so."""
-    [cells] = re.findall(rf"^\| {line} \| (.*) \|$", page, re.MULTILINE)
-    return [float(cell.rstrip(" %")) for cell in cells.split(" | ")]
 
 
 @pytest.mark.slow

@@ -50,16 +50,11 @@ def test_better_needs_the_corrected_p():
     table, said = judge(five, five + 10, five - 10, *[five] * 7)
     q = 9 / 2 * 2 / 252  # two of nine comparisons reach 2 / 252
     assert list(table["p_adjusted"][:2]) == pytest.approx([q, q])
-    assert said["verdict"].value_counts().to_dict() == {
-        "better": 1,
-        "worse": 1,
-        "no clear difference": 7,
-    }
+    counts = said["verdict"].value_counts().to_dict()
+    assert counts == {"better": 1, "worse": 1, "no clear difference": 7}
     table, said = judge(five, five + 10, *[five] * 7)
     assert set(said["verdict"]) == {"no clear difference"} and table["p"][0] < 0.05
-    text = said["sentence"].iloc[0]
-    assert "p = 0.0079, corrected for 8 comparisons 0.063; excluded: a gain of more than" in text
-    assert text.endswith(", any loss.")
+    assert "p = 0.0079, corrected for 8 comparisons 0.063;" in said["sentence"].iloc[0]
 
 
 def test_p_of_exactly_five_percent_is_enough():
@@ -74,26 +69,20 @@ def test_p_of_exactly_five_percent_is_enough():
 def test_few_seeds():
     """Below five there is no interval, with three no p of 0.05, with one no p."""
     _, said = judge([10.0, 11, 12, 13], [110.0, 111, 112, 113])
-    few = "(smallest possible: 0.029; too few seeds for an interval)"
-    expected = f"better than no noise: +100.0 (+870 %), p = 0.029 {few}, the only comparison there."
-    assert said["sentence"].iloc[0].endswith(expected)
-    _, said = judge(TEN, [104.0, 104.5])
-    assert "p = 0.85 (smallest possible: 0.03; too few" in said["sentence"].iloc[0]
+    expected = "better than no noise: +100.0 (+870 %), p = 0.029 (smallest possible: 0.029; too few"
+    assert expected in said["sentence"].iloc[0]
     _, said = judge([10.0, 11, 12], [9.0, 10])
     assert "2 seeds against 3 cannot show any (smallest possible p" in said["sentence"].iloc[0]
     _, said = judge([10.0], [5.0])
     assert said["verdict"].tolist() == ["too few seeds"]
-    assert said["sentence"].iloc[0].endswith("has too few seeds for a test: -5.000 (-50 %).")
 
 
 def test_an_unclear_verdict_says_what_is_excluded():
-    """Never how many seeds the observed difference would take."""
     table, said = judge(TEN, TEN + 1.5)
     row, [text] = table.iloc[0], said["sentence"]
     low, high = row[["percent_low", "percent_high"]]
     assert f"excluded: a gain of more than {high:.1f} %, a loss of more than {-low:.1f} %." in text
     assert low < 0 < row["difference_percent"] < high
-    assert "would take" not in text and "perhaps" not in text
     _, said = judge(TEN - 104.5, TEN - 104)  # of nearly zero there is no percentage
     assert "a gain of more than 3.3, a loss of more than 2.3." in said["sentence"].iloc[0]
     _, said = judge(TEN, TEN + 0.01)
@@ -171,13 +160,13 @@ def test_numbers_of_any_size(baseline, noisy, expected):
     assert expected in text and ("%" in expected or "%" not in text)
 
 
-@pytest.mark.parametrize(
-    ("value", "spread", "expected"),
-    [(0.013, 2.4, "0.013"), (-0.013, 2.4, "-0.013"), (0.06, 2.4, "0.1"), (0.0, 2.4, "0.0")]
-    + [(1e-12, 2.4, "0.0"), (4.7, 2.4, "4.7")],  # 1e-12 is a rounding error
-)
-def test_an_end_of_an_interval_looks_like_zero_only_if_it_is(value, spread, expected):
-    assert analysis.formatting.text_of("difference_low", value, spread) == expected
+def test_an_end_of_an_interval_looks_like_zero_only_if_it_is():
+    ends = {0.013: "0.013", -0.013: "-0.013", 0.06: "0.1", 0.0: "0.0", 4.7: "4.7"}
+    ends |= {1e-12: "0.0"}  # a rounding error
+    for end, text in ends.items():
+        assert analysis.formatting.text_of("difference_low", end, spread=2.4) == text
+    assert analysis.formatting.text_of("percent_low", -0.011) == "-0.01"
+    assert analysis.formatting.text_of("percent_high", 1e-12) == "0.0"
 
 
 def test_what_is_excluded_agrees_with_the_ends_of_both_intervals():
@@ -187,22 +176,14 @@ def test_what_is_excluded_agrees_with_the_ends_of_both_intervals():
         row = {"difference": 5.0, "difference_low": low, "difference_high": high}
         row |= {"difference_percent": 5.0, "percent_low": percent_low, "percent_high": percent_high}
         row = pd.Series(row)
-        text = analysis.verdicts.difference_in_words(row) + analysis.verdicts.excluded(row)
-        return text.replace("; excluded: a gain of more than 11 %, a loss of more than ", " > ")
+        return analysis.verdicts.excluded(row).removeprefix("; excluded: ").split(", ")
 
-    assert said(-0.011, 10, -0.011, 11) == "+5.0 [-0.011, 10.0] (+5.0 % [-0.01, 11]) > 0.01 %"
-    assert said(-0.26, 10, 0.3, 11) == "+5.0 [-0.3, 10.0] (+5.0 % [0.3, 11]) > 0.3"
-    assert said(0.2, 10, -0.1, 11) == "+5.0 [0.2, 10.0] (+5.0 % [-0.1, 11]) > 0.1 %"
-    assert said(0.2, 10, 0.3, 11).endswith("a gain of more than 11 %, any loss")
-    assert said(-9, 0.2, -9, -0.1).endswith("a gain of more than 0.2, a loss of more than 9.0 %")
-    assert said(-9, 0.0, -9, 0.0).endswith("any gain, a loss of more than 9.0 %")
-    assert analysis.formatting.text_of("percent_low", -0.011) == "-0.01"
-    assert analysis.formatting.text_of("percent_high", 1e-12) == "0.0"
-
-
-def test_a_percentage_that_is_rounded_to_ten_has_no_decimal():
-    said = [analysis.formatting.percent(x) for x in (9.94, 9.96, -9.96, 10.4, 0.04)]
-    assert said == ["+9.9 %", "+10 %", "-10 %", "+10 %", "0.0 %"]
+    assert said(-0.011, 10, -0.011, 11)[1] == "a loss of more than 0.01 %"
+    assert said(-0.26, 10, 0.3, 11)[1] == "a loss of more than 0.3"
+    assert said(0.2, 10, -0.1, 11)[1] == "a loss of more than 0.1 %"
+    assert said(0.2, 10, 0.3, 11) == ["a gain of more than 11 %", "any loss"]
+    assert said(-9, 0.2, -9, -0.1)[0] == "a gain of more than 0.2"
+    assert said(-9, 0.0, -9, 0.0) == ["any gain", "a loss of more than 9.0 %"]
 
 
 def test_a_p_above_the_level_does_not_look_like_it():
