@@ -1,15 +1,13 @@
-"""The one reader of run folders: what releases 0.3 and 0.4 wrote, and what is damaged."""
+"""The one reader of run folders: what a run tells, and what is damaged."""
 
 import json
-from pathlib import Path
+import re
 
 import pytest
 from sweeps import SCALE, write_run
 
 from analysis.folders import SUCCESS, DamageError, read_run
-from noisy_wrappers import BASELINE, Configuration
-
-DATA = Path(__file__).parents[2] / "results/data"
+from noisy_wrappers import BASELINE
 
 
 def change(folder, args=(), **config):
@@ -18,18 +16,6 @@ def change(folder, args=(), **config):
     content = json.loads(path.read_text()) | config
     content["args"] |= dict(args)
     path.write_text(json.dumps(content))
-
-
-def test_a_run_of_the_frozen_release():
-    folder = next((DATA / "runs").glob("p1.0_s3_EarlyTermination_50__Pusher*"))
-    run = read_run(folder)
-    assert (run.algorithm, run.environment, run.seed) == ("PPO", "Pusher-v5", 3)
-    assert run.configuration == Configuration.parse("RandomEarlyTermination(50)", 1.0)
-    assert (run.release, run.script) == ("0.3", "ppo_continuous_noisy.py")
-    assert run.finished and run.tested == "" and run.curve.success_rates is None
-    assert run.curve.steps.tolist() == list(range(50_000, 1_000_001, 50_000))
-    assert run.curve.returns[-1] == pytest.approx(run.result["final_return_mean"])
-    assert read_run(folder, with_curve=False).curve is None
 
 
 def test_a_run_of_an_algorithm_of_ones_own(tmp_path):
@@ -59,6 +45,27 @@ def test_success_is_told_or_not(header, cells, rates, tmp_path):
     assert curve.returns.tolist() == [1, 2]
     found = curve.of(SUCCESS)
     assert found is None if rates is None else found.tolist() == rates
+
+
+DAMAGED = {
+    "a short line": lambda text: text.replace(",1000\n", "\n", 1),
+    "nan": lambda text: re.sub(r"(?m)^(10000,0,)[^,]*", r"\1nan", text),
+    "a missing episode": lambda text: re.sub(r"(?m)^20000,1,.*\n", "", text),
+    "a missing evaluation at the end": lambda text: re.sub(r"(?m)^50000,.*\n", "", text),
+    "steps out of order": lambda text: text.replace("\n30000,", "\n10000,"),
+    "no header": lambda text: text.split("\n", 1)[1],
+    "only a header": lambda text: text.split("\n", 1)[0] + "\n",
+}
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_damaged_evaluations_are_told(name, tmp_path):
+    path = write_run(tmp_path, [10, 20, 30, 40, 50.0]) / "eval.csv"
+    text = path.read_text()
+    path.write_text(DAMAGED[name](text))
+    assert path.read_text() != text
+    with pytest.raises(DamageError, match="^eval.csv"):
+        read_run(path.parent)
 
 
 def test_of_a_damaged_run_is_known_what_can_be_read(tmp_path):
