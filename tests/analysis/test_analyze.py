@@ -34,20 +34,20 @@ def test_the_same_bytes_again_also_from_shuffled_folders(tmp_path):
             assert path.read_bytes() == (tmp_path / other / path.name).read_bytes(), path.name
 
 
-@pytest.mark.parametrize("case", ["no folder", "no runs", "none finished", "no place"])
+@pytest.mark.parametrize("case", ["no folder", "no runs", "unfinished", "no place", "no success"])
 def test_nothing_to_read_or_no_place_to_write_is_an_error(case, tmp_path, capsys):
     if case != "no folder":
         (tmp_path / "runs").mkdir()
-    if case in ("none finished", "no place"):
-        write_run(tmp_path / "runs", [1], finished=case == "no place")
+    if case in ("unfinished", "no place", "no success"):
+        write_run(tmp_path / "runs", [1], finished=case != "unfinished")
     if case == "no place":
         (tmp_path / "results").write_text("a file")
     with pytest.raises(SystemExit) as error:
-        run(tmp_path)
+        run(tmp_path, metric="success_rate" if case == "no success" else "return")
     printed = capsys.readouterr()
     assert error.value.code == 2 and not (tmp_path / "results").is_dir()
     assert printed.err.startswith("error: ") and printed.err.count("\n") == 1
-    assert ("unfinished" in printed.out) == (case == "none finished")
+    assert ("unfinished" in printed.out) == (case == "unfinished")
 
 
 def test_results_go_beside_the_runs(tmp_path, monkeypatch):

@@ -1,12 +1,11 @@
 """The figures of analyze.py: what stands where, in which colour, with which n, at which size."""
 
-import re
 from itertools import combinations, product
 
 import numpy as np
 import pandas as pd
 import pytest
-from sweeps import ENDING, NAN, RESULTS, SCALE, drawn_of, small_sweep, write_pairs, write_run
+from sweeps import ENDING, NAN, SCALE, drawn_of, small_sweep, write_pairs, write_run
 
 import analysis.effects
 import analysis.figures
@@ -218,9 +217,3 @@ def test_figures_of_experiments_with_similar_names_have_names_of_their_own(tmp_p
     names = drawn_of(tmp_path).keys()
     assert {"effects_SAC_lr_1", "effects_SAC_lr_1_again"} <= names
     assert max(map(len, names)) < 200
-
-
-def test_committed_figures_are_those_that_a_page_shows():
-    pages = [RESULTS.parent / "README.md", *RESULTS.glob("*.md"), *RESULTS.parent.glob("docs/*.md")]
-    shown = re.findall(r"!\[[^]]*\]\([^)]*figures/([^)]*)\)", "".join(p.read_text() for p in pages))
-    assert {path.name for path in (RESULTS / "figures").iterdir()} == set(shown)
