@@ -48,6 +48,7 @@ def test_nothing_to_read_or_no_place_to_write_is_an_error(case, tmp_path, capsys
     assert error.value.code == 2 and not (tmp_path / "results").is_dir()
     assert printed.err.startswith("error: ") and printed.err.count("\n") == 1
     assert ("unfinished" in printed.out) == (case == "unfinished")
+    assert ("--metric" in printed.err) == (case == "no success")
 
 
 def test_results_go_beside_the_runs(tmp_path, monkeypatch):

@@ -55,17 +55,6 @@ def test_search_and_confirmation_are_never_mixed(tmp_path, capsys):
     assert page.index('id="choice"') < page.index('id="noises"')
 
 
-def test_a_confirmation_is_not_corrected(tmp_path):
-    """It has its share of the level from the command that planned it."""
-    for env in ("Hopper-v5", "Pusher-v5", "Walker2d-v5"):
-        write_choice(tmp_path / "runs", env, gain=0.5 if env == "Pusher-v5" else 30.0)
-    table = run(tmp_path)["statistics"]
-    table = table[table["p"].notna()].set_index("environment")
-    assert set(table.index) == {"Hopper-v5", "Pusher-v5", "Walker2d-v5"}  # nor all of them
-    assert table.loc["Hopper-v5", "p"] == pytest.approx(2 / 252)
-    assert list(table["p_adjusted"]) == list(table["p"]) and set(table["comparisons"]) == {1}
-
-
 def test_a_choice_in_a_folder_of_its_own_disturbs_no_other_sweep(tmp_path):
     write_run(tmp_path, [100.0], "PPO")
     write_run(tmp_path, [110.0], "PPO", noise=SCALE, rate=1.0)
@@ -81,7 +70,11 @@ def test_a_choice_in_a_folder_of_its_own_disturbs_no_other_sweep(tmp_path):
     + [(-30.0, "no", "no clear difference"), (2.0, "yes", "better"), (30.0, None, "")],
 )
 def test_a_confirmation_has_the_verdict_of_the_choice(gain, survives, verdict, tmp_path):
-    """Which looks several times: a plain p would be one look more."""
+    """Which looks several times: a plain p would be one look more.
+
+    It is not corrected: it has its share of the level from the command that planned it.
+    """
+    write_choice(tmp_path / "runs", "Pusher-v5", gain=0.5)
     write_choice(tmp_path / "runs", gain=gain)
     path = tmp_path / "runs/choice.csv"
     lines = path.read_text().splitlines()
@@ -90,8 +83,10 @@ def test_a_confirmation_has_the_verdict_of_the_choice(gain, survives, verdict, t
         lines.append(f"{last},{survives}")
     path.write_text("\n".join(lines) + "\n")
     tables = run(tmp_path)
-    [said] = tables["noises"]["verdict"]
+    said = row(tables["noises"], environment="Hopper-v5")["verdict"]
     assert said == verdict or (pd.isna(said) and not verdict)
+    assert list(tables["noises"]["p_adjusted"]) == list(tables["noises"]["p"])
+    assert set(tables["noises"]["comparisons"]) == {1} and tables["noises_together"].empty
 
 
 def test_a_confirmation_that_is_not_judged_yet_is_drawn(tmp_path):
