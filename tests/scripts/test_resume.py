@@ -181,6 +181,7 @@ KILLS = {
     "the first one written, not on the disk": ("os.fsync", None, die_flushing_checkpoint),
     "the first one on the disk, not in place": ("os.replace", None, Nth("checkpoint", 1, die)),
     "mid-episode, after an evaluation that the checkpoint lacks": (TRAINING_STEP, 80, die),
+    "the next but one not in place": ("os.replace", None, Nth("checkpoint", 2, die)),
     "the policy half written": half_way("policy"),
     "a test not in place": ("os.replace", None, Nth("eval", 2, die)),  # the first is on resuming
     "the result not in place": ("os.replace", None, Nth("result", 1, die)),
