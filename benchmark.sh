@@ -131,8 +131,9 @@ done
 case ${PYTHON:-} in '' | /*) ;; */*) PYTHON=$caller/$PYTHON ;; esac
 [ -n "${PYTHON:-}" ] || [ ! -x .venv/bin/python ] || PYTHON=.venv/bin/python
 export PYTHON=${PYTHON:-python}
-# A module of the user's lies there, too
-[ "$caller" = "$PWD" ] || export PYTHONPATH=${PYTHONPATH:+$PYTHONPATH:}$caller
+# A module of the user's, as in my_envs:MyEnv-v0, lies there, too. Without a colon there is none, and
+# the folder stays off the path: a file in it could have the name of one of Python's own modules.
+[[ "$caller" = "$PWD" || "${grid[*]}" != *:* ]] || export PYTHONPATH=${PYTHONPATH:+$PYTHONPATH:}$caller
 lacking=$("$PYTHON" -c "import sys, importlib.util as u
 print(*[name for name in sys.argv[1:] if not u.find_spec(name)], sep=', ')" \
   gymnasium mujoco torch tyro tensorboard 2>/dev/null) ||

@@ -705,3 +705,6 @@ def test_a_script_and_an_environment_in_the_callers_folder(tmp_path):
     assert f" {tmp_path / python} " in line and "--env-id my_envs:Mine-v0" in line
     pasted = subprocess.run(line, shell=True, cwd=ROOT, capture_output=True, text=True)
     assert (pasted.returncode, pasted.stdout) == (3, "found them\n")
+    # without a module of one's own, a file in the folder hides none of Python's
+    (tmp_path / "random.py").write_text("exit('hidden')")
+    assert run("demo", "--dry-run", **here).code == 0
