@@ -24,10 +24,13 @@ def load(runs_dir):
     path = file_of(runs_dir)
     empty = {"commands": [], "plans": {}}
     try:
-        return empty | json.loads(path.read_text("utf-8"))
+        kept = empty | json.loads(path.read_text("utf-8"))
+        plans = kept["plans"].items()
+        plans = {key: Plan(tuple(one["looks"]), one["level"]) for key, one in plans}
+        return {"commands": list(kept["commands"]), "plans": plans}
     except FileNotFoundError:
         return empty
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError, TypeError, AttributeError, KeyError) as error:
         return fail(f"cannot read {path} ({in_words(error)}), which keeps the plan of a choice")
 
 
@@ -39,22 +42,20 @@ def choice_key(args, algorithm, env_id):
 
 def plan_of(args, algorithm, env_id):
     """Return the Plan that a choice began its confirmation with, or None."""
-    kept = load(args.runs_dir)["plans"].get(choice_key(args, algorithm, env_id))
-    return Plan(tuple(kept["looks"]), kept["level"]) if kept else None
+    return load(args.runs_dir)["plans"].get(choice_key(args, algorithm, env_id))
 
 
 def keep_plans(args, plans):
     """Keep the plans of confirmations that begin now, {key: Plan}, and the command."""
     command = {name: getattr(args, name) for name in ("algos", "envs", "words", "extra_words")}
     path = file_of(args.runs_dir)
-    new = {key: plan._asdict() for key, plan in plans.items()}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with rewritten(path) as file:  # another command may write at the same time
             kept = load(args.runs_dir)
             others = [one for one in kept["commands"] if one != command]
-            kept = {"commands": [*others, command], "plans": new | kept["plans"]}
-            json.dump(kept, file, indent=1)
+            kept_plans = {key: plan._asdict() for key, plan in (plans | kept["plans"]).items()}
+            json.dump({"commands": [*others, command], "plans": kept_plans}, file, indent=1)
     except OSError as error:
         fail(f"--runs-dir: cannot write {path}: {error.strerror}")
 

@@ -399,10 +399,11 @@ def test_what_was_fixed_beforehand_is_kept(tmp_path, capsys):
     assert first.plan == choice.plan and second.plan == Plan((5, 10, 15, 20, 25), 0.025)
     assert "of 0.9 standard deviations" in telling.detectable_gain(second.plan)
     assert listed(one)[0].plan == choice.plan
-    (tmp_path / "choice.json").write_text("{")
-    with pytest.raises(SystemExit):  # it must not be decided anew
-        listed(one)
-    assert "which keeps the plan of a choice" in capsys.readouterr().err
+    for damage in ("{", '{"plans": {"a": {"looks": [5]}}}', '{"commands": 4}'):
+        (tmp_path / "choice.json").write_text(damage)
+        with pytest.raises(SystemExit):  # it must not be decided anew
+            listed(one)
+        assert "which keeps the plan of a choice" in capsys.readouterr().err
 
 
 def test_fresh_seeds_that_ran_otherwise_are_refused_at_once(tmp_path, capsys):
