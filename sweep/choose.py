@@ -54,12 +54,14 @@ def choices(args):
     pairs = list(itertools.product(args.algos, args.envs))
     plans = {pair: plan_for(args, *pair, len(pairs)) for pair in pairs}
     known = {env_id: remembered(args, env_id) for env_id in args.envs}
+    asked = {}
     if args.view in ("list", "dry-run"):
         refuse_other_baselines(args, plans)
-        known |= ask_about_untried(args, known)
+        asked = ask_about_untried(args, known)
+        known |= asked
     found = [follow(args, *pair, known[pair[1]], plan) for pair, plan in plans.items()]
     if args.view == "list":
-        for env_id, environment in known.items():
+        for env_id, environment in asked.items():
             remember(args, env_id, environment)
     problems = [f"{choice.name}: {choice.problem}" for choice in found if choice.problem]
     if len(problems) == len(found):
@@ -71,9 +73,12 @@ def choices(args):
 
 def begin(args, found):
     """Keep what the runs that start now fix: the command, and the plans of confirmations."""
-    confirmed = [choice for choice in found if choice.state.look]
-    keys = [choice_key(args, choice.kind[0].lower(), choice.kind[1]) for choice in confirmed]
-    keep_plans(args, {key: one.plan for key, one in zip(keys, confirmed, strict=True)})
+    plans = {}
+    for choice in found:
+        algorithm, env_id = choice.kind
+        if choice.state.look:
+            plans[choice_key(args, algorithm.lower(), env_id)] = choice.plan
+    keep_plans(args, plans)
 
 
 def plan_for(args, algorithm, env_id, verdicts):

@@ -272,12 +272,11 @@ def check_transitions(name, inputs, places):
     if len(raw) != 2 or len(raw[1]) != size or len(numbers) < 2:
         return
     rows, at_limit = [], []
+    advice = "give s before s'; store what step() returned, before reset(); test in test_env alone"
     for row, (key, next_key) in enumerate(zip(keys(raw[0]), keys(raw[1]), strict=True)):
         if key in places and next_key in places:
             pairs = itertools.product(places[key], places[next_key])
             later = [b for a, b in pairs if a.episode == b.episode and a.step < b.step]
-            advice = "give s before s'; store what step() returned, before reset(); "
-            advice += "test in test_env alone"
             check(later, f"{name}() is given a next observation that does not come later: {advice}")
             rows.append(row)
             at_limit.append(any(place.at_limit for place in later))
@@ -360,9 +359,9 @@ def as_bytes(state):
 def left_behind(seen):
     """Yield what in the state never changes, and what is wrong with targets.
 
-    Those are the networks in the state that no update learns.
-    The tensors of a target move as those of the learned network do that it is a copy of; of another
-    one, all parameters move. What is to stay as it is needs no place in the state.
+    Targets are the networks in the state that no update learns. Their tensors move as those of the
+    learned network do that it is a copy of; of another one, all parameters move. What is to stay as
+    it is needs no place in the state.
     """
     idle = [part for parts in seen.idle.values() for part in parts]
     for name, (part, begun) in seen.others.items():
