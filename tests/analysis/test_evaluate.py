@@ -588,7 +588,9 @@ def test_a_process_that_is_killed_is_told_in_one_line(runs, tmp_path):
     other_environment(first, "killed:Exiting-v0")
     result = run(first, second, "--episodes", 1, "--jobs", 2, cwd=tmp_path)
     assert (result.returncode, result.stdout) == (1, "")
-    assert re.fullmatch("error: a process ended abruptly .* with fewer --jobs\n", result.stderr)
+    # Lines of glfw may stand beside it: a helper of its import minds that its process is ended
+    line = "^error: a process ended abruptly .* with fewer --jobs$"
+    assert re.search(line, result.stderr, re.MULTILINE) and "evaluate.py" not in result.stderr
 
 
 def test_runs_without_a_policy_are_told_before_any_environment_is_made(runs, monkeypatch, capsys):
