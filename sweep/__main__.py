@@ -116,7 +116,7 @@ def table(title, progresses, args):
 def show_list(args, runs, choices):
     """Print the runs to do for benchmark.sh: folder and command; on stderr how many there are.
 
-    A dry run also says what they will take; a choice says it of each of its batches.
+    A dry run also says what they will take. A choice says it of each of its batches, see begin.
     """
     done, todo = [], []
     for run, found in zip(runs, refuse_others(runs, from_caller(args, args.runs_dir)), strict=True):
@@ -127,22 +127,30 @@ def show_list(args, runs, choices):
     for run in todo:
         folder = f"{run.folder.parent}/{run.folder.name}"  # with a slash, for --runs-dir . too
         print(folder, command_line(run), sep="\t")
-    line = f"{counted(len(runs), 'run')}{with_baselines(runs)}, {len(todo):,} to do"
     if choices:
-        from sweep import telling
-
-        line = "\n".join(telling.before_a_batch(choices, args))
-    elif args.view == "dry-run" and todo:
+        if args.view == "dry-run":
+            announce(args, choices)
+        return
+    line = f"{counted(len(runs), 'run')}{with_baselines(runs)}, {len(todo):,} to do"
+    if args.view == "dry-run" and todo:
         line += "; " + cost(args, done, todo)
-    if line:
+    print(line, file=sys.stderr)
+
+
+def announce(args, choices):
+    """Say on stderr what a choice's next batch is, and what all of it will take."""
+    from sweep import telling
+
+    for line in telling.before_a_batch(choices, args):
         print(line, file=sys.stderr)
 
 
 def begin(args, runs, choices):
-    """Keep what a choice's next batch of runs fixes, just before they start."""
+    """Announce a choice's next batch of runs just before they start; keep what it fixes."""
     from sweep import choose
 
     choose.begin(args, choices)
+    announce(args, choices)
 
 
 def watch(args, runs, choices):

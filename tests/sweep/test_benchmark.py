@@ -513,6 +513,7 @@ def test_choose_submits_one_batch_after_another(slurm, tmp_path):
     executor = ["--executor", "slurm"]
     result = run(*command, "--runs-dir", tmp_path / "runs", *executor, env=slurm)
     assert result.code == 0, result.out + result.err
+    assert result.err.count("the verdict are stored in") == 2, result.err  # once a batch
     found = *chosen(tmp_path / "runs"), verdicts(result.out)
     assert found == undisturbed(tmp_path / "expected", *command) and len(found[1]) == 10
 
