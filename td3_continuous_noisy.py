@@ -445,7 +445,7 @@ class Run:
         with fail_on(OSError, f"--runs-dir {args.runs_dir}"):
             self.folder.mkdir(parents=True, exist_ok=True)
             self.lock = (self.folder / ".lock").open("a")
-        with fail_on(BlockingIOError, f"{self.folder} is in use by another process"):
+        with fail_on(BlockingIOError, f"another process trains in {self.folder}: wait for it"):
             fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
         if args.overwrite:
             self._delete(*self.FILES, *(f"{name}.tmp" for name in self.FILES))

@@ -441,7 +441,7 @@ def test_a_second_process_is_refused_while_the_first_one_lives(tmp_path):
     for overwrite in (False, True):
         second = command("SAC", tmp_path, (TRAINING_STEP, 30, die), **long, overwrite=overwrite)
         assert second.code == 2
-        assert f"{folder(tmp_path)} is in use by another process" in one_line(second.err)
+        assert f"another process trains in {folder(tmp_path)}: wait" in one_line(second.err)
     assert first.is_alive() and list(tmp_path.glob("*/checkpoint.pt"))
     first.kill()
     assert commands.ended(first).code == -signal.SIGKILL
