@@ -35,16 +35,8 @@ REWARD_CASES = {
 
 # One configuration per wrapper, and the variants.
 NOISES = [
-    "RandomNormalNoisyObservation(0.3)",
-    "RandomUniformNoisyObservation(-0.2, 0.7)",
-    "RandomUniformScaleObservation(0.5, 1.7)",
-    "RandomUniformScaleObservation(-1.0, 0.0, per_dimension=True)",
-    "RandomMixupObservation(0.3)",
-    "RandomMixupObservation(0.3, recursive=True)",
-    "RandomDropoutObservation(0.3)",
-    "RandomNormalNoisyReward(0.3)",
-    "RandomUniformNoisyReward(-0.2, 0.7)",
-    "RandomUniformScaleReward(0.5, 1.7)",
+    *OBSERVATION_CASES,
+    *REWARD_CASES,
     "RandomEarlyTermination(3, 9)",
     "RandomEarlyTermination(3, 9, truncate=True)",
     "RandomEarlyTermination(each_step=True)",
@@ -157,22 +149,6 @@ def constant_env(value=2.0, shape=(3,)):
         reset=lambda env: (np.full(shape, value), {}),
         step=lambda env, action: (np.full(shape, value), value, False, False, {}),
     )
-
-
-def episodes_env(lengths):
-    """An environment whose episodes have the given lengths (None: endless), in turn."""
-
-    def reset(env):
-        env.episode = getattr(env, "episode", -1) + 1
-        env.t = 0
-        return env.draw(), {}
-
-    def step(env, action):
-        env.t += 1
-        done = env.t == lengths[env.episode % len(lengths)]
-        return env.draw(), 1.0, done, False, {}
-
-    return GenericEnv(reset=reset, step=step)
 
 
 def build(text, env, rate):

@@ -11,7 +11,6 @@ from cases import (
     GenericEnv,
     build,
     constant_env,
-    episodes_env,
     numbered_env,
     rollout,
     same,
@@ -66,19 +65,25 @@ def test_reward_golden(text, rate):
 @pytest.mark.parametrize("truncate", [False, True])
 @pytest.mark.parametrize("rate", [0.5, 1.0])
 def test_early_termination_golden(rate, truncate):
-    natural = [4, None, 20, None, 7]  # a chosen episode may end before its drawn step
-    env = RandomEarlyTermination(episodes_env(natural), rate, 3, 9, truncate=truncate)
+    """A chosen episode may also end by itself before its drawn step, or at it."""
+
+    def step(env, action):
+        return env.draw(), 1.0, env.np_random.random() < 0.1, False, {}
+
+    bare, twin = GenericEnv(step=step), GenericEnv(step=step)
+    env = RandomEarlyTermination(twin, rate, 3, 9, truncate=truncate)
     gate, noise = streams(RandomEarlyTermination, seed=5)
     ended = 0
     for episode in range(100):
-        env.reset(seed=5 if episode == 0 else None)
+        for each in (bare, env):
+            each.reset(seed=5 if episode == 0 else None)
         drawn = noise.integers(3, 10)
         last = drawn if gate.random() < rate else math.inf
-        end = natural[episode % 5] or math.inf
         for t in range(1, 30):
+            end = bare.step(0)[2]
             _, _, terminated, truncated, info = env.step(0)
-            acted = t == last and t != end
-            assert terminated == (t == end or (acted and not truncate))
+            acted = t == last and not end
+            assert terminated == (end or (acted and not truncate))
             assert truncated == (acted and truncate)
             ended += acted
             assert info == ({"noise": ("RandomEarlyTermination",)} if acted else {})
