@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pandas as pd
 import pytest
-from sweeps import ENDING, SCALE, row, run, small_sweep, write_pairs, write_run
+from sweeps import ENDING, SCALE, row, run, write_pairs, write_run
 
 from analysis.runs import in_short, left_out, missing_runs, read_runs
 from analysis.studies import make_studies, version_notes
@@ -21,26 +21,6 @@ def status_of(entries, status):
 
 
 # --------------------------------------------------------------------------------- what is left out
-
-
-def test_damaged_unfinished_missing_and_duplicate_runs_are_listed(tmp_path, capsys):
-    root = tmp_path / "runs"
-    small_sweep(root)
-    args = {"env": "Pusher-v5", "noise": SCALE, "rate": 0.05}
-    (root / f"Hopper-v5__SAC__{SCALE}+0.05__2/eval.csv").write_text("damaged")
-    shutil.rmtree(root / f"Pusher-v5__SAC__{SCALE}+0.05__2")
-    shutil.rmtree(root / f"Pusher-v5__SAC__{SCALE}+0.05__3")
-    write_run(root, [-1, -1, -1, -1, 1e6], seed=3, finished=False, **args)
-    write_run(root, [-1, -1, -1, -1, 1e6], seed=4, folder="copy", **args)
-    tables = run(tmp_path)
-    missing = tables["missing"].set_index("status")
-    assert sorted(missing.index) == ["corrupt", "duplicate", "missing", "unfinished"]
-    assert missing.loc["missing", "seed"] == 2 and missing.loc["missing", "noise"] == SCALE
-    noisy = row(tables["summary_SAC"], environment="Pusher-v5", noise=SCALE, noise_rate="0.05")
-    assert noisy["n"] == 2  # seeds 1 and 4
-    printed = capsys.readouterr().out
-    assert "WARNING: Runs left out: 4 (" in printed and "copy" in printed
-    assert "not complete (1 unfinished, 1 missing)" in printed
 
 
 @pytest.mark.parametrize(("file", "status"), [("config.json", "corrupt"), (".lock", "unfinished")])
@@ -68,15 +48,18 @@ def test_every_run_left_out_has_its_own_reason(tmp_path):
         write_run(tmp_path, [10], seed=9, folder=name)
         (tmp_path / name / "config.json").write_text("{" * len(name))
     (tmp_path / "damaged__1/config.json").write_text("[]")
+    folder = write_run(tmp_path, [10], seed=4, noise=SCALE, rate=0.5)
+    (folder / "eval.csv").write_text("damaged")  # which run it is can be read
     table = left_out(read_runs(tmp_path))
-    assert table["status"].value_counts().to_dict() == {"unfinished": 4, "corrupt": 2, "missing": 6}
-    assert (table["reason"] != "").all() and table["run"].nunique() == 7
+    assert table["status"].value_counts().to_dict() == {"unfinished": 4, "corrupt": 3, "missing": 7}
+    assert (table["reason"] != "").all() and table["run"].nunique() == 8
     short = in_short(table)
     assert short[["status", "noise", "seeds"]].fillna("").to_numpy().tolist() == [
         ["unfinished", SCALE, "2-3, 5-6"],
+        ["corrupt", SCALE, "4"],
         ["corrupt", "", ""],
         ["corrupt", "", ""],
-        ["missing", "", "1-3, 5-6, 8"],  # the baseline
+        ["missing", "", "1-6, 8"],  # the baseline
     ]
     assert "3 more" in short["run"].iloc[0]
 
@@ -177,11 +160,16 @@ def test_an_argument_that_a_run_lacks_had_the_default_that_others_name(tmp_path)
 
 
 def test_runs_of_two_releases_are_never_pooled(tmp_path, capsys):
+    """Nor do unfinished runs and copies count."""
     for seed in (1, 2, 3):
         write_run(tmp_path / "runs", [10], seed=seed, config=NEW)
+    write_run(tmp_path / "runs", [99], seed=3, config=NEW, folder="z copy")
+    write_run(tmp_path / "runs", [99], seed=5, config=NEW, finished=False)
     write_run(tmp_path / "runs", [99], seed=4)
     assert list(status_of(read_runs(tmp_path / "runs"), "different")) == [4]
-    assert run(tmp_path)["summary_SAC"]["mean"].tolist() == [10]
+    tables = run(tmp_path)
+    assert tables["summary_SAC"][["n", "mean"]].to_numpy().tolist() == [[3, 10]]
+    assert set(tables["missing"]["status"]) == {"different", "duplicate", "unfinished"}
     assert "of release 0.3, whose numbers differ from those of 0.4" in capsys.readouterr().out
 
 
