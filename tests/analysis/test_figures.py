@@ -151,7 +151,7 @@ def test_curves_have_the_noise_units_and_n(tmp_path):
 
 
 def test_curves_have_only_what_was_run(tmp_path):
-    """No panel where a noise was not tried, and no line of the baseline that a search lacks."""
+    """No panel where a noise was not tried, and nothing of the baseline that a search lacks."""
     small_sweep(tmp_path)
     [study], _ = make_studies(read_runs(tmp_path))
     for config in study.finals:
@@ -162,25 +162,25 @@ def test_curves_have_only_what_was_run(tmp_path):
     figure = analysis.figures.noise_figure(study, SCALE)
     assert texts(figure.legends[0].get_texts()) == ["rate 0.05", "rate 0.20"]
     assert len(figure.axes) == 2
+    scaled = [config for config in study.finals if config.noise == SCALE]
+    figure = analysis.figures.parameters_figure(study, scaled)
+    assert texts(figure.legends[0].get_texts()) == [SCALE]
+    assert texts(figure.axes[0].get_xticklabels()) == ["0.05", "0.20"]
 
 
-@pytest.mark.parametrize("band", ["interval", "std"])
-def test_a_band_is_the_interval_of_the_mean_or_each_seed(band, tmp_path):
-    finals = {5: [10.0, 12, 14, 16, 18], 4: [10.0, 12, 14, 16]}
-    for seeds, values in finals.items():
-        for seed, value in enumerate(values):
-            write_run(tmp_path / str(seeds), [value, value], seed=seed)
-    for seeds, values in finals.items():
-        [study], _ = make_studies(read_runs(tmp_path / str(seeds)))
-        [ax] = analysis.figures.noise_figure(study, "", band).axes
-        if band == "interval" and seeds == 4:
-            assert not ax.collections and len(ax.lines) == 1 + seeds
-            continue
-        [shaded] = ax.collections
-        half = 2.7764 * np.std(values, ddof=1) / np.sqrt(5)  # Student's t of 4 degrees of freedom
-        half = np.std(values, ddof=1) if band == "std" else half
-        top = shaded.get_paths()[0].vertices[:, 1].max()
-        assert top == pytest.approx(np.mean(values) + half, rel=1e-4) and len(ax.lines) == 1
+@pytest.mark.parametrize(
+    ("band", "seeds", "factor"),  # of the standard deviation; Student's t of 4 degrees of freedom
+    [("interval", 5, 2.776445 / np.sqrt(5)), ("interval", 4, None), ("std", 4, 1)],
+)
+def test_a_band_is_the_interval_of_the_mean_or_each_seed(band, seeds, factor, tmp_path):
+    values = np.arange(10.0, 10 + 2 * seeds, 2)
+    for seed, value in enumerate(values):
+        write_run(tmp_path, [value, value], seed=seed)
+    [study], _ = make_studies(read_runs(tmp_path))
+    [ax] = analysis.figures.noise_figure(study, "", band).axes
+    tops = [shaded.get_paths()[0].vertices[:, 1].max() for shaded in ax.collections]
+    assert tops == pytest.approx([values.mean() + factor * values.std(ddof=1)] if factor else [])
+    assert len(ax.lines) == (1 if factor else 1 + seeds)
 
 
 def test_parameters_are_points_side_by_side(tmp_path):
@@ -198,15 +198,6 @@ def test_parameters_are_points_side_by_side(tmp_path):
     assert whisker == pytest.approx([60 - half, 60 + half], rel=1e-4)
     assert texts(ax.get_xticklabels()) == ["none", "0.05", "0.50"]
     assert texts(figure.legends[0].get_texts()) == ["no noise", SCALE, OTHER]
-
-
-def test_parameters_of_a_search_show_no_baseline(tmp_path):
-    noises = [SCALE, OTHER]
-    for noise in noises:
-        write_run(tmp_path, [10], noise=noise, rate=0.5)
-    figure = drawn_of(tmp_path)["parameters_SAC_RandomUniformScaleReward"].draw()
-    assert texts(figure.axes[0].get_xticklabels()) == ["0.50"]
-    assert texts(figure.legends[0].get_texts()) == noises
 
 
 def test_figures_of_experiments_with_similar_names_have_names_of_their_own(tmp_path):

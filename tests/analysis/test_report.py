@@ -24,18 +24,13 @@ def results(tmp_path_factory):
     return path / "results"
 
 
-def browser():
-    """Path of Chromium: without it the tests of the report skip, or fail under CI."""
-    found = shutil.which("chromium") or shutil.which("google-chrome")
-    if not found and os.environ.get("CI"):
-        pytest.fail("chromium is missing, and CI must have it")
-    if not found:
-        pytest.skip("chromium is not installed")
-    return found
-
-
 def in_browser(page, script, width, tmp_path):
     """Open `page` in a frame of this width and return what `script` returns there."""
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if not browser and os.environ.get("CI"):
+        pytest.fail("chromium is missing, and CI must have it")
+    if not browser:
+        pytest.skip("chromium is not installed")
     # In a frame, because a headless window is never narrower than 500 pixels.
     frame = f'style="width: {width}px; height: 800px; border: 0"'
     wrapper = f"""<!DOCTYPE html><meta charset="utf-8"><pre id="answer"></pre><script>
@@ -50,7 +45,7 @@ def in_browser(page, script, width, tmp_path):
         --disable-background-networking --disable-component-update --disable-sync --dump-dom
         --virtual-time-budget=10000 --window-size=1400,900"""
     with tempfile.TemporaryDirectory() as profile:
-        command = [browser(), *flags.split(), f"--user-data-dir={profile}", copy.as_uri()]
+        command = [browser, *flags.split(), f"--user-data-dir={profile}", copy.as_uri()]
         dom = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
     return json.loads(unescape(re.search(r'<pre id="answer">(.*?)</pre>', dom, re.DOTALL)[1]))
 

@@ -316,7 +316,7 @@ def test_heatmap_of_a_matrix(tmp_path):
         assert ax.images[0].get_clim() == (-4, 40)
 
 
-def test_a_harmless_noise_is_a_test_condition(tmp_path):
+def test_a_harmless_noise_is_a_test_condition():
     """Where all episodes end alike it looks like the clean test, and is none."""
     harmless = Configuration.read([PUSH], [1.0])
     assert not is_clean(harmless) and is_clean(Configuration())

@@ -165,22 +165,17 @@ def test_statistics(sweep):
     assert both["p"] == pytest.approx(2 / 70**2) == both["smallest_p"]
 
 
-@pytest.fixture(scope="module")
-def sparse(tmp_path_factory):
-    """Three environments: returns without noise of 100, of exactly 0, and of nearly 0."""
-    path = tmp_path_factory.mktemp("sparse")
+def test_an_environment_whose_baseline_is_nearly_zero_is_in_every_table(tmp_path):
+    """Returns without noise of 100, of exactly 0, and of nearly 0."""
     finals = {"Hopper-v5": (100, 120, 90), "Maze-v0": (0, 0, -1), "Car-v0": (-1e-5, 92, -20)}
     for env, (baseline, better, worse) in finals.items():
         for seed in range(1, 6):
             spread = {"Hopper-v5": seed, "Maze-v0": 0, "Car-v0": 1e-6 * seed}[env]
             config = {"env": env, "seed": seed}
-            write_run(path / "runs", [baseline + spread], **config)
-            write_run(path / "runs", [better + seed / 10], noise=SCALE, rate=0.1, **config)
-            write_run(path / "runs", [worse - seed / 10], noise=ENDING, rate=0.1, **config)
-    return run(path) | {"note": (path / "results/best.md").read_text()}
-
-
-def test_an_environment_whose_baseline_is_nearly_zero_is_in_every_table(sparse):
+            write_run(tmp_path / "runs", [baseline + spread], **config)
+            write_run(tmp_path / "runs", [better + seed / 10], noise=SCALE, rate=0.1, **config)
+            write_run(tmp_path / "runs", [worse - seed / 10], noise=ENDING, rate=0.1, **config)
+    sparse = run(tmp_path)
     best = sparse["best"].set_index("environment")
     assert set(best["noise"]) == {SCALE} and best["p_luck"].notna().all()
     told = best["difference_percent"].notna().to_dict()
@@ -195,7 +190,8 @@ def test_an_environment_whose_baseline_is_nearly_zero_is_in_every_table(sparse):
     zero = row(sparse["statistics"], environment="Maze-v0", noise=ENDING)
     assert zero["verdict"] == "worse" and zero["difference"] == pytest.approx(-1.3)
     assert np.isnan(zero["iqm_change_percent"]) and zero["probability_of_improvement"] == 0
-    assert "No percentage, or not for every noise, on Car-v0 and Maze-v0: " in sparse["note"]
+    note = (tmp_path / "results/best.md").read_text()
+    assert "No percentage, or not for every noise, on Car-v0 and Maze-v0: " in note
 
 
 @pytest.mark.parametrize("same", [0.0, -7.3])
