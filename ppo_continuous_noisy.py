@@ -100,7 +100,7 @@ class Args:
 
 
 def make_env(env_id, **kwargs):
-    """Make the environment, with vectors as observations and actions; train() adds the noise."""
+    """Make the environment, with vectors as observations and actions; noise comes on top."""
     env = gym.make(env_id, disable_env_checker=True, **kwargs)
     return noisy.make_flat(env, STEP_LIMIT)
 
@@ -177,7 +177,8 @@ class RewardScaler(Normalizer):
         """Take a reward into account; return it in standard deviations, at most 10 of them."""
         self.discounted_return = self.discounted_return * gamma * (1 - terminated) + reward
         self.update(self.discounted_return)
-        return max(-10.0, min(10.0, reward / math.sqrt(self.var + 1e-8)))
+        scaled = reward / math.sqrt(self.var + 1e-8)
+        return max(min(scaled, 10.0), -10.0)  # in this order NaN stays NaN
 
 
 class Rollout(Saved):
@@ -194,7 +195,7 @@ def compute_gae(rewards, values, dones, args):
 
     delta_t = r_t + gamma (1 - done_t) V_(t+1) - V_t. Rewards and dones (T,), values (T + 1,).
     """
-    rewards, values, dones = (x.tolist() for x in (rewards, values, dones))
+    rewards, values, dones = (x.tolist() for x in (rewards, values, dones))  # faster than arrays
     advantages, advantage = [0.0] * len(rewards), 0.0
     for t in reversed(range(len(rewards))):
         discount = args.gamma * (1 - dones[t])
@@ -246,7 +247,7 @@ def learn(args, env, test_env, stop):
     rng = np.random.default_rng(args.seed)
     env.action_space.seed(args.seed)  # an environment may draw from it
     observation, _ = env.reset(seed=args.seed)
-    total_steps = args.total_timesteps // args.num_steps * args.num_steps
+    total_steps = args.total_timesteps // args.num_steps * args.num_steps  # of whole rollouts
     rollout = Rollout(args.num_steps, env)
     observation_stats, reward_scaler = Normalizer(observation.shape), RewardScaler()
     agent = Agent(env).to(device)
@@ -260,7 +261,7 @@ def learn(args, env, test_env, stop):
     state |= {"observation_stats": observation_stats, "reward_scaler": reward_scaler}
     start = run.resume(state | {"env": noisy.EnvState(env, rng)})
     if start > 0:  # the checkpoint was written between two episodes
-        noisy.set_progress(env, start / total_steps)
+        noisy.set_progress(env, start / total_steps)  # for rates that change
         observation, _ = env.reset()
 
     act, std = agent.acting()
@@ -322,12 +323,11 @@ def learn(args, env, test_env, stop):
             run.log(global_step, charts=charts, losses=curves, noise=noisy.noise_statistics(env))
 
             # TEST: if one fell due during the rollout; eval.csv has the step at which it fell due
-            due = global_step - global_step % max(1, args.eval_frequency)
-            is_due = args.eval_frequency > 0 and due > global_step - args.num_steps
-            if is_last or is_due:
+            steps_late = global_step % args.eval_frequency if args.eval_frequency > 0 else math.inf
+            if is_last or steps_late < args.num_steps:
                 policy = make_policy(agent, observation_stats, env)
                 results = noisy.play(test_env, policy, args.eval_episodes, TEST_SEED)
-                due = args.total_timesteps if is_last else due  # whole rollouts may end before it
+                due = args.total_timesteps if is_last else global_step - steps_late
                 saved = {"agent": agent.state_dict()}
                 saved["observation_stats"] = observation_stats.state_dict()
                 run.log_test(global_step, results, saved, due)
@@ -335,7 +335,7 @@ def learn(args, env, test_env, stop):
         # NEXT EPISODE
         if terminated or truncated:
             run.log_episode(global_step, info)
-            if is_last:
+            if is_last:  # no checkpoint: nothing is left to resume
                 break
             stopping = stop()
             if stopping or global_step - run.saved_step >= args.checkpoint_frequency:
@@ -352,6 +352,7 @@ def learn(args, env, test_env, stop):
 
 def check_acting(log_probs, rollout, std):
     """Exit if the policy that acted, in NumPy, is not the one of forward(), in PyTorch."""
+    # the density of the normal, where (x - mean) / std is eps
     expected = (-0.5 * rollout.eps**2 - np.log(std) - 0.5 * math.log(2 * math.pi)).sum(1)
     rounding = 1e-3 * (1 + np.abs(rollout.actions / std).sum(1))
     if (np.abs(log_probs.cpu().numpy() - expected) > rounding).any():
@@ -359,13 +360,13 @@ def check_acting(log_probs, rollout, std):
 
 
 def make_policy(agent, observation_stats, env):
-    """Return the test policy, NumPy to NumPy: mean actions, frozen observation statistics."""
+    """Return the test policy, NumPy to NumPy: mean actions; it leaves observation_stats as is."""
     act, normalize = in_numpy(agent.actor_mean), observation_stats.normalize
     return lambda observation: noisy.into_space(act(normalize(observation)), env.action_space)
 
 
 def load_policy(run_dir, env=None):
-    """Return the policy of a run's last test; version 0.3 saved no spaces, so it needs `env`."""
+    """Return the policy of a run's last test; only runs of 0.3, without spaces, need `env`."""
     config = json.loads(Path(run_dir, "config.json").read_text())
     env = env or noisy.Spaces(config)
     agent, observation_stats = Agent(env), Normalizer(env.observation_space.shape)
@@ -383,14 +384,14 @@ def updater(loss, network, optimizer, args):
     Numbers among the inputs may change from one update to the next. The optimizer may be any whose
     step() needs no closure. Loss and gradient in one compiled graph are faster than backward().
     """
-    # functional_call takes a module, whose parameters it replaces: its forward() is the loss
-    learned = nn.ModuleList([network])
-    learned.forward = functools.partial(loss, network)
-    parameters = {name: p for name, p in learned.named_parameters() if p.requires_grad}
+    # functional_call calls a module with other parameters: one whose forward() is the loss
+    module = nn.ModuleList([network])
+    module.forward = functools.partial(loss, network)
+    parameters = dict(module.named_parameters())
 
-    def clipped_gradient(parameters, inputs):
-        call = functools.partial(functional_call, learned)
-        gradient, (_, curves) = grad_and_value(call, has_aux=True)(parameters, inputs)
+    def clipped_gradient(learned, inputs):
+        call = functools.partial(functional_call, module)
+        gradient, (_, curves) = grad_and_value(call, has_aux=True)(learned, inputs)
         norm = torch.stack([value.norm() for value in gradient.values()]).norm()
         scale = (args.max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
         return {name: value * scale for name, value in gradient.items()}, curves
@@ -398,13 +399,14 @@ def updater(loss, network, optimizer, args):
     gradient_of = compiled(clipped_gradient) if args.compile else clipped_gradient
 
     def update(*inputs):
+        learned = {name: p for name, p in parameters.items() if p.requires_grad}  # not frozen
         # a compiled graph takes a Python number as a constant, and is compiled again for another
-        numbers = (int, float, np.float32, np.float64, np.int32, np.int64)  # but no bool: a switch
+        numbers = (int, float, np.float32, np.float64, np.int32, np.int64)  # a bool may be a switch
         inputs = [torch.tensor(float(x)) if type(x) in numbers else x for x in inputs]
-        gradient, curves = gradient_of(parameters, tuple(inputs))
+        gradient, curves = gradient_of(learned, tuple(inputs))
         for name, parameter in parameters.items():
             # the fused Adam of PyTorch 2.13 silently misreads gradients that are not contiguous
-            parameter.grad = gradient[name].contiguous()
+            parameter.grad = gradient[name].contiguous() if name in learned else None
         optimizer.step()
         return curves
 
@@ -438,7 +440,7 @@ def in_numpy(network):
     return call
 
 
-# THE RUN: environments, folder, signals. Three scripts have the same text; you may change one.
+# THE RUN: environments, folder, signals. The same text in three scripts; you may change yours.
 
 
 def fail(message, code=2):
@@ -461,7 +463,7 @@ def say(text):
     """Print a line; training goes on if nobody reads it any more, as in `... | head`."""
     try:
         print(text, flush=True)
-    except OSError:
+    except OSError:  # from here on, print to nowhere
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
@@ -522,13 +524,13 @@ class Run:
         """Open the folder; exit if another process uses it, or if it holds a different run."""
         self.args, self.env = args, env
         self.folder = noisy.run_folder(asdict(args))
-        if self.folder.is_symlink():
+        if self.folder.is_symlink():  # --overwrite would delete what is elsewhere
             fail(f"{self.folder} is a link: remove it, or choose another --exp-name or --runs-dir")
         with fail_on(OSError, f"--runs-dir {args.runs_dir}"):
             self.folder.mkdir(parents=True, exist_ok=True)
             self.lock = (self.folder / ".lock").open("a")
         with fail_on(BlockingIOError, f"another process trains in {self.folder}: wait for it"):
-            fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
+            fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # as long as it is open
         if args.overwrite:
             self._delete(*self.FILES, *(f"{name}.tmp" for name in self.FILES))
         new = noisy.describe_run(__file__, asdict(args), asdict(Args()), env)
@@ -545,7 +547,7 @@ class Run:
         say(f"{self.folder} is finished" if self.is_finished else f"{begun}: {self.folder}")
 
     def resume(self, state):
-        """Restore the last checkpoint of {name: part with state_dict()}; return its step, or 0."""
+        """Restore {name: part with state_dict()} from a checkpoint; return its step, or 0."""
         self.state, self.eval_csv = state, "step,episode,episodic_return,episodic_length,success\n"
         step, processor_seconds = 0, 0.0
         path = self.folder / "checkpoint.pt"
@@ -565,8 +567,8 @@ class Run:
         else:
             self._delete("events.out.tfevents.*")  # of a process killed before its first checkpoint
             for name, part in state.items():  # fail now, and not when the run is resumed
-                needed = f"{name!r} needs a state_dict() of tensors, arrays, numbers"
-                with fail_on(Exception, needed):
+                message = f"{name!r} needs a state_dict() of tensors, arrays, numbers"
+                with fail_on(Exception, message):
                     file = io.BytesIO()
                     torch.save(part.state_dict(), file)
                     read_state(io.BytesIO(file.getvalue()))
@@ -578,8 +580,8 @@ class Run:
             self._log_hyperparameters()
         total = self.args.total_timesteps
         self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None, smoothing=0)
-        self.saved_step, self.last_test = step, ""
-        self.first_step, self.begun, self.printed = step, time.monotonic(), -math.inf
+        self.first_step = self.saved_step = step
+        self.last_test, self.begun, self.printed = "", time.monotonic(), -math.inf
         self.processor_begun = time.process_time() - processor_seconds
         return step
 
@@ -695,7 +697,7 @@ def read_state(file):
 
 
 def stop_at_signals():
-    """Answer signals at the end of an episode: return stop() -> the first one's number, or 0."""
+    """Keep signals until an episode ends: return stop() -> the number of the first, or 0."""
     received, script_pid = [], os.getpid()
 
     def remember(number, frame):

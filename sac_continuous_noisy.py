@@ -77,12 +77,12 @@ class Args:
     cuda: bool = False
     torch_threads: int = 1  # CPU threads; runs in parallel gain more than extra threads
     compile: bool = True  # compile the updates, if there is a C++ compiler
-    # precision of float32 products, raised to highest where another would cost accuracy; with bf16
-    # the updates are computed in bfloat16, even if this costs accuracy
+    # precision of float32 products. medium: faster on some processors, and used only where it costs
+    # no accuracy; bf16: updates in bfloat16, much faster where the processor has it, less accurate
     matmul_precision: Literal["highest", "medium", "bf16"] = "medium"
 
     # ALGORITHM
-    # - rows of the replay buffer: steps, and one per episode
+    # - steps in the replay buffer; the end of each episode takes the room of one
     buffer_size: int = 1_000_000
     gamma: float = 0.99  # discount factor
     tau: float = 0.005  # target smoothing coefficient
@@ -97,7 +97,7 @@ class Args:
 
 
 def make_env(env_id, **kwargs):
-    """Make the environment, with vectors as observations and actions; train() adds the noise."""
+    """Make the environment, with vectors as observations and actions; noise comes on top."""
     env = gym.make(env_id, disable_env_checker=True, **kwargs)
     return noisy.make_flat(env, STEP_LIMIT)
 
@@ -123,7 +123,7 @@ class Critic(nn.Module):
 
 
 class Actor(nn.Module):
-    """A Gaussian policy, squashed to the action bounds; the standard normal `eps` is an input."""
+    """A Gaussian policy, squashed to the action bounds; learn() draws its standard normal `eps`."""
 
     def __init__(self, env):
         super().__init__()
@@ -134,7 +134,7 @@ class Actor(nn.Module):
         self.register_buffer("action_bias", (high + low) / 2)
 
     def forward(self, observations, eps):
-        """Return actions (B, A), the same in (-1, 1), and the log of the standard deviation."""
+        """Return actions (B, A), the same before scaling, in (-1, 1), and the log of the std."""
         mean, log_std = self.network(observations).chunk(2, dim=-1)
         # a smooth clamp, from SpinUp / Denis Yarats
         log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (torch.tanh(log_std) + 1)
@@ -144,6 +144,7 @@ class Actor(nn.Module):
     def sample(self, observations, eps):
         """Return actions (B, A) and their log-probabilities (B,)."""
         actions, squashed, log_std = self(observations, eps)
+        # the density of the normal, where (x - mean) / std is eps, then of tanh and the scaling
         log_prob = -0.5 * eps.square() - log_std - 0.5 * math.log(2 * math.pi)
         log_prob = log_prob - torch.log(self.action_scale * (1 - squashed.square()) + 1e-6)
         return actions, log_prob.sum(1)
@@ -158,7 +159,7 @@ class Actor(nn.Module):
 
 
 class ReplayBuffer:
-    """The latest steps; the next observation of row i is the observation of row i + 1.
+    """The latest steps, in a ring; the next observation of row i is the observation of row i + 1.
 
     The final observation of an episode has a row, too: it is no step, so it is never drawn.
     """
@@ -169,7 +170,7 @@ class ReplayBuffer:
         self.rows, self.position, self.size = rows, 0, 0
         self.observations = np.zeros((rows, *env.observation_space.shape), np.float32)
         self.actions = np.zeros((rows, *env.action_space.shape), np.float32)
-        self.rewards, self.terminated = np.zeros((2, rows), np.float32)
+        self.rewards, self.terminated = np.zeros(rows, np.float32), np.zeros(rows, np.float32)
         self.is_step = np.zeros(rows, bool)
 
     def add(self, observation, action, reward, next_observation, terminated, truncated):
@@ -178,20 +179,20 @@ class ReplayBuffer:
         self.observations[row], self.observations[next_row] = observation, next_observation
         self.actions[row], self.rewards[row], self.terminated[row] = action, reward, terminated
         self.is_step[row], self.is_step[next_row] = True, False
-        self.position = (next_row + (terminated or truncated)) % self.rows
+        self.position = (next_row + int(terminated or truncated)) % self.rows
         self.size = max(self.size, row + 1, next_row + 1)
 
     def sample(self, batch_size, rng):
         """Draw (s, a, r, s', terminated) uniformly: float32 tensors with batch_size rows."""
         rows = rng.integers(self.size, size=batch_size)
-        while not self.is_step[rows].all():  # draw the others again
+        while not self.is_step[rows].all():  # draw the other rows again
             rows = np.where(self.is_step[rows], rows, rng.integers(self.size, size=batch_size))
         batch = [self.observations[rows], self.actions[rows], self.rewards[rows]]
         batch += [self.observations[(rows + 1) % self.rows], self.terminated[rows]]
         return [torch.from_numpy(array) for array in batch]
 
     def state_dict(self):
-        """Return the filled rows, as tensors that share the buffer's memory."""
+        """Return the filled rows, as tensors: torch.save() writes these without copying them."""
         state = {name: torch.from_numpy(getattr(self, name)[: self.size]) for name in self.ARRAYS}
         return state | {"position": self.position, "size": self.size}
 
@@ -260,7 +261,7 @@ def learn(args, env, test_env, stop):
     actor, critic, target = Actor(env).to(device), Critic(env).to(device), Critic(env).to(device)
     target.load_state_dict(critic.state_dict())
     alpha = torch.tensor(1.0 if args.autotune else args.alpha)
-    temperature = nn.ParameterDict({"log_alpha": alpha.log()}).to(device)
+    temperature = nn.ParameterDict({"log_alpha": alpha.log()}).to(device)  # for updater()
     target_entropy = -float(env.action_space.shape[0])
     q_optimizer = torch.optim.Adam(critic.parameters(), lr=args.q_lr, fused=True)
     actor_optimizer = torch.optim.Adam(actor.parameters(), lr=args.policy_lr, fused=True)
@@ -275,10 +276,10 @@ def learn(args, env, test_env, stop):
     # the CPU, because the generator of a GPU is not saved.
     state = {"actor": actor, "critic": critic, "target": target, "temperature": temperature}
     state |= {"actor_optimizer": actor_optimizer, "q_optimizer": q_optimizer}
-    state |= {"alpha_optimizer": alpha_optimizer, "buffer": buffer}
-    start = run.resume(state | {"env": noisy.EnvState(env, rng)})
+    state |= {"alpha_optimizer": alpha_optimizer, "buffer": buffer, "env": noisy.EnvState(env, rng)}
+    start = run.resume(state)
     if start > 0:  # the checkpoint was written between two episodes
-        noisy.set_progress(env, start / args.total_timesteps)
+        noisy.set_progress(env, start / args.total_timesteps)  # for rates that change
         observation, _ = env.reset()
 
     for global_step in range(start + 1, args.total_timesteps + 1):
@@ -304,7 +305,7 @@ def learn(args, env, test_env, stop):
             eps = torch.randn(actions.shape).to(device)
             curves = update_critic(target, actor, temperature, batch, eps, args.gamma)
 
-            # LEARN: actor and temperature, for all steps since the last time
+            # LEARN: actor and temperature, N updates every N steps
             if global_step % args.policy_frequency == 0:
                 for _ in range(args.policy_frequency):
                     eps = torch.randn(actions.shape).to(device)
@@ -329,7 +330,7 @@ def learn(args, env, test_env, stop):
         # NEXT EPISODE
         if terminated or truncated:
             run.log_episode(global_step, info)
-            if is_last:
+            if is_last:  # no checkpoint: nothing is left to resume
                 break
             stopping = stop()
             if stopping or global_step - run.saved_step >= args.checkpoint_frequency:
@@ -344,7 +345,7 @@ def learn(args, env, test_env, stop):
 
 
 def load_policy(run_dir, env=None):
-    """Return the policy of a run's last test; version 0.3 saved no spaces, so it needs `env`."""
+    """Return the policy of a run's last test; only runs of 0.3, without spaces, need `env`."""
     config = json.loads(Path(run_dir, "config.json").read_text())
     actor = Actor(env or noisy.Spaces(config))
     saved = read_state(Path(run_dir, "policy.pt"))
@@ -358,23 +359,25 @@ def updater(loss, network, optimizer, args):
     Numbers among the inputs may change from one update to the next. The optimizer may be any whose
     step() needs no closure. Loss and gradient in one compiled graph are faster than backward().
     """
-    # functional_call takes a module, whose parameters it replaces: its forward() is the loss
-    learned, device = nn.ModuleList([network]), next(network.parameters()).device
-    learned.forward = functools.partial(loss, network)
-    parameters = {name: p for name, p in learned.named_parameters() if p.requires_grad}
-    gradient_of = grad_and_value(functools.partial(functional_call, learned), has_aux=True)
+    # functional_call calls a module with other parameters: one whose forward() is the loss
+    module = nn.ModuleList([network])
+    module.forward = functools.partial(loss, network)
+    parameters = dict(module.named_parameters())
+    gradient_of = grad_and_value(functools.partial(functional_call, module), has_aux=True)
     gradient_of = compiled(gradient_of) if args.compile else gradient_of
-    bf16 = torch.autocast(device.type, torch.bfloat16, enabled=args.matmul_precision == "bf16")
+    device = next(network.parameters()).device
+    precision = torch.autocast(device.type, torch.bfloat16, enabled=args.matmul_precision == "bf16")
 
     def update(*inputs):
+        learned = {name: p for name, p in parameters.items() if p.requires_grad}  # not frozen
         # a compiled graph takes a Python number as a constant, and is compiled again for another
-        numbers = (int, float, np.float32, np.float64, np.int32, np.int64)  # but no bool: a switch
+        numbers = (int, float, np.float32, np.float64, np.int32, np.int64)  # a bool may be a switch
         inputs = [torch.tensor(float(x)) if type(x) in numbers else x for x in inputs]
-        with bf16:
-            gradient, (_, curves) = gradient_of(parameters, tuple(inputs))
+        with precision:
+            gradient, (_, curves) = gradient_of(learned, tuple(inputs))
         for name, parameter in parameters.items():
             # the fused Adam of PyTorch 2.13 silently misreads gradients that are not contiguous
-            parameter.grad = gradient[name].contiguous()
+            parameter.grad = gradient[name].contiguous() if name in learned else None
         # Adam's momentum of dead units decays to 1e-45, and Intel's processors are slow with that
         torch.set_flush_denormal(True)
         optimizer.step()
@@ -384,7 +387,7 @@ def updater(loss, network, optimizer, args):
     return update
 
 
-# THE RUN: environments, folder, signals. Three scripts have the same text; you may change one.
+# THE RUN: environments, folder, signals. The same text in three scripts; you may change yours.
 
 
 def fail(message, code=2):
@@ -407,7 +410,7 @@ def say(text):
     """Print a line; training goes on if nobody reads it any more, as in `... | head`."""
     try:
         print(text, flush=True)
-    except OSError:
+    except OSError:  # from here on, print to nowhere
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
@@ -468,13 +471,13 @@ class Run:
         """Open the folder; exit if another process uses it, or if it holds a different run."""
         self.args, self.env = args, env
         self.folder = noisy.run_folder(asdict(args))
-        if self.folder.is_symlink():
+        if self.folder.is_symlink():  # --overwrite would delete what is elsewhere
             fail(f"{self.folder} is a link: remove it, or choose another --exp-name or --runs-dir")
         with fail_on(OSError, f"--runs-dir {args.runs_dir}"):
             self.folder.mkdir(parents=True, exist_ok=True)
             self.lock = (self.folder / ".lock").open("a")
         with fail_on(BlockingIOError, f"another process trains in {self.folder}: wait for it"):
-            fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
+            fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # as long as it is open
         if args.overwrite:
             self._delete(*self.FILES, *(f"{name}.tmp" for name in self.FILES))
         new = noisy.describe_run(__file__, asdict(args), asdict(Args()), env)
@@ -491,7 +494,7 @@ class Run:
         say(f"{self.folder} is finished" if self.is_finished else f"{begun}: {self.folder}")
 
     def resume(self, state):
-        """Restore the last checkpoint of {name: part with state_dict()}; return its step, or 0."""
+        """Restore {name: part with state_dict()} from a checkpoint; return its step, or 0."""
         self.state, self.eval_csv = state, "step,episode,episodic_return,episodic_length,success\n"
         step, processor_seconds = 0, 0.0
         path = self.folder / "checkpoint.pt"
@@ -511,8 +514,8 @@ class Run:
         else:
             self._delete("events.out.tfevents.*")  # of a process killed before its first checkpoint
             for name, part in state.items():  # fail now, and not when the run is resumed
-                needed = f"{name!r} needs a state_dict() of tensors, arrays, numbers"
-                with fail_on(Exception, needed):
+                message = f"{name!r} needs a state_dict() of tensors, arrays, numbers"
+                with fail_on(Exception, message):
                     file = io.BytesIO()
                     torch.save(part.state_dict(), file)
                     read_state(io.BytesIO(file.getvalue()))
@@ -524,8 +527,8 @@ class Run:
             self._log_hyperparameters()
         total = self.args.total_timesteps
         self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None, smoothing=0)
-        self.saved_step, self.last_test = step, ""
-        self.first_step, self.begun, self.printed = step, time.monotonic(), -math.inf
+        self.first_step = self.saved_step = step
+        self.last_test, self.begun, self.printed = "", time.monotonic(), -math.inf
         self.processor_begun = time.process_time() - processor_seconds
         return step
 
@@ -641,7 +644,7 @@ def read_state(file):
 
 
 def stop_at_signals():
-    """Answer signals at the end of an episode: return stop() -> the first one's number, or 0."""
+    """Keep signals until an episode ends: return stop() -> the number of the first, or 0."""
     received, script_pid = [], os.getpid()
 
     def remember(number, frame):

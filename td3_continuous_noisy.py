@@ -76,12 +76,12 @@ class Args:
     cuda: bool = False
     torch_threads: int = 1  # CPU threads; runs in parallel gain more than extra threads
     compile: bool = True  # compile the updates, if there is a C++ compiler
-    # precision of float32 products, raised to highest where another would cost accuracy; with bf16
-    # the updates are computed in bfloat16, even if this costs accuracy
+    # precision of float32 products. medium: faster on some processors, and used only where it costs
+    # no accuracy; bf16: updates in bfloat16, much faster where the processor has it, less accurate
     matmul_precision: Literal["highest", "medium", "bf16"] = "medium"
 
     # ALGORITHM
-    # - rows of the replay buffer: steps, and one per episode
+    # - steps in the replay buffer; the end of each episode takes the room of one
     buffer_size: int = 1_000_000
     gamma: float = 0.99  # discount factor
     tau: float = 0.005  # target smoothing coefficient
@@ -89,13 +89,13 @@ class Args:
     learning_starts: int = 25_000  # environment steps with random actions before learning starts
     learning_rate: float = 3e-4  # learning rate of the policy and of the Q-functions
     policy_frequency: int = 2  # environment steps between two updates of the policy and the targets
-    exploration_noise: float = 0.1  # std of the noise on training actions; 1: half of their range
-    policy_noise: float = 0.2  # std of the noise on the target's actions; 1: half of their range
-    noise_clip: float = 0.5  # largest noise on the target's actions; 1: half of their range
+    exploration_noise: float = 0.1  # std of the noise on training actions, in half action ranges
+    policy_noise: float = 0.2  # std of the noise on the target's actions, in half action ranges
+    noise_clip: float = 0.5  # largest noise on the target's actions, in half action ranges
 
 
 def make_env(env_id, **kwargs):
-    """Make the environment, with vectors as observations and actions; train() adds the noise."""
+    """Make the environment, with vectors as observations and actions; noise comes on top."""
     env = gym.make(env_id, disable_env_checker=True, **kwargs)
     return noisy.make_flat(env, STEP_LIMIT)
 
@@ -134,21 +134,21 @@ class Actor(nn.Module):
         self.register_buffer("action_bias", (high + low) / 2)
 
     def forward(self, observations, eps=0.0):
-        """Return actions (B, A), moved by eps (B, A) half ranges, within the bounds."""
+        """Return actions (B, A), within the bounds; eps (B, A) is added before the scaling."""
         actions = torch.tanh(self.network(observations)) + eps
         actions = actions * self.action_scale + self.action_bias
         return torch.clamp(actions, self.low, self.high)
 
     @torch.no_grad()
     def policy(self, observation, eps=0.0):
-        """Return the action for one observation, NumPy to NumPy."""
+        """Return the action for one observation, NumPy to NumPy; eps as in forward()."""
         device = self.action_scale.device
         observations = torch.as_tensor(observation, dtype=torch.float32, device=device)[None]
         return noisy.into_space(self(observations, eps)[0].cpu().numpy(), self.action_space)
 
 
 class ReplayBuffer:
-    """The latest steps; the next observation of row i is the observation of row i + 1.
+    """The latest steps, in a ring; the next observation of row i is the observation of row i + 1.
 
     The final observation of an episode has a row, too: it is no step, so it is never drawn.
     """
@@ -159,7 +159,7 @@ class ReplayBuffer:
         self.rows, self.position, self.size = rows, 0, 0
         self.observations = np.zeros((rows, *env.observation_space.shape), np.float32)
         self.actions = np.zeros((rows, *env.action_space.shape), np.float32)
-        self.rewards, self.terminated = np.zeros((2, rows), np.float32)
+        self.rewards, self.terminated = np.zeros(rows, np.float32), np.zeros(rows, np.float32)
         self.is_step = np.zeros(rows, bool)
 
     def add(self, observation, action, reward, next_observation, terminated, truncated):
@@ -168,20 +168,20 @@ class ReplayBuffer:
         self.observations[row], self.observations[next_row] = observation, next_observation
         self.actions[row], self.rewards[row], self.terminated[row] = action, reward, terminated
         self.is_step[row], self.is_step[next_row] = True, False
-        self.position = (next_row + (terminated or truncated)) % self.rows
+        self.position = (next_row + int(terminated or truncated)) % self.rows
         self.size = max(self.size, row + 1, next_row + 1)
 
     def sample(self, batch_size, rng):
         """Draw (s, a, r, s', terminated) uniformly: float32 tensors with batch_size rows."""
         rows = rng.integers(self.size, size=batch_size)
-        while not self.is_step[rows].all():  # draw the others again
+        while not self.is_step[rows].all():  # draw the other rows again
             rows = np.where(self.is_step[rows], rows, rng.integers(self.size, size=batch_size))
         batch = [self.observations[rows], self.actions[rows], self.rewards[rows]]
         batch += [self.observations[(rows + 1) % self.rows], self.terminated[rows]]
         return [torch.from_numpy(array) for array in batch]
 
     def state_dict(self):
-        """Return the filled rows, as tensors that share the buffer's memory."""
+        """Return the filled rows, as tensors: torch.save() writes these without copying them."""
         state = {name: torch.from_numpy(getattr(self, name)[: self.size]) for name in self.ARRAYS}
         return state | {"position": self.position, "size": self.size}
 
@@ -250,12 +250,12 @@ def learn(args, env, test_env, stop):
     # RESUME: all that training changes belongs in `state`. What is missing there starts anew when a
     # run is resumed, without a warning: tools/check_script.py finds it. Random numbers are drawn on
     # the CPU, because the generator of a GPU is not saved.
-    state = {"actor": actor, "critic": critic, "buffer": buffer}
+    state = {"actor": actor, "critic": critic, "buffer": buffer, "env": noisy.EnvState(env, rng)}
     state |= {"target_actor": target_actor, "target_critic": target_critic}
     state |= {"q_optimizer": q_optimizer, "actor_optimizer": actor_optimizer}
-    start = run.resume(state | {"env": noisy.EnvState(env, rng)})
+    start = run.resume(state)
     if start > 0:  # the checkpoint was written between two episodes
-        noisy.set_progress(env, start / args.total_timesteps)
+        noisy.set_progress(env, start / args.total_timesteps)  # for rates that change
         observation, _ = env.reset()
 
     for global_step in range(start + 1, args.total_timesteps + 1):
@@ -301,7 +301,7 @@ def learn(args, env, test_env, stop):
         # NEXT EPISODE
         if terminated or truncated:
             run.log_episode(global_step, info)
-            if is_last:
+            if is_last:  # no checkpoint: nothing is left to resume
                 break
             stopping = stop()
             if stopping or global_step - run.saved_step >= args.checkpoint_frequency:
@@ -316,7 +316,7 @@ def learn(args, env, test_env, stop):
 
 
 def load_policy(run_dir, env=None):
-    """Return the policy of a run's last test; version 0.3 saved no spaces, so it needs `env`."""
+    """Return the policy of a run's last test; only runs of 0.3, without spaces, need `env`."""
     config = json.loads(Path(run_dir, "config.json").read_text())
     actor = Actor(env or noisy.Spaces(config))
     saved = read_state(Path(run_dir, "policy.pt"))
@@ -330,23 +330,25 @@ def updater(loss, network, optimizer, args):
     Numbers among the inputs may change from one update to the next. The optimizer may be any whose
     step() needs no closure. Loss and gradient in one compiled graph are faster than backward().
     """
-    # functional_call takes a module, whose parameters it replaces: its forward() is the loss
-    learned, device = nn.ModuleList([network]), next(network.parameters()).device
-    learned.forward = functools.partial(loss, network)
-    parameters = {name: p for name, p in learned.named_parameters() if p.requires_grad}
-    gradient_of = grad_and_value(functools.partial(functional_call, learned), has_aux=True)
+    # functional_call calls a module with other parameters: one whose forward() is the loss
+    module = nn.ModuleList([network])
+    module.forward = functools.partial(loss, network)
+    parameters = dict(module.named_parameters())
+    gradient_of = grad_and_value(functools.partial(functional_call, module), has_aux=True)
     gradient_of = compiled(gradient_of) if args.compile else gradient_of
-    bf16 = torch.autocast(device.type, torch.bfloat16, enabled=args.matmul_precision == "bf16")
+    device = next(network.parameters()).device
+    precision = torch.autocast(device.type, torch.bfloat16, enabled=args.matmul_precision == "bf16")
 
     def update(*inputs):
+        learned = {name: p for name, p in parameters.items() if p.requires_grad}  # not frozen
         # a compiled graph takes a Python number as a constant, and is compiled again for another
-        numbers = (int, float, np.float32, np.float64, np.int32, np.int64)  # but no bool: a switch
+        numbers = (int, float, np.float32, np.float64, np.int32, np.int64)  # a bool may be a switch
         inputs = [torch.tensor(float(x)) if type(x) in numbers else x for x in inputs]
-        with bf16:
-            gradient, (_, curves) = gradient_of(parameters, tuple(inputs))
+        with precision:
+            gradient, (_, curves) = gradient_of(learned, tuple(inputs))
         for name, parameter in parameters.items():
             # the fused Adam of PyTorch 2.13 silently misreads gradients that are not contiguous
-            parameter.grad = gradient[name].contiguous()
+            parameter.grad = gradient[name].contiguous() if name in learned else None
         # Adam's momentum of dead units decays to 1e-45, and Intel's processors are slow with that
         torch.set_flush_denormal(True)
         optimizer.step()
@@ -356,7 +358,7 @@ def updater(loss, network, optimizer, args):
     return update
 
 
-# THE RUN: environments, folder, signals. Three scripts have the same text; you may change one.
+# THE RUN: environments, folder, signals. The same text in three scripts; you may change yours.
 
 
 def fail(message, code=2):
@@ -379,7 +381,7 @@ def say(text):
     """Print a line; training goes on if nobody reads it any more, as in `... | head`."""
     try:
         print(text, flush=True)
-    except OSError:
+    except OSError:  # from here on, print to nowhere
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
@@ -440,13 +442,13 @@ class Run:
         """Open the folder; exit if another process uses it, or if it holds a different run."""
         self.args, self.env = args, env
         self.folder = noisy.run_folder(asdict(args))
-        if self.folder.is_symlink():
+        if self.folder.is_symlink():  # --overwrite would delete what is elsewhere
             fail(f"{self.folder} is a link: remove it, or choose another --exp-name or --runs-dir")
         with fail_on(OSError, f"--runs-dir {args.runs_dir}"):
             self.folder.mkdir(parents=True, exist_ok=True)
             self.lock = (self.folder / ".lock").open("a")
         with fail_on(BlockingIOError, f"another process trains in {self.folder}: wait for it"):
-            fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
+            fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # as long as it is open
         if args.overwrite:
             self._delete(*self.FILES, *(f"{name}.tmp" for name in self.FILES))
         new = noisy.describe_run(__file__, asdict(args), asdict(Args()), env)
@@ -463,7 +465,7 @@ class Run:
         say(f"{self.folder} is finished" if self.is_finished else f"{begun}: {self.folder}")
 
     def resume(self, state):
-        """Restore the last checkpoint of {name: part with state_dict()}; return its step, or 0."""
+        """Restore {name: part with state_dict()} from a checkpoint; return its step, or 0."""
         self.state, self.eval_csv = state, "step,episode,episodic_return,episodic_length,success\n"
         step, processor_seconds = 0, 0.0
         path = self.folder / "checkpoint.pt"
@@ -483,8 +485,8 @@ class Run:
         else:
             self._delete("events.out.tfevents.*")  # of a process killed before its first checkpoint
             for name, part in state.items():  # fail now, and not when the run is resumed
-                needed = f"{name!r} needs a state_dict() of tensors, arrays, numbers"
-                with fail_on(Exception, needed):
+                message = f"{name!r} needs a state_dict() of tensors, arrays, numbers"
+                with fail_on(Exception, message):
                     file = io.BytesIO()
                     torch.save(part.state_dict(), file)
                     read_state(io.BytesIO(file.getvalue()))
@@ -496,8 +498,8 @@ class Run:
             self._log_hyperparameters()
         total = self.args.total_timesteps
         self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None, smoothing=0)
-        self.saved_step, self.last_test = step, ""
-        self.first_step, self.begun, self.printed = step, time.monotonic(), -math.inf
+        self.first_step = self.saved_step = step
+        self.last_test, self.begun, self.printed = "", time.monotonic(), -math.inf
         self.processor_begun = time.process_time() - processor_seconds
         return step
 
@@ -613,7 +615,7 @@ def read_state(file):
 
 
 def stop_at_signals():
-    """Answer signals at the end of an episode: return stop() -> the first one's number, or 0."""
+    """Keep signals until an episode ends: return stop() -> the number of the first, or 0."""
     received, script_pid = [], os.getpid()
 
     def remember(number, frame):

@@ -74,7 +74,7 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
         ),
     ],
     ("trains", "td3", "next observation that does not come later"): [
-        ("(next_row + (terminated or truncated)) % self.rows", "next_row")
+        ("(next_row + int(terminated or truncated)) % self.rows", "next_row")
     ],
     ("learns", "ppo", "no gradient of critic."): [(" + args.vf_coef * value_loss, c", ", c")],
     ("learns", "td3", "critic_loss() never changes"): [

@@ -512,6 +512,19 @@ def test_each_term_of_a_loss_has_its_gradient_and_other_networks_are_constants(a
     assert all(p.grad is None for p in [*parameters(other), network[0].bias])
 
 
+@two_scripts
+def test_a_layer_may_be_frozen_and_thawed_while_it_learns(algorithm):
+    script, (network, other, x) = SCRIPTS[algorithm], two_networks()
+    optimizer = torch.optim.Adam(network.parameters())  # its momentum would move a frozen layer
+    update = script.updater(loss_of_a_researcher, network, optimizer, script.Args(compile=False))
+    for frozen in (False, True, False):
+        network[0].requires_grad_(not frozen)
+        before = copy.deepcopy(network.state_dict())
+        update(other, x, 0.3)
+        moved = [name for name, p in network.state_dict().items() if not p.equal(before[name])]
+        assert moved == [*before][2 * frozen :]
+
+
 @pytest.fixture
 def graphs(monkeypatch):
     """Let torch.compile make graphs that are not translated, so without a compiler; list them."""
@@ -668,6 +681,7 @@ def test_normalized_numbers_are_clipped():
     """Otherwise they are Gymnasium's: test_ppo_trains_as_a_plain_implementation."""
     assert ppo.Normalizer((2,)).normalize(np.array([1e6, -1e6])).tolist() == [10, -10]
     assert [ppo.RewardScaler().scale(x, False, 0.9) for x in (1e9, -1e9)] == [10, -10]
+    assert np.isnan(ppo.RewardScaler().scale(np.nan, False, 0.9))  # so that the run ends
 
 
 def play(lengths):
