@@ -5,7 +5,6 @@ order; they share nothing else, so equal final weights mean equal algorithms.
 """
 
 import copy
-import functools
 from dataclasses import replace
 from types import SimpleNamespace
 from unittest import mock
@@ -18,7 +17,7 @@ import torch._inductor.config
 import torch.nn as nn
 import torch.nn.functional as F
 from gymnasium import wrappers
-from small_runs import SCRIPTS, policy, refused, run, two_scripts
+from small_runs import SCRIPTS, refused, two_scripts
 from torch.distributions import Normal
 
 import noisy_wrappers as noisy
@@ -590,19 +589,6 @@ def test_what_cannot_be_compiled_is_computed_without(capsys):
     assert out.startswith("not compiled, so it is slower: ") and "/no/compiler" in out
     assert "the compiler's cache is " in out and out.count("\n") == 1
     torch.testing.assert_close(network.state_dict(), plain.state_dict(), rtol=0, atol=0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("algorithm", SCRIPTS)
-def test_updates_as_graphs_and_plain_ones_agree(algorithm, tmp_path, monkeypatch):
-    """What a C++ compiler makes of the graphs, tools/check_script.py compares: test_changing.py."""
-    traced = functools.partial(torch.compile, backend="aot_eager")
-    monkeypatch.setattr(torch, "compile", traced)
-    short = {"matmul_precision": "highest"}
-    short |= {} if algorithm == "PPO" else {"total_timesteps": 30, "learning_starts": 20}
-    plain = policy(run(algorithm, tmp_path / "plain", **short))
-    compiled = policy(run(algorithm, tmp_path / "compiled", compile=True, **short))
-    torch.testing.assert_close(compiled, plain, rtol=1e-4, atol=1e-5)
 
 
 def test_only_bf16_computes_products_in_bfloat16():
