@@ -35,7 +35,7 @@ from tensorboard.plugins.hparams import plugin_data_pb2
 import ppo_continuous_noisy as ppo
 import sac_continuous_noisy as sac
 import td3_continuous_noisy as td3
-from noisy_wrappers import NotFiniteError, __version__, signatures
+from noisy_wrappers import NotFiniteError, __version__
 
 NOISES = ("RandomNormalNoisyReward(0.5)", "RandomEarlyTermination(2, 4)")
 
@@ -131,12 +131,6 @@ def test_run_folder(tmp_path, capsys):
     assert {path: path.stat().st_mtime_ns for path in run_dir.glob("[!.]*")} == before
 
 
-def replayed(script, run_dir):
-    """Play the last test of a run again, in a clean environment -> (return, length) of each."""
-    with gym.wrappers.RecordEpisodeStatistics(gym.make("toy_envs:Tiny-v0")) as env:
-        return script.noisy.play(env, script.load_policy(run_dir), 3, 1_000_000)[:, :2]
-
-
 @each_script
 def test_the_test_environment_is_clean_and_policies_play_without_an_environment(
     algorithm, tmp_path
@@ -150,7 +144,9 @@ def test_the_test_environment_is_clean_and_policies_play_without_an_environment(
         if step != 60:
             (kept / f"policy_{step}.pt").rename(kept / "policy.pt")
         expected = [row[2:] for row in evaluations(kept) if row[0] == step]
-        np.testing.assert_allclose(replayed(script, kept), expected, rtol=1e-12)
+        with gym.wrappers.RecordEpisodeStatistics(gym.make("toy_envs:Tiny-v0")) as env:
+            results = script.noisy.play(env, script.load_policy(kept), 3, 1_000_000)
+        np.testing.assert_allclose(results[:, :2], expected, rtol=1e-12)
     plain = run(algorithm, tmp_path / "plain", **noise)
     assert (kept / "eval.csv").read_bytes() == (plain / "eval.csv").read_bytes()
     assert list(plain.glob("policy*")) == [plain / "policy.pt"]
@@ -361,43 +357,36 @@ def test_tensorboard_knows_the_hyperparameters(tmp_path):
 # COMMANDS
 
 
+MY_ENVS = """
+from toy_envs import Endless, register
+
+class Mine(Endless):
+    def reset(self, **kwargs):
+        import my_physics  # only now
+        return super().reset(**kwargs)
+
+register("Mine", Mine, None, length=20)
+"""
+
+
 @pytest.mark.slow
 def test_command_line(tmp_path):
+    """With an environment from a module in the current folder."""
+    (tmp_path / "my_envs.py").write_text(MY_ENVS)
+    (tmp_path / "my_physics.py").touch()
     noise = {"noise": NOISES, "noise_rate": (0.5, 0.25), "test_noise": NOISES[:1]}
-    args = arguments("PPO", tmp_path, **noise, test_noise_rate=(1.0,), env_kwargs=("length:7",))
-    args.env_id = "toy_envs:NoLimit-v0"
-    result = command("PPO", *flags(args))
+    noise |= {"test_noise_rate": (1.0,), "env_kwargs": ("length:7",)}
+    args = arguments("PPO", tmp_path / "runs", **noise)
+    args.env_id = "my_envs:Mine-v0"
+    result = command("PPO", *flags(args), cwd=tmp_path)
     assert (result.code, result.err) == (0, "")
-    [run_dir] = tmp_path.iterdir()
+    [run_dir] = (tmp_path / "runs").iterdir()
     first, *lines, last, finished = result.out.splitlines()
     assert first == f"training: {run_dir}"
     assert len(lines) == 3  # not a terminal: plain lines, the first at once, then of each test
     mean = read_json(run_dir / "result.json")["final_return_mean"]
     assert re.fullmatch(rf"step=60/60 sps=\d+ eval_return={mean:.2f}", last)
     assert finished.startswith(f"{run_dir} is finished after 60 steps: eval_return=")
-    again = command("PPO", *flags(args))
-    assert (again.code, again.out, again.err) == (0, f"{run_dir} is finished\n", "")
-
-
-MY_ENVS = """
-from toy_envs import Tiny, register
-
-class Mine(Tiny):
-    def reset(self, **kwargs):
-        import my_physics  # only now
-        return super().reset(**kwargs)
-
-register("Mine", Mine, 8)
-"""
-
-
-@pytest.mark.slow
-def test_a_module_beside_the_caller(tmp_path):
-    (tmp_path / "my_physics.py").touch()
-    (tmp_path / "my_envs.py").write_text(MY_ENVS)
-    args = arguments("SAC", tmp_path / "runs", env_id="my_envs:Mine-v0", eval_frequency=0)
-    result = command("SAC", *flags(args), cwd=tmp_path)
-    assert (result.code, result.err) == (0, "")
 
 
 @pytest.mark.slow
@@ -409,13 +398,6 @@ def test_training_goes_on_when_its_reader_has_left(tmp_path):
     result = commands.ended(process)
     assert (result.code, result.err) == (0, "")
     assert evaluations(next(tmp_path.iterdir()))[-1][0] == 60
-
-
-@pytest.mark.slow
-def test_help_has_examples_and_noises():
-    shown = command("SAC", "--help").out
-    assert "python sac_continuous_noisy.py --env-id HalfCheetah-v5" in shown
-    assert all(f"  {signature}\n" in shown for signature in signatures())
 
 
 # LEARNING
