@@ -122,14 +122,6 @@ class Slow(Count):
         return super().step(action)
 
 
-class Talks(Count):
-    """Its author left a print in it."""
-
-    def reset(self, **kwargs):
-        print("reset!")
-        return super().reset(**kwargs)
-
-
 class Solves(Count):
     """Tells whether it is solved: in two of five episodes, or in the fifth and sixth.
 
@@ -175,7 +167,6 @@ register("NoEnv", object, 8)
 register("BuggyConstructor", Buggy, 8, where="constructor")
 register("BuggyStep", Buggy, 8, where="step")
 register("Slow", Slow, 100)
-register("Talks", Talks, 8)
 register("IsSuccess", Solves, 8, key="is_success", kind=np.bool_)
 register("Success", Solves, 8, key="success", kind=int)
 register("SuccessOnly", Solves, 8, key="is_success", kind=np.float32, only=True)

@@ -90,7 +90,6 @@ def test_advance_by_hand():
 def test_equal_scores_are_decided_by_the_order_given():
     noises = named(5)
     state, _ = play(noises, 15, np.ones((6, SEARCH_SEEDS + CONFIRM)))
-    assert [len(done.survivors) for done in state.rounds] == [3, 2, 1]
     assert [done.survivors for done in state.rounds] == [noises[:3], noises[:2], noises[:1]]
     # The third is best in round 1, all are equal over rounds 1 and 2.
     table = np.ones((6, SEARCH_SEEDS + CONFIRM))

@@ -42,14 +42,12 @@ def short(monkeypatch, tmp_path):
 # THE QUESTION
 
 
-def test_an_environment_that_sleeps():
+def test_how_long_a_step_and_an_episode_take():
     found = ask("toy_envs:Slow-v0")
     assert 0.005 < found.step_seconds < 1  # the machine may be busy
     assert (found.episode_steps, found.observed, found.bounded) == (100, 1, True)
     assert ask("toy_envs:Slow-v0", max_episode_steps=7).episode_steps == 7
-
-
-def test_without_a_time_limit_a_test_is_as_long_as_an_episode():
+    # without a time limit, tests are as long as the episodes that were timed
     assert ask("toy_envs:NoLimit-v0").episode_steps == 20
     assert ask("toy_envs:Endless-v0").episode_steps == 10_000
 
@@ -98,13 +96,9 @@ def test_noise_on_rewards_that_take_few_values_is_left_out(tmp_path):
         assert "Reward(" in choose("Count", *words, "--noises", named).out
 
 
-def test_what_an_environment_prints_is_no_command(tmp_path):
-    shown = choose("Talks", "--runs-dir", tmp_path)
-    assert shown.code == 0 and "reset!" in shown.err and "!" not in shown.out
-
-
 @pytest.mark.slow
-def test_what_native_code_prints_is_no_command(tmp_path):
+def test_what_a_module_prints_is_no_command(tmp_path):
+    """Nor what its native code prints."""
     (tmp_path / "native_envs.py").write_text(
         "import os\n\nprint('loaded')\nos.write(1, b'pybullet build time\\n')\n"
     )
@@ -129,13 +123,6 @@ def test_the_seconds_of_a_run():
     run = planned("ppo", "toy_envs:Tiny-v0", *words)
     learning = 100_000 * (0.103e-3 + 3 * 0.2e-6)
     assert run_seconds(run, KNOWN) == pytest.approx(10 + learning + 100 + 0.3)
-
-
-def test_a_plan_says_what_it_will_decide_and_what_it_costs(tmp_path):
-    said = choose("Slow", "--runs-dir", tmp_path).err
-    assert "round 1 of 4: 14 of 14 configurations, seed 1" in said
-    assert re.search(r"at most 92 runs, .*, about [\d.]+ h of processor time left\n", said)
-    assert "25 fresh seeds confirm a true gain of 0.8 standard deviations" in said
 
 
 def test_any_dry_run_says_what_it_costs_and_finished_runs_tell_better(tmp_path):
@@ -164,9 +151,13 @@ def test_any_dry_run_says_what_it_costs_and_finished_runs_tell_better(tmp_path):
 
 
 def test_a_status_makes_no_environment(tmp_path, monkeypatch):
+    """A dry run does, and says what the choice will decide and what it costs; it keeps nothing."""
     words = ["--runs-dir", tmp_path, "--noise-rates", "1"]
     assert "of 11 configurations" in choose("Tiny", *words, view_name="status").out
-    assert "of 9 configurations" in choose("Tiny", *words).err and not list(tmp_path.iterdir())
+    said = choose("Tiny", *words).err
+    assert "of 9 configurations" in said and not list(tmp_path.iterdir())
+    assert re.search(r"at most \d+ runs, .*, about .* of processor time left\n", said)
+    assert "25 fresh seeds confirm a true gain of 0.8 standard deviations" in said
     assert choose("Tiny", *words, view_name="list").code == 0
     monkeypatch.setattr(environment, "ask", None)
     shown = choose("Tiny", *words, view_name="status").out
