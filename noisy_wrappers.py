@@ -115,6 +115,7 @@ Array = NDArray[Any]
 Rate = float | str  # a number, or "start:end"
 Scale = float | tuple[float, ...]  # one number, or one for each dimension
 Keys = tuple[str | int, ...] | None  # of a Dict observation; of a Tuple, indices
+Config = Mapping[str, Any]  # the content of a config.json, or a script's arguments by name
 EntryPath = tuple[Any, ...]  # the keys that lead to an entry of nested observations
 
 
@@ -157,8 +158,9 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def noise_rate(self) -> float:
         """The probability p of perturbing a step (or an episode), as it is now.
 
-        A number may be assigned at any time: it holds at once and for the rest of training. 0 is
-        the bare environment bit for bit, 1 perturbs every time.
+        A number may be assigned to this wrapper (see :func:`noise_wrappers`) at any time: it holds
+        at once and for the rest of training. 0 is the bare environment bit for bit, 1 perturbs
+        every time.
         """
         return self._noise_rate
 
@@ -227,7 +229,7 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return {**info, "noise": (*below, type(self).__name__)}
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the streams, the counters and the estimates, to be taken between two episodes."""
+        """Return streams, counters, rates and estimates, to be taken between two episodes."""
         state = {
             "gate": self._gate.bit_generator.state,
             "noise": self.noise.bit_generator.state,
@@ -309,7 +311,7 @@ class ObservationNoise(NoiseWrapper):
         space = env.observation_space
         entries = dict(_entries(space))
         if self.keys is not None:
-            known = [*dict.fromkeys(path[0] for path in entries if path)]
+            known = [*dict.fromkeys(path[0] for path in entries if path)]  # each key once
             if not set(self.keys) <= set(known):
                 raise ValueError(f"keys={self.keys!r}: these observations have the keys {known}")
             entries = {path: part for path, part in entries.items() if path[0] in self.keys}
@@ -443,10 +445,6 @@ class RandomUniformNoisyObservation(ObservationNoise):
     """Adds uniform noise: o + e with each e_i ~ U(low, high) (section 3.1).
 
     ``low``, ``high``: the paper's alpha and beta. e = ``noise.uniform(low, high, o.shape)``.
-
-    >>> env = RandomUniformNoisyObservation(gym.make("CartPole-v1"), 1.0, -0.1, 0.1)
-    >>> env.reset(seed=0)[0]
-    array([ 0.01826801, -0.01052575, -0.1353507 , -0.00589376], dtype=float32)
     """
 
     def __init__(
@@ -476,10 +474,6 @@ class RandomUniformScaleObservation(ObservationNoise):
 
     e is one factor for the whole observation, ``noise.uniform(low, high)``, or with
     ``per_dimension`` one for each element, ``noise.uniform(low, high, o.shape)``.
-
-    >>> env = RandomUniformScaleObservation(gym.make("CartPole-v1"), 1.0, 0.5, 1.5)
-    >>> env.reset(seed=0)[0]
-    array([ 0.01069597, -0.01797841, -0.03584748, -0.03775657], dtype=float32)
     """
 
     def __init__(
@@ -536,18 +530,15 @@ class RandomMixupObservation(ObservationNoise):
 
     def _observe(self, observation: Any, info: Info) -> tuple[Any, Info]:
         received = self._numbers(observation)  # a copy: the environment may reuse its array
-        remembered = received
         if self._previous is not None and self.acts():
             observation, info = self._perturbed(observation, received, info)
-            if self.recursive:
-                remembered = self._numbers(observation)
-        self._previous = remembered
+        self._previous = self._numbers(observation) if self.recursive else received
         return observation, info
 
     def _perturb(self, observation: Array) -> Array:
         assert self._previous is not None
         if self.factor in (0, 1):  # 0 * inf would be NaN
-            return (observation if self.factor else self._previous).copy()
+            return (observation if self.factor == 1 else self._previous).copy()
         mixture = self.factor * observation + (1 - self.factor) * self._previous
         low, high = np.minimum(observation, self._previous), np.maximum(observation, self._previous)
         return np.minimum(np.maximum(mixture, low), high)  # rounding must not leave the space
@@ -626,8 +617,8 @@ class RandomObservationDelay(ObservationNoise):
         self, env: Env, noise_rate: Rate, low: int, high: int | None = None, *, keys: Keys = None
     ):
         self.low, self.high = _whole_interval(low, high, least=0)
-        unlike = None if self.high == self.low else self.high
-        super().__init__(env, noise_rate, low=self.low, high=unlike, keys=keys)
+        written = None if self.high == self.low else self.high
+        super().__init__(env, noise_rate, low=self.low, high=written, keys=keys)
         self._delay = 0
         self._received: deque[Array] = deque()  # what is seen now, and what waits
 
@@ -679,11 +670,6 @@ class RandomNormalNoisyReward(RewardNoise):
     """Adds Gaussian noise to the reward: r + e with e ~ N(loc, scale^2) (section 3.2).
 
     ``scale``: the paper's sigma. e = ``noise.normal(loc, scale)``. noisyenv 0.1.1 takes loc first.
-
-    >>> env = RandomNormalNoisyReward(gym.make("CartPole-v1"), 1.0, 0.1)
-    >>> _ = env.reset(seed=0)
-    >>> env.step(0)[1]
-    1.1210431182607201
     """
 
     def __init__(
@@ -701,11 +687,6 @@ class RandomUniformNoisyReward(RewardNoise):
     """Adds uniform noise to the reward: r + e with e ~ U(low, high) (section 3.2).
 
     ``low``, ``high``: the paper's alpha and beta. e = ``noise.uniform(low, high)``.
-
-    >>> env = RandomUniformNoisyReward(gym.make("CartPole-v1"), 1.0, -0.1, 0.1)
-    >>> _ = env.reset(seed=0)
-    >>> env.step(0)[1]
-    0.9380732431402061
     """
 
     def __init__(
@@ -720,13 +701,7 @@ class RandomUniformNoisyReward(RewardNoise):
 
 
 class RandomUniformScaleReward(RewardNoise):
-    """Scales the reward: r * e with e ~ U(low, high), ``noise.uniform(low, high)`` (section 3.2).
-
-    >>> env = RandomUniformScaleReward(gym.make("CartPole-v1"), 1.0, 0.5, 1.5)
-    >>> _ = env.reset(seed=0)
-    >>> env.step(0)[1]
-    0.778865122592071
-    """
+    """Scales the reward: r * e with e = ``noise.uniform(low, high)`` (section 3.2)."""
 
     def __init__(self, env: Env, noise_rate: Rate, low: float, high: float):
         self.low, self.high = _interval(low, high)
@@ -761,9 +736,8 @@ class RandomNormalNoisyAction(NoiseWrapper):
         super().__init__(env, noise_rate, scale=self.scale, loc=self.loc, relative=relative)
         space = self._space = env.action_space
         if not _is_box(space, "f"):
-            raise ValueError(
-                f"RandomNormalNoisyAction needs a Box action space of floats, got {space}"
-            )
+            needed = "needs a Box action space of floats"
+            raise ValueError(f"RandomNormalNoisyAction {needed}, got {space}")
         if _flag("relative", relative) and not is_bounded(space):
             raise ValueError(f"relative=True needs bounded actions, got {space}")
         self._low, self._high = space.low.astype(np.float64), space.high.astype(np.float64)
@@ -804,8 +778,8 @@ class RandomActionDelay(NoiseWrapper):
 
     def __init__(self, env: Env, noise_rate: Rate, low: int, high: int | None = None):
         self.low, self.high = _whole_interval(low, high, least=0)
-        unlike = None if self.high == self.low else self.high
-        super().__init__(env, noise_rate, low=self.low, high=unlike)
+        written = None if self.high == self.low else self.high
+        super().__init__(env, noise_rate, low=self.low, high=written)
         self._delay = 0
         self._actions: deque[Any] = deque()  # the one that acts now, and those that wait
 
@@ -865,9 +839,9 @@ class RandomEarlyTermination(NoiseWrapper):
         elif low is not None or high is not None:
             raise ValueError(f"each_step=True excludes low and high, got low={low}, high={high}")
         self.low, self.high = low, high
-        unlike = None if high == low else high  # (50, 50) and (50) are one configuration
+        written = None if high == low else high  # (50, 50) is written (50)
         flags = {"each_step": each_step, "truncate": truncate}
-        super().__init__(env, noise_rate, low=low, high=unlike, **flags)
+        super().__init__(env, noise_rate, low=low, high=written, **flags)
         self._steps = 0
         self._last_step: int | None = None
         timers = _layers(env, gym.wrappers.TimeLimit)
@@ -984,7 +958,7 @@ class RandomDynamics(NoiseWrapper):
         base = self.env.unwrapped
         physics = getattr(getattr(base, "_env", base), "physics", None)  # of dm_control
         for model in (getattr(base, "model", None), getattr(physics, "model", None)):
-            model = getattr(model, "ptr", model)
+            model = getattr(model, "ptr", model)  # dm_control wraps it
             if mujoco and isinstance(model, mujoco.MjModel):
                 return model
         where = "as its .model or .physics.model"
@@ -1030,48 +1004,24 @@ class RandomDynamics(NoiseWrapper):
         written.clear()
 
 
-_FIELDS = (
-    "body_mass",
-    "body_inertia",
-    "geom_friction",
-    "pair_friction",
-    "jnt_stiffness",
-    "dof_damping",
-    "dof_frictionloss",
-    "dof_armature",
-    "tendon_stiffness",
-    "tendon_damping",
-    "tendon_frictionloss",
-    "actuator_gainprm",
-    "actuator_forcerange",
-    "actuator_gear",
-)
+_FIELDS: tuple[str, ...] = ("body_mass", "body_inertia", "geom_friction", "pair_friction")
+_FIELDS += ("jnt_stiffness", "dof_damping", "dof_frictionloss", "dof_armature")
+_FIELDS += ("tendon_stiffness", "tendon_damping", "tendon_frictionloss")
+_FIELDS += ("actuator_gainprm", "actuator_forcerange", "actuator_gear")
 _FRICTIONS = ("geom_friction", "pair_friction")
 _SCALED_ALONG = {"body_mass": "body_inertia", "actuator_gainprm": "actuator_biasprm"}
 # What mj_setConst derives from them, in the model and in its stat; older versions lack some.
-_DERIVED_FIELDS = (
-    "body_subtreemass",
-    "body_invweight0",
-    "dof_invweight0",
-    "dof_M0",
-    "actuator_acc0",
-    "actuator_length0",
-    "tendon_invweight0",
-    "flexedge_invweight0",
-    "cam_poscom0",
-    "light_poscom0",
-)
+_DERIVED_FIELDS: tuple[str, ...] = ("body_subtreemass", "body_invweight0", "dof_invweight0")
+_DERIVED_FIELDS += ("dof_M0", "actuator_acc0", "actuator_length0", "tendon_invweight0")
+_DERIVED_FIELDS += ("flexedge_invweight0", "cam_poscom0", "light_poscom0")
 _DERIVED_STATISTICS = ("meaninertia", "meanmass")
 # Which of an actuator's ten parameters are its strength, by its type: of the gain a fixed one, an
 # affine one, a muscle; of the bias none, an affine one (of a servo), a muscle.
-_PARAMETER = np.arange(10)
-_STRENGTH_IN_GAIN = {0: _PARAMETER < 3, 1: _PARAMETER < 3, 2: np.isin(_PARAMETER, (2, 3))}
-_STRENGTH_IN_BIAS = {0: _PARAMETER < 0, 1: np.isin(_PARAMETER, (1, 2)), 2: _STRENGTH_IN_GAIN[2]}
+_STRENGTH_IN_GAIN = {0: (0, 1, 2), 1: (0, 1, 2), 2: (2, 3)}
+_STRENGTH_IN_BIAS = {0: (), 1: (1, 2), 2: (2, 3)}
 
 
-def _scale_model(
-    model: Any, data: Any, factors: dict[str, Array]
-) -> dict[str, tuple[Array, Array]]:
+def _scale_model(model: Any, data: Any, factors: dict[str, Array]) -> dict[str, Any]:
     """Multiply the rows of a model's fields by their factors, {field: factors}.
 
     Return {name: (values before, values written)} of all that was changed. ``data`` is an MjData of
@@ -1114,13 +1064,14 @@ def _factors_of_elements(model: Any, factors: dict[str, Array]) -> dict[str, Arr
     found = {}
     for field, of_rows in factors.items():
         for name in _with_those_along([field]):
-            found[name] = (np.ones_like(getattr(model, name)).T * of_rows).T
+            ones = np.ones_like(getattr(model, name))  # a row is one number or several
+            found[name] = (ones.T * of_rows).T
     if "actuator_gainprm" in factors:  # not the shape of a muscle, nor a servo's constant force
         gain, bias = found["actuator_gainprm"], found["actuator_biasprm"]
         types = (model.actuator_gaintype.tolist(), model.actuator_biastype.tolist())
         for i, (type_of_gain, type_of_bias) in enumerate(zip(*types, strict=True)):
-            gain[i, ~_STRENGTH_IN_GAIN[type_of_gain]] = 1
-            bias[i, ~_STRENGTH_IN_BIAS[type_of_bias]] = 1
+            gain[i, np.setdiff1d(range(10), _STRENGTH_IN_GAIN[type_of_gain])] = 1
+            bias[i, np.setdiff1d(range(10), _STRENGTH_IN_BIAS[type_of_bias])] = 1
     return found
 
 
@@ -1192,13 +1143,14 @@ def parse_noise(text: str) -> Noise:
     """
     if not isinstance(text, str):
         raise _bad_noise(text, _EXPECTED)
-    return _read_noise(text)
+    module, name, _, _ = _read_call(text)
+    wrapper = _import_wrapper(module, name, text) if module else WRAPPERS.get(name)
+    return _read_noise(text, wrapper)  # of a module that was reloaded, the new class
 
 
 @functools.cache  # the runs of a large sweep have few different noises
-def _read_noise(text: str) -> Noise:
+def _read_noise(text: str, wrapper: type[NoiseWrapper] | None) -> Noise:
     module, name, args, kwargs = _read_call(text)
-    wrapper = _import_wrapper(module, name, text) if module else WRAPPERS.get(name)
     if wrapper is None:
         near = difflib.get_close_matches(name, WRAPPERS, n=1)
         advice = f" (did you mean {near[0]}?)" if near else ""
@@ -1306,7 +1258,8 @@ class Configuration:
             raise ValueError(f"give one noise rate for all noises, or one for each {counts}")
         schedules = [_schedule(rate) for rate in rates]
         parsed = [n if stored and _read_call(n)[0] else parse_noise(n) for n in noises]
-        pairs = [pair for pair in zip(parsed, schedules, strict=True) if pair[1] != (0.0, 0.0)]
+        both = zip(parsed, schedules, strict=True)
+        pairs = [(noise, rate) for noise, rate in both if rate != (0.0, 0.0)]
         if not stored:
             pairs.sort(key=lambda pair: _place(pair[0].wrapper))
         return cls(tuple(str(noise) for noise, _ in pairs), tuple(rate for _, rate in pairs))
@@ -1319,7 +1272,7 @@ class Configuration:
         schedules = []
         for rate in str(noise_rate).split(" + "):
             ends = [float(end) for end in re.split(":| to ", rate)]
-            schedules.append((ends[0], ends[-1]))
+            schedules.append((ends[0], ends[-1]))  # of a single number, twice
         return cls(tuple(split_noises(noise)), tuple(schedules))
 
     def for_tests(self) -> Self:
@@ -1380,11 +1333,9 @@ class Configuration:
         """Stack the noises on an environment, as :func:`make_noisy` says."""
         if not isinstance(env, gym.Env):
             raise TypeError(f"needs a single gymnasium.Env, not a {type(env).__name__}")
-        if isinstance(env, gym.wrappers.FlattenObservation) and not isinstance(
-            env.env.observation_space, gym.spaces.Box
-        ):
-            noisy = self.wrap(env.env, record_statistics=record_statistics)
-            return gym.wrappers.FlattenObservation(noisy)
+        flatten = gym.wrappers.FlattenObservation
+        if isinstance(env, flatten) and not isinstance(env.env.observation_space, gym.spaces.Box):
+            return flatten(self.wrap(env.env, record_statistics=record_statistics))
         pairs = [(parse_noise(noise), rate) for noise, rate in zip(*self.texts, strict=True)]
         for noise, rate in pairs:
             if noise.wrapper.kind in ("dynamics", "action"):
@@ -1392,8 +1343,7 @@ class Configuration:
         recorder = gym.wrappers.RecordEpisodeStatistics
         inside = next(layer for layer in _layers(env) if not isinstance(layer, NoiseWrapper))
         if record_statistics and not isinstance(inside, recorder):
-            drops_records = _layers(env, FiniteNumbers)
-            if _layers(env, recorder) and not drops_records:
+            if _layers(env, recorder) and not _layers(env, FiniteNumbers):  # which drops records
                 advice = "let make_noisy do, or say record_statistics=False"
                 raise ValueError(f"this environment records its returns: {advice}")
             env = recorder(env)
@@ -1418,7 +1368,7 @@ def read_test_noise(noises: Sequence[str], rates: Sequence[Rate]) -> Configurati
 
 def rate_order(noise_rate: str) -> tuple[tuple[float, float], ...]:
     """Return the key that sorts rates of tables (:attr:`Configuration.noise_rate`) as numbers."""
-    return Configuration.parse("any", noise_rate).rates
+    return Configuration.parse("any noise", noise_rate).rates
 
 
 def split_noises(text: str) -> list[str]:
@@ -1653,10 +1603,8 @@ def make_environments(
         raise SpaceError(str(error)) from error
 
 
-def is_bounded(space: gym.Space[Any]) -> bool:
+def is_bounded(space: gym.spaces.Box) -> bool:
     """Return whether all bounds of a Box are finite; the largest float32 stands for infinity."""
-    if not isinstance(space, gym.spaces.Box):
-        return False
     bounds = np.abs(np.concatenate([space.low, space.high], axis=None, dtype=np.float64))
     return bool((bounds < np.finfo(np.float32).max).all())
 
@@ -1708,17 +1656,23 @@ def canonical_env_id(env_id: str) -> str:
 def parse_env_kwargs(texts: Sequence[str]) -> dict[str, Any]:
     """Read arguments of an environment, "name:value", as a script's ``--env-kwargs`` has them.
 
-    A value is a literal of Python, or else text. ValueError if that is no name, or given twice.
+    A value is a literal of Python, or else text. ValueError if that is no name, given twice, an
+    option of the scripts, or ``false``, a text that would count as true.
     """
     found: dict[str, Any] = {}
     for text in _listed("env_kwargs", texts, '["mass:2.0"]'):
         name, colon, value = str(text).partition(":")
+        value = value.strip()
         if not colon or not name.isidentifier():
             raise ValueError(f"env_kwargs: {text!r} is not name:value, such as mass:2.0")
         if name in found:
             raise ValueError(f"env_kwargs: {name} is given twice")
+        if name == "max_episode_steps":
+            raise ValueError("env_kwargs: max_episode_steps is an option: --max-episode-steps")
+        if value.capitalize() in ("True", "False", "None") and value != value.capitalize():
+            raise ValueError(f"env_kwargs: {text!r}: write True, False or None, or quote a text")
         try:
-            found[name] = ast.literal_eval(value.strip())
+            found[name] = ast.literal_eval(value)
         except (MemoryError, RecursionError, SyntaxError, TypeError, ValueError):
             found[name] = value
     return found
@@ -1757,10 +1711,11 @@ class EnvState:
     """What an environment carries from one episode to the next, to resume training.
 
     These are the random generators that the environment, its wrappers and their spaces have as
-    attributes, with the number of children that they spawned; the streams, counters and estimates
-    of its noise wrappers; the returns that RecordEpisodeStatistics remembers; the global generators
-    of ``random`` and NumPy; and further ``generators``. An environment that carries anything else,
-    or holds a generator elsewhere, does not resume exactly. Reset it with a seed before.
+    attributes, with the number of children that they spawned; the streams, counters, rates and
+    estimates of its noise wrappers; the returns that RecordEpisodeStatistics remembers; the global
+    generators of ``random`` and NumPy; and further ``generators``. An environment that carries
+    anything else, or holds a generator elsewhere, does not resume exactly. Reset it with a seed
+    before.
     """
 
     def __init__(self, env: Env, *generators: np.random.Generator):
@@ -1809,7 +1764,10 @@ def seed_globals(seed: int) -> None:
 
 @contextlib.contextmanager
 def kept_generators(env: Env | None = None) -> Iterator[None]:
-    """Restore after some lines the global generators, and those that EnvState finds in ``env``."""
+    """Restore after some lines the global generators, and those that ``env`` had before.
+
+    A reset with a seed gives ``env`` new ones, which stay.
+    """
     generators: list[Any] = [random, np.random]
     if env is not None:
         generators += _generators(env).values()
@@ -1830,7 +1788,8 @@ def play(
 
     ``env`` records its returns (:func:`make_noisy`); ``policy`` gives the action for an
     observation. Returns an array (episodes, 3): the true return of each, its length, and its
-    :func:`outcome`. The global generators are seeded for each episode, and restored afterwards.
+    :func:`outcome`. The global generators are seeded for each episode, and restored afterwards;
+    those of ``env`` go on from the last test, so do not train in it.
     """
     results = np.zeros((episodes, 3))
     with kept_generators(env):
@@ -1965,23 +1924,15 @@ def safe_name(text: str) -> str:
 
 # The scripts' arguments that change nothing about what a run learns. A run may be resumed with
 # others, and a finished one counts as done whatever it had.
-MAY_DIFFER_IN_A_RUN = {
-    "runs_dir",
-    "overwrite",
-    "torch_threads",
-    "compile",
-    "checkpoint_frequency",
-    "keep_policies",
-}
+MAY_DIFFER_IN_A_RUN = {"runs_dir", "overwrite", "torch_threads", "compile"}
+MAY_DIFFER_IN_A_RUN |= {"checkpoint_frequency", "keep_policies"}
 # Runs with other values of these may stand in one row of a table, too: a GPU rounds otherwise, and
 # tests do not touch training. But a run keeps to the ones that it began with.
 MAY_DIFFER_IN_A_TABLE = MAY_DIFFER_IN_A_RUN | {"cuda", "eval_frequency"}
 
 
 def different_arguments(
-    config: Mapping[str, Any],
-    other: Mapping[str, Any],
-    may_differ: Collection[str] = MAY_DIFFER_IN_A_RUN,
+    config: Config, other: Config, may_differ: Collection[str] = MAY_DIFFER_IN_A_RUN
 ) -> dict[str, tuple[Any, Any]]:
     """Return the arguments in which two runs differ: {name: (value of config, value of other)}.
 
@@ -1989,20 +1940,14 @@ def different_arguments(
     are compared as JSON, so a tuple equals its list. An argument that one of them lacks, because
     the script has it since then, had the default that the other one names.
     """
-    names = [*config["args"], *(name for name in other["args"] if name not in config["args"])]
+    ours = as_json({**other.get("defaults", other["args"]), **config["args"]})
+    theirs = as_json({**config.get("defaults", config["args"]), **other["args"]})
     differing = {}
-    for name in names:
-        values = _argument(config, other, name), _argument(other, config, name)
+    for name in dict.fromkeys([*config["args"], *other["args"]]):
+        values = ours.get(name), theirs.get(name)
         if name not in may_differ and json.dumps(values[0]) != json.dumps(values[1]):
             differing[name] = values
     return differing
-
-
-def _argument(config: Mapping[str, Any], other: Mapping[str, Any], name: str) -> Any:
-    """Return a run's argument as JSON has it, or its default if only the other run has it."""
-    if name in config["args"]:
-        return as_json(config["args"][name])
-    return as_json(other.get("defaults", other["args"]).get(name))
 
 
 def release(config: Mapping[str, Any]) -> str:
@@ -2017,34 +1962,12 @@ def as_json(value: Any) -> Any:
 
 
 # Arguments of the scripts that are at least 0, at least 1, or fractions.
-_NOT_NEGATIVE = (
-    "seed",
-    "eval_frequency",
-    "learning_starts",
-    "learning_rate",
-    "policy_lr",
-    "q_lr",
-    "exploration_noise",
-    "policy_noise",
-    "noise_clip",
-    "clip_coef",
-    "max_grad_norm",
-)
-_COUNTS = (
-    "total_timesteps",
-    "max_episode_steps",
-    "checkpoint_frequency",
-    "eval_episodes",
-    "torch_threads",
-    "buffer_size",
-    "batch_size",
-    "policy_frequency",
-    "target_network_frequency",
-    "num_steps",
-    "num_minibatches",
-    "update_epochs",
-)
-_FRACTIONS = ("gamma", "gae_lambda", "tau")
+_NOT_NEGATIVE = {"seed", "eval_frequency", "learning_starts", "learning_rate", "policy_lr", "q_lr"}
+_NOT_NEGATIVE |= {"exploration_noise", "policy_noise", "noise_clip", "clip_coef", "max_grad_norm"}
+_COUNTS = {"total_timesteps", "max_episode_steps", "checkpoint_frequency", "eval_episodes"}
+_COUNTS |= {"torch_threads", "buffer_size", "batch_size", "policy_frequency"}
+_COUNTS |= {"target_network_frequency", "num_steps", "num_minibatches", "update_epochs"}
+_FRACTIONS = {"gamma", "gae_lambda", "tau"}
 
 
 def _check_numbers(args: Mapping[str, Any]) -> None:
@@ -2052,9 +1975,9 @@ def _check_numbers(args: Mapping[str, Any]) -> None:
 
     A researcher's script may give an option another type, such as a schedule as text.
     """
-    for name in _NOT_NEGATIVE + _COUNTS + _FRACTIONS:
-        value = args.get(name)
-        if not isinstance(value, int | float):
+    known = _NOT_NEGATIVE | _COUNTS | _FRACTIONS
+    for name, value in args.items():
+        if name not in known or not isinstance(value, int | float):
             continue
         low = 1 if name in _COUNTS else 0
         high = 1 if name in _FRACTIONS else math.inf
@@ -2087,22 +2010,13 @@ def canonical_arguments(args: Mapping[str, Any]) -> dict[str, Any]:
 
 def run_folder(args: Mapping[str, Any]) -> Path:
     """Return the folder of a run with these arguments of a script: :func:`run_name` in runs_dir."""
-    name = run_name(
-        args["env_id"],
-        args["exp_name"],
-        args["noise"],
-        args["noise_rate"],
-        args["seed"],
-        env_kwargs=args["env_kwargs"],
-        test_noise=args["test_noise"],
-        test_noise_rate=args["test_noise_rate"],
-    )
+    options = {name: args[name] for name in ("env_kwargs", "test_noise", "test_noise_rate")}
+    noises, rates, seed = args["noise"], args["noise_rate"], args["seed"]
+    name = run_name(args["env_id"], args["exp_name"], noises, rates, seed, **options)
     return Path(args["runs_dir"], name)
 
 
-def describe_run(
-    script: str, args: Mapping[str, Any], defaults: Mapping[str, Any], env: Env
-) -> dict[str, Any]:
+def describe_run(script: str, args: Config, defaults: Config, env: Env) -> dict[str, Any]:
     """Return the content of a config.json: what a script runs, in which spaces, by which code.
 
     ``script`` is the path of its file, whose name is NAME_continuous_noisy.py for an algorithm
@@ -2182,12 +2096,7 @@ def _describe_keys(env: Env) -> list[list[Any]]:
 
 
 class Spaces:
-    """The spaces that a run's config.json tells of, in place of its environment.
-
-    Attributes:
-        observation_space: a Box of one dimension.
-        action_space: a Box of one dimension.
-    """
+    """The spaces that a run's config.json tells of, in place of its environment."""
 
     def __init__(self, config: Mapping[str, Any]):
         """Raise KeyError for a run of version 0.3, whose config.json does not tell its spaces."""
@@ -2238,13 +2147,9 @@ def _replaced(nested: Any, entries: dict[EntryPath, Any]) -> Any:
     """Return a nested observation, or its space, with other entries in containers of its own."""
     if () in entries:
         return entries[()]
-    parts, deeper = dict(_items(nested)), {}
-    for path, entry in entries.items():
-        if len(path) == 1:
-            parts[path[0]] = entry
-        else:
-            deeper.setdefault(path[0], {})[path[1:]] = entry
-    for key, inner in deeper.items():
+    parts = dict(_items(nested))
+    for key in {path[0] for path in entries}:
+        inner = {path[1:]: entry for path, entry in entries.items() if path[0] == key}
         parts[key] = _replaced(parts[key], inner)
     if isinstance(nested, gym.spaces.Dict):
         return gym.spaces.Dict(list(parts.items()))
@@ -2291,9 +2196,7 @@ class _ProbeEnv(gym.Env[Any, Any]):
     So a wrapper leaves alone what only the environment can tell: its keys, its simulator.
     """
 
-    def __init__(self) -> None:
-        self.observation_space = gym.spaces.Box(-1.0, 1.0, (1,))
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+    observation_space = action_space = gym.spaces.Box(-1.0, 1.0, (1,))
 
 
 def _parameters(wrapper: type[NoiseWrapper]) -> list[inspect.Parameter]:
@@ -2321,16 +2224,14 @@ def _interval(low: float, high: float, least: float = -math.inf) -> tuple[float,
 
 def _whole_interval(low: int | None, high: int | None, least: int) -> tuple[int, int]:
     """Check two numbers of steps; the second is the first by default."""
-    ends = []
-    for name, value in (("low", low), ("high", low if high is None else high)):
-        end = _without_arrays(value)
-        is_whole = isinstance(end, numbers.Integral) and not isinstance(end, bool)
-        if not (is_whole and least <= end < 2**31):
+    high = low if high is None else high
+    for name, value in (("low", low), ("high", high)):
+        is_whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+        if not (is_whole and least <= value < 2**31):
             raise ValueError(f"{name} must be an integer in [{least}, 2**31), got {value!r}")
-        ends.append(int(end))
-    if ends[0] > ends[1]:
-        raise ValueError(f"low must not exceed high, got low={ends[0]}, high={ends[1]}")
-    return ends[0], ends[1]
+    if low > high:
+        raise ValueError(f"low must not exceed high, got low={low}, high={high}")
+    return int(low), int(high)
 
 
 def _scale_or_scales(value: Any) -> Scale:

@@ -62,11 +62,13 @@ def test_the_environments_arguments_and_the_tests_are_part_of_the_name():
 
 
 def test_env_kwargs():
-    texts = ["mass:2.0", "reward_type:dense", "n:-3", "range:(0, 1)", "at:10:30"]
+    texts = ["mass:2.0", "reward_type: dense", "n:-3", "range:(0, 1)", "at:10:30", "on:'false'"]
     values = {"mass": 2.0, "reward_type": "dense", "n": -3, "range": (0, 1), "at": "10:30"}
+    values["on"] = "false"
     assert parse_env_kwargs(texts) == values
     assert parse_env_kwargs(["x:__import__('os')"]) == {"x": "__import__('os')"}
-    for bad in (["mass"], ["a-b:1"], ["a:1", "a:2"], "mass:2"):
+    of_scripts = ["max_episode_steps:5"]
+    for bad in (["mass"], ["a-b:1"], ["a:1", "a:2"], "mass:2", ["a:false"], of_scripts):
         with pytest.raises(ValueError, match="^env_kwargs"):
             parse_env_kwargs(bad)
 

@@ -1,6 +1,7 @@
 """Noises of one's own: the docstring's, from a folder of its own, through all commands."""
 
 import csv
+import importlib
 import json
 import os
 import re
@@ -29,10 +30,15 @@ def folder(tmp_path, monkeypatch):
     (tmp_path / "my_noises.py").write_text(MODULE)
     monkeypatch.chdir(tmp_path)
     monkeypatch.delitem(sys.modules, "my_noises", raising=False)
-    parse_noise.__globals__["_read_noise"].cache_clear()
     yield tmp_path
     sys.modules.pop("my_noises", None)
-    parse_noise.__globals__["_read_noise"].cache_clear()
+
+
+def test_a_module_that_is_loaded_again_has_its_new_class(folder, monkeypatch):
+    monkeypatch.syspath_prepend(folder)
+    old = parse_noise(TEXT).wrapper
+    module = importlib.reload(sys.modules["my_noises"])
+    assert parse_noise(TEXT).wrapper is module.StickyAction is not old
 
 
 @pytest.mark.filterwarnings("ignore:.*WARN")
