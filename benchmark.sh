@@ -87,6 +87,10 @@ END
 }
 
 fail() { echo "error: $*" >&2 || true; exit 2; }
+pass_on() { # what a run prints; where its reader has left, the run goes on
+  trap '' TERM INT USR1
+  cat || cat >/dev/null
+}
 
 caller=$(pwd -P)
 cd "$(dirname -- "$(readlink -f -- "${BASH_SOURCE[0]}")")" # it may be called through a link
@@ -94,7 +98,7 @@ cd "$(dirname -- "$(readlink -f -- "${BASH_SOURCE[0]}")")" # it may be called th
 case ${1:-} in # how the executors call this script: run-one SWEEP FOLDER COMMAND
   run-one) # on a machine whose connection may break: the run must outlive its reader
     trap : TERM INT USR1
-    run_one "$2" "$3" "$4" | { trap '' TERM INT USR1 && { cat || cat >/dev/null; }; } || exit 1
+    run_one "$2" "$3" "$4" | pass_on || exit 1
     exit ;;
   slurm-task) slurm_task "$2" "$3" ;;
   "" | -h | --help) usage || true; exit ;;
@@ -133,7 +137,10 @@ case ${PYTHON:-} in '' | /*) ;; */*) PYTHON=$caller/$PYTHON ;; esac
 export PYTHON=${PYTHON:-python}
 # A module of the user's, as in my_envs:MyEnv-v0, lies there, too. Without a colon there is none, and
 # the folder stays off the path: a file in it could have the name of one of Python's own modules.
-[[ "$caller" = "$PWD" || "${grid[*]}" != *:* ]] || export PYTHONPATH=${PYTHONPATH:+$PYTHONPATH:}$caller
+# (A status of a choice reads in choice.json which environments it has.)
+if [ "$caller" != "$PWD" ] && [[ $view = status || "${grid[*]}" = *:[A-Za-z_]* ]]; then
+  export PYTHONPATH=${PYTHONPATH:+$PYTHONPATH:}$caller
+fi
 lacking=$("$PYTHON" -c "import sys, importlib.util as u
 print(*[name for name in sys.argv[1:] if not u.find_spec(name)], sep=', ')" \
   gymnasium mujoco torch tyro tensorboard 2>/dev/null) ||
@@ -151,7 +158,7 @@ list_todo() {
   local status=0
   todo=$(show "${dry_run:-list}") || status=$?
   [ "$status" -eq 0 ] || exit "$status"
-  todo=$(printf '%s\n' "$todo" | grep -vxFf <(printf '%s\n' "$tried")) || [ $? -eq 1 ]
+  todo=$(printf '%s\n' "$todo" | grep -vxFf <(printf '%s\n' "$tried")) || [ $? -eq 1 ] # no line is left
 }
 tried=''
 list_todo
@@ -212,13 +219,12 @@ stop() { # EXIT_STATUS
 # reaches every run once.
 run_todo() {
   local reason guard watch
-  command -v flock >/dev/null || fail "benchmark.sh needs flock (Debian: apt-get install util-linux)"
   [ "$executor" != slurm ] || array_limit
   mapfile -t folders < <(printf '%s\n' "$todo" | cut -f1 | sed 's,/[^/]*$,/logs,' | sort -u)
   reason=$( (mkdir -p "${folders[@]}" && printf '%s\n' "$todo" >"$list") 2>&1) ||
     fail "--runs-dir: cannot write to $logs: ${reason##*: }"
   flock "$list" true ||
-    fail "--runs-dir: cannot lock files in $logs, so two processes could write into one run"
+    fail "--runs-dir: cannot lock files in $logs (by flock), so two processes could write into one run"
   [ "${grid[0]}" != choose ] || show begin
   if [ "$executor" = slurm ]; then
     submit

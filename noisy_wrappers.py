@@ -1893,7 +1893,7 @@ def run_name(
         written, plain = str(value), safe_name(str(value))
         environment += f"_{name}={plain}" if plain == written else f"_{name}={_hashed(written)}"
     end = f"__{environment}__{safe_name(exp_name)}"
-    if test := Configuration.read(test_noise, test_noise_rate).slug:
+    if test := read_test_noise(test_noise, test_noise_rate).slug:
         end += f"__tests_{test}"
     if len(first + end) > 240:  # a file's name has at most 255 bytes
         first = f"{first[:100]}_{_hashed(first, 16)}"
@@ -2276,10 +2276,9 @@ def _fields(fields: Any) -> tuple[str, ...]:
 
 def _schedule(noise_rate: Rate) -> tuple[float, float]:
     """Return the rates at the beginning and at the end of training."""
-    start = end = noise_rate
+    start, colon, end = str(noise_rate).partition(":")
     try:
-        if isinstance(noise_rate, str):
-            start, end = map(float, noise_rate.split(":"))
+        start, end = float(start), float(end if colon else start)
         return _number("noise_rate", start, 0, 1), _number("noise_rate", end, 0, 1)
     except ValueError:
         raise ValueError(

@@ -476,7 +476,7 @@ class Run:
         with fail_on(OSError, f"--runs-dir {args.runs_dir}"):
             self.folder.mkdir(parents=True, exist_ok=True)
             self.lock = (self.folder / ".lock").open("a")
-        with fail_on(BlockingIOError, f"another process trains in {self.folder}: wait for it"):
+        with fail_on(BlockingIOError, f"another process trains in {self.folder}: wait for it", 1):
             fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # as long as it is open
         if args.overwrite:
             self._delete(*self.FILES, *(f"{name}.tmp" for name in self.FILES))
@@ -499,7 +499,7 @@ class Run:
         step, processor_seconds = 0, 0.0
         path = self.folder / "checkpoint.pt"
         if path.exists():
-            with fail_on(Exception, f"cannot read {path} (--overwrite starts afresh)"):
+            with fail_on(Exception, f"cannot read {path} (delete it, or use --overwrite)", 1):
                 if zipfile.ZipFile(path).testzip():  # torch.load checks no checksums
                     raise ValueError("it is damaged")
                 checkpoint = read_state(path)

@@ -89,7 +89,7 @@ class Run:
         commit = str(self.config.get("git_commit"))  # 40 digits, perhaps with "-dirty"
         scripts = str(self.config.get("script_sha256", "unknown")).split(", ")
         more = {"matmul precision": self.config.get("matmul_precision")}
-        more["git commit"] = commit[:10] + commit[40:]
+        more["git commit"] = commit[:10] + ("-dirty" if commit.endswith("-dirty") else "")
         more["script"] = ", ".join(script[:10] for script in scripts)
         return {**self.config.get("versions", {}), **more}
 
@@ -162,12 +162,8 @@ def naming(path):
 
 def read_json(path):
     """Read an object from a file. Raises DamageError."""
-
-    def refuse(constant):
-        raise ValueError(f"{constant} is no number of JSON")
-
     with naming(path):
-        value = json.loads(path.read_text("utf-8"), parse_constant=refuse)
+        value = json.loads(path.read_text("utf-8"))
     if not isinstance(value, dict):
         raise DamageError(f"{path.name} is no JSON object")
     return value
@@ -253,10 +249,6 @@ def read_result_of(run):
     with naming(path):  # an integer may be too large
         if type(mean) not in (int, float) or not math.isfinite(mean):
             raise ValueError(f"final_return_mean is {shortened(mean)}")
-    steps = result.get("total_timesteps", run.total_timesteps)
-    if steps != run.total_timesteps:
-        said = f"total_timesteps is {shortened(steps)}, in config.json {run.total_timesteps}"
-        raise DamageError(f"result.json: {said}")
     return result
 
 

@@ -50,7 +50,8 @@ def read_log(folder):
             lines = file.read().decode(errors="replace").splitlines()
     except OSError:  # there is none, or it is somebody else's
         return Log(path, math.inf, 0, 0, None, "")
-    end = END.fullmatch(lines[-1]) if lines else None
+    frame = [line for line in lines if line.startswith("# ")]
+    end = END.fullmatch(frame[-1]) if frame else None  # what a run left behind may print after it
     steps = [found.groups() for found in map(PROGRESS.match, lines) if found]
     step, steps_per_second = map(int, steps[-1]) if steps else (0, 0)
     own = [line for line in lines if re.search(r"\w", line) and not line.startswith("# ")]

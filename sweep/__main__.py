@@ -162,7 +162,7 @@ def watch(args, runs, choices):
     parent = int(os.environ.get("WATCHED", os.getppid()))
     terminal = sys.stderr.isatty()
     pause = 10 if terminal or args.preset == "demo" else 600  # seconds
-    shown = -pause if terminal else time.monotonic()
+    shown = -pause if terminal else time.monotonic()  # a terminal shows the first line at once
     while os.getppid() == parent:
         if time.monotonic() - shown >= pause:
             shown = time.monotonic()
@@ -230,12 +230,9 @@ def show_progress(args, runs, found, over, everything=False):
 
 
 def with_baselines(runs):
-    """Say how many runs have no noise, where these have other seeds than those with noise."""
-    noisy = {(run.kind, run.seed) for run in runs if "--noise" in run.command}
-    clean = {(run.kind, run.seed) for run in runs if "--noise" not in run.command}
-    if not noisy or noisy == clean:
-        return ""
-    return f" ({len(clean)} of them without noise)"
+    """Say how many runs have no noise, unless none has any."""
+    clean = sum("--noise" not in run.command for run in runs)
+    return "" if clean == len(runs) else f" ({clean:,} of them without noise)"
 
 
 VIEWS = {

@@ -66,8 +66,9 @@ def choices(args):
     problems = [f"{choice.name}: {choice.problem}" for choice in found if choice.problem]
     if len(problems) == len(found):
         fail("\nerror: ".join(problems), code=1)
-    for problem in problems:  # the others go on
-        print(f"warning: {problem}", file=sys.stderr)
+    if args.view not in ("begin", "watch"):  # which follow a list
+        for problem in problems:  # the others go on
+            print(f"warning: {problem}", file=sys.stderr)
     return [choice for choice in found if not choice.problem]
 
 
@@ -212,7 +213,7 @@ def follow(args, algorithm, env_id, environment, plan):
     batches = [number * seeds for number, seeds in sizes]
     batches += [2 * (after - before) for before, after in itertools.pairwise(looks)]
     kind = algorithm.upper(), env_id
-    first_batch_is_over = state.rounds or not state.due
+    first_batch_is_over = state.rounds or state.look > 1 or not state.due
     problem = why_tests_say_nothing(args, tests) if first_batch_is_over else ""
     return Choice(kind, len(tried), plan, batches, state, runs, returns, seconds, problem)
 

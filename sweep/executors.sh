@@ -16,9 +16,8 @@ quoted() { # TEXT: as one word of any sh, which does not know all that printf %q
 # leaves this file, and the sweep starts no run of another seed (on this machine, if machines share
 # no folder). Other environments and noises are tried: it may be one of these that is refused.
 refusal_of() {
-  local name=${2##*/} configuration
-  configuration=${name%%__*}
-  echo "${2%/*}/logs/.refused-$1-${configuration%_s*}__${name#*__}"
+  local name=${2##*/} # RATE_sSEED_NOISE__ENVIRONMENT__..., or baseline_sSEED__...
+  echo "${2%/*}/logs/.refused-$1-${name%%_s*}_${name#*_s*_}"
 }
 
 # SWEEP FOLDER COMMAND: one run, its output framed by two lines that begin with "#"; returns its
@@ -36,7 +35,7 @@ run_one() {
   mkdir -p "${1%/*}/logs" # on a machine that does not share the folder, too
   exec 9>>"$(log_of "$1")" || return
   if ! flock --nonblock 9; then
-    echo "$1 is running already: waiting for it" >&2
+    echo "$1 is running already: waiting for it (another sweep, or a process that an ended run left)" >&2
     flock 9 || return
   fi
   [ ! -e "$1/result.json" ] || return 0
@@ -124,7 +123,7 @@ submit() { # the array's indices are line numbers, counted from the offset of it
       --ntasks=1 --cpus-per-task=1 --job-name=noisy-sweep \
       --open-mode=append --output="${logs//%/%%}/slurm-%A.out" \
       ${slurm_options[@]+"${slurm_options[@]}"} \
-      --wrap "exec ./benchmark.sh slurm-task $(quoted "$list") $offset") || said=''
+      --wrap "exec $(quoted "$PWD/benchmark.sh") slurm-task $(quoted "$list") $offset") || said=''
     # ID or ID;CLUSTER; a site's sbatch may print more lines
     if ! id=$(printf '%s\n' "$said" | grep -xE '[0-9]+(;[A-Za-z0-9_.-]+)?'); then
       [ "$stopped" -eq 0 ] || break # Ctrl-C ends sbatch, too

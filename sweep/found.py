@@ -18,7 +18,8 @@ from sweep.grid import PlannedRun
 from sweep.scripts import PROJECT, is_same, read, scripts_in, spelt
 
 NOW = release({"versions": {"noisy_wrappers": __version__}})
-NOT_COMPARED = MAY_DIFFER_IN_A_RUN | {"noise", "noise_rate"}  # the name of a folder tells these
+# The name of a folder tells the noises
+NOT_COMPARED = MAY_DIFFER_IN_A_RUN | {"noise", "noise_rate", "test_noise", "test_noise_rate"}
 ADVICE = "give this sweep another --exp-name, at the end after --, or another --runs-dir"
 
 
@@ -52,6 +53,8 @@ def look(planned, with_curve=False):
 
 def differences_of(run, planned):
     """Yield the arguments in which a run differs from what the sweep would give it, in words."""
+    if run.algorithm.lower() != planned.kind[0]:
+        yield f"--algos {run.algorithm.lower()}, not {planned.kind[0]}"
     defaults = planned.script.defaults
     wanted = {"args": dict(defaults), "defaults": defaults}
     for name, words in planned.args.items():

@@ -118,7 +118,9 @@ def configurations(args, algorithm, env_id):
     pairs = [best_of_the_paper(algorithm, env_id)] if args.pairs is None else args.pairs
     entries, rates = [[pair] for pair in pairs], []
     if args.noises or args.noise_rates:
-        entries = args.noises or [[(noise, None)] for noise in dict(pairs)]
+        entries = args.noises or [
+            [(noise, None)] for noise in dict.fromkeys(noise for noise, _ in pairs)
+        ]
         rates = args.noise_rates or list(dict.fromkeys(own for _, own in args.pairs or []))
     crossed = [pairs for pairs in entries if any(rate is None for _, rate in pairs)]
     if crossed and not rates:
@@ -170,14 +172,6 @@ def name_of(args, algorithm, env_id, configuration, seed):
         return fail(f"after the --: {error}")
 
 
-def rate(text):
-    """Read a noise rate: a number, or text such as "1.0:0.0", which Configuration.read reads."""
-    try:
-        return float(text)
-    except ValueError:
-        return text
-
-
 def grid(args):
     """Return the runs, each once."""
     runs = {}
@@ -203,6 +197,7 @@ def baseline_seeds(args, seeds, configurations):
         return sorted(set(itertools.chain(*args.baseline_seeds)))
     if args.preset != "custom":
         return seeds
+    # rounded, so that 3 * sqrt(9) does not become 10
     number = math.ceil(round(len(seeds) * math.sqrt(max(1, configurations)), 9))
     number = min(number, math.floor(round(len(seeds) * MOST_BASELINES, 9)))
     return [*seeds, *range(seeds[-1] + 1, seeds[-1] + 1 + number - len(seeds))]

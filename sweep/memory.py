@@ -14,14 +14,9 @@ from sweep.grid import name_of
 from sweep.looks import Plan
 
 
-def file_of(runs_dir):
-    """Return the file of a folder."""
-    return Path(runs_dir, "choice.json")
-
-
 def load(runs_dir):
     """Return what a folder keeps; exits where that cannot be read: it must not be decided anew."""
-    path = file_of(runs_dir)
+    path = Path(runs_dir, "choice.json")
     empty = {"commands": [], "plans": {}}
     try:
         kept = empty | json.loads(path.read_text("utf-8"))
@@ -48,7 +43,7 @@ def plan_of(args, algorithm, env_id):
 def keep_plans(args, plans):
     """Keep the plans of confirmations that begin now, {key: Plan}, and the command."""
     command = {name: getattr(args, name) for name in ("algos", "envs", "words", "extra_words")}
-    path = file_of(args.runs_dir)
+    path = Path(args.runs_dir, "choice.json")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with rewritten(path) as file:  # another command may write at the same time

@@ -6,12 +6,9 @@ import re
 from pathlib import Path
 
 from analysis.errors import fail
-from noisy_wrappers import canonical_env_id, read_test_noise, split_noises
+from noisy_wrappers import canonical_env_id, split_noises
 from sweep import scripts
-from sweep.grid import ENVS, PRESETS, SEEDS, rate
-
-EXECUTOR_OPTIONS = ["--dry-run", "--executor", "--jobs", "--sshlogin", "--remote-dir"]
-EXECUTOR_OPTIONS += ["--slurm-args", "--wait", "--help"]  # benchmark.sh reads these
+from sweep.grid import ENVS, PRESETS, SEEDS
 
 GIVEN_BY_THE_GRID = {  # options of the scripts, and those of the sweep that set them
     "--env-id": "--envs",
@@ -56,7 +53,7 @@ def entry(text):
     pairs = []
     for part in split_noises(text):
         found = re.fullmatch(r"(.*\))\s*@(.*)", part)  # there may be an @ in the brackets, too
-        pairs.append((found[1], rate(found[2])) if found else (part, None))
+        pairs.append((found[1], found[2]) if found else (part, None))
     if len({own is None for _, own in pairs}) > 1:
         reason = f"{text!r}: give each of these noises a rate with @, or none of them"
         raise argparse.ArgumentTypeError(reason)
@@ -68,7 +65,7 @@ OPTIONS = {  # their defaults, and how argparse reads them
     "algos": (list(SEEDS), SEVERAL | {"type": str.lower}),
     "envs": (ENVS, SEVERAL),
     "noises": ([], SEVERAL | {"type": entry}),
-    "noise_rates": ([], SEVERAL | {"type": rate}),
+    "noise_rates": ([], SEVERAL),
     "seeds": (None, SEVERAL | {"type": seeds}),
     "baseline_seeds": (None, SEVERAL | {"type": seeds}),
     "total_timesteps": (1_000_000, {"type": whole_number}),
@@ -99,10 +96,14 @@ def parse_args(view, caller, argv):
     preset = words[0] if words and not words[0].startswith("--") else None
     if preset not in PRESETS and not (preset is None and view == "status"):
         named = words[0] if words else ""
+        if named.startswith("--"):
+            fail(f"a preset comes before {named}: one of {', '.join(PRESETS)}")
         fail(f"unknown preset {named!r}; choose one of {', '.join(PRESETS)}")
     found, unknown = parser.parse_known_args(words[preset is not None :])
     if unknown:
-        fail(unknown_option(unknown[0].partition("=")[0]))
+        name = unknown[0].partition("=")[0]
+        hint = scripts.did_you_mean(name, map(scripts.spelt, OPTIONS))
+        fail(f"unknown option {name} (those of the scripts come at the end, after --){hint}")
     given = {scripts.spelt(name) for name in vars(found)}
     defaults = {"pairs": [], "options": []} | {name: value for name, (value, _) in OPTIONS.items()}
     args = argparse.Namespace(**defaults | PRESETS.get(preset, {}) | vars(found))
@@ -132,7 +133,11 @@ def kept_words(args):
     algos = args.algos if "--algos" in args.given else []
     envs = args.envs if "--envs" in args.given else []
     kept = memory.words_of_choice(args.runs_dir, algos, envs)
-    return kept and [*kept[0], "--runs-dir", args.runs_dir, *(["--", *kept[1]] if kept[1] else [])]
+    if not kept:
+        return None
+    words, extra = kept
+    words = [*words, "--runs-dir", os.path.abspath(args.runs_dir)]
+    return [*words, "--", *extra] if extra else words
 
 
 def check(args):
@@ -170,7 +175,7 @@ def check_words(args):
         name: scripts.read_words(script, args.extra_words) for name, script in args.scripts.items()
     }
     args.extra = {name: command for name, (_, command) in read.items()}
-    args.given_words = {name: given | spelt_as_stored(given) for name, (given, _) in read.items()}
+    args.given_words = {name: given for name, (given, _) in read.items()}
     args.exp_names = {
         name: " ".join(args.given_words[name].get("exp_name", [script.exp_name]))
         for name, script in args.scripts.items()
@@ -180,30 +185,6 @@ def check_words(args):
             "--exp-name: several algorithms would write into the same folders: name one algorithm "
             "with --algos, or leave --exp-name out and use another --runs-dir"
         )
-
-
-def spelt_as_stored(given):
-    """Return the options about the noise of tests as a run stores them."""
-    if "test_noise" not in given:
-        return {}
-    try:
-        rates = list(map(rate, given.get("test_noise_rate", [])))
-        noises, rates = read_test_noise(given["test_noise"], rates).texts
-    except ValueError as error:
-        fail(f"--test-noise: {error}")
-    return {"test_noise": list(noises), "test_noise_rate": list(rates)}
-
-
-def unknown_option(name):
-    """Say what to write instead of an option that the grid does not have."""
-    ours = [scripts.read(path) for path in scripts.scripts_in(scripts.PROJECT).values()]
-    of_scripts = {scripts.spelt(option) for script in ours for option in script.options}
-    of_scripts -= GIVEN_BY_THE_GRID.keys()
-    if name in of_scripts or re.sub("^--no-", "--", name) in of_scripts:
-        return f"{name} is an option of the scripts: put it at the end, after --"
-    known = [*map(scripts.spelt, OPTIONS), *EXECUTOR_OPTIONS]
-    hint = scripts.did_you_mean(name, known) or "; ./benchmark.sh --help lists them"
-    return f"unknown option {name}{hint}"
 
 
 def from_project(caller, text):

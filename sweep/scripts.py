@@ -160,7 +160,7 @@ def is_same(value, words):
 def number(words, otherwise=None):
     """Return the number that an option's words are, if they are one."""
     text = words[0] if isinstance(words, list) and len(words) == 1 else words
-    try:
-        return float(text) if re.search("[.e]", str(text)) else int(text)
-    except (ValueError, TypeError):
-        return otherwise
+    for read_as in (int, float):
+        with contextlib.suppress(ValueError, TypeError):
+            return read_as(str(text))
+    return otherwise

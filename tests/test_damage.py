@@ -59,7 +59,7 @@ DAMAGE = {  # and what is said of it
         "result.json: ",
     ),
     "a seed that is true": (config(seed=True), "seed is True"),
-    "an infinite seed": (config(seed=float("inf")), "Infinity is no number of JSON"),
+    "an infinite seed": (config(seed=float("inf")), "seed is inf"),
     "deep nesting": (text("config.json", lambda _: "[" * 100_000), "recursion"),
     "a time limit as text": (config(max_episode_steps="100"), "max_episode_steps is '100'"),
     "an escape sequence": (config(exp_name="\x1b[31m"), r"exp_name is '\x1b[31m'"),
@@ -67,7 +67,6 @@ DAMAGE = {  # and what is said of it
     "a rate of 5": (config(noise_rate=[5.0], noise=[A]), "5.0"),
     "a noise without a rate": (config(noise=[A], noise_rate=[]), "noise ["),
     "a path as algorithm": (config(algorithm="x/../../ESCAPED"), "algorithm is 'x/../../ESCAPED'"),
-    "other steps": (text("result.json", lambda text: text.replace("4000", "5000")), "is 5000, in"),
     "an infinite result": (
         text("result.json", lambda text: re.sub(r'_mean": [^,}]*', '_mean": 1e999', text)),
         "final_return_mean is inf",

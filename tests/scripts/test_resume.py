@@ -332,7 +332,7 @@ def test_state_that_cannot_be_read_back_is_named_at_the_start(tmp_path, capsys):
 def test_a_checkpoint_of_other_parts_is_named(tmp_path, capsys):
     save(tmp_path, Part(a=1))
     state = {"mine": Part(a=1), "scheduler": Part(b=2)}
-    line = refused(capsys, lambda: a_run(tmp_path).resume(state))
+    line = refused(capsys, lambda: a_run(tmp_path).resume(state), code=1)
     assert "it holds ['mine'], not ['mine', 'scheduler']" in line
 
 
@@ -345,10 +345,10 @@ def files(path):
     return {file.name: (file.stat().st_mtime_ns, file.read_bytes()) for file in found}
 
 
-def untouched(capsys, path, **kwargs):
+def untouched(capsys, path, code=2, **kwargs):
     """Check that a run is refused, and its folder left as it is; return the line."""
     before = files(path)
-    line = refused(capsys, run, "PPO", path.parent, **hopper("PPO") | kwargs)
+    line = refused(capsys, run, "PPO", path.parent, code=code, **hopper("PPO") | kwargs)
     assert files(path) == before and "--overwrite" in line
     return line
 
@@ -362,9 +362,9 @@ def test_a_damaged_checkpoint_is_noticed(stopped, capsys):
         damaged[-1][int(part * len(whole))] ^= 1
     for content in damaged:
         path.write_bytes(content)
-        assert f"cannot read {path}" in untouched(capsys, stopped)
+        assert f"cannot read {path}" in untouched(capsys, stopped, code=1)
     torch.save({"step": 1}, path)
-    assert f"cannot read {path}" in untouched(capsys, stopped)
+    assert f"cannot read {path}" in untouched(capsys, stopped, code=1)
 
 
 class Intruder:
@@ -378,7 +378,7 @@ class Intruder:
 def test_a_checkpoint_cannot_run_code(stopped, tmp_path, capsys):
     trace, path = tmp_path / "trace", stopped / "checkpoint.pt"
     torch.save(ppo.read_state(path) | {"eval_csv": Intruder(trace)}, path)
-    untouched(capsys, stopped)
+    untouched(capsys, stopped, code=1)
     assert not trace.exists()
     torch.load(path, weights_only=False)
     assert trace.exists()  # it works where it is let in
@@ -440,7 +440,7 @@ def test_a_second_process_is_refused_while_the_first_one_lives(tmp_path):
         time.sleep(0.01)
     for overwrite in (False, True):
         second = command("SAC", tmp_path, (TRAINING_STEP, 30, die), **long, overwrite=overwrite)
-        assert second.code == 2
+        assert second.code == 1
         assert f"another process trains in {folder(tmp_path)}: wait" in one_line(second.err)
     assert first.is_alive() and list(tmp_path.glob("*/checkpoint.pt"))
     first.kill()

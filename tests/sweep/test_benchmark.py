@@ -266,17 +266,19 @@ def test_a_failing_and_a_killed_run(engine, tmp_path):
 
 @pytest.mark.slow
 def test_a_run_that_is_refused_is_not_started_with_other_seeds(stub, tmp_path):
-    """Nor does an environment that a script refuses hinder another one."""
-    grid = ["baseline", "--algos", "sac", "--envs", "Pendulum-v1", "MountainCarContinuous-v0"]
-    grid += ["--seeds", "1-3", "--total-timesteps", "400", "--runs-dir", tmp_path, "--jobs", "1"]
-    (tmp_path / "refuse").write_text("*Pendulum*")
+    """Nor does a noise in an environment that a script refuses hinder any other."""
+    grid = ["custom", "--algos", "sac", "--envs", "Pendulum-v1", "MountainCarContinuous-v0"]
+    grid += ["--noises", A, "RandomMixupObservation(0.5)", "--noise-rates", "1", "--seeds", "1-3"]
+    grid += ["--baseline-seeds", "1", "--total-timesteps", "400", "--jobs", "1"]
+    grid += ["--runs-dir", tmp_path]
+    (tmp_path / "refuse").write_text("*NormalNoisyReward*Pendulum*")
     result = run(*grid, env=stub)
     said = "sac_continuous_noisy.py refused arguments, so no other seeds of these were started: "
     assert f"{said}error: --gamma must be at most 1, not 2\n" in result.out
-    assert result.code == 1 and "6 runs: 3 done, 0 running, 1 failed, 2 to do" in result.out
+    assert result.code == 1 and "14 runs: 11 done, 0 running, 1 failed, 2 to do" in result.out
     assert not list(tmp_path.glob("logs/.refused*"))
     (tmp_path / "refuse").unlink()
-    assert "6 runs: 6 done" in run(*grid, env=stub).out
+    assert "14 runs: 14 done" in run(*grid, env=stub).out
 
 
 @pytest.mark.slow

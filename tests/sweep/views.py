@@ -51,7 +51,8 @@ def finish(folder, steps=1000, more=(), **args):
     args = {"env_id": "Hopper-v5", "noise": [], "noise_rate": []} | args
     args |= {"total_timesteps": steps, "eval_episodes": 10}
     versions = {"noisy_wrappers": __version__}
-    config = {"algorithm": "SAC", "args": args, "versions": versions} | dict(more)
+    algorithm = args["exp_name"].partition("_")[0].upper()
+    config = {"algorithm": algorithm, "args": args, "versions": versions} | dict(more)
     (folder / "config.json").write_text(json.dumps(config))
     result = {"total_timesteps": steps, "final_return_mean": 1.0}
     (folder / "result.json").write_text(json.dumps(result))

@@ -85,7 +85,7 @@ def test_canonical_notation():
     ("noises", "rates"),
     [([], [0.1]), ([A], []), ([A], [0.1, 0.2]), ([A, B, C], [0.1, 0.2]), (["Nothing(1)"], [0.0])]
     + [(A, [0.5]), ([A], 0.5), ([A], "1:0")]  # no lists
-    + [([A], [rate]) for rate in (1.1, math.nan, "0.5:", "1:2", "a:b", "0.5", "1:0.5:0", "nan:0")],
+    + [([A], [rate]) for rate in (1.1, math.nan, "0.5:", "1:2", "a:b", "1:0.5:0", "nan:0")],
 )
 def test_bad_noises_and_rates(noises, rates):
     with pytest.raises(ValueError) as error:

@@ -22,7 +22,8 @@ BAD_NUMBERS = [math.nan, -math.inf, True, "0.5", None, [0.5], 1j, 10**400]
 BAD_STEPS = [-1, 2**63, 2.5, math.nan, True, "3", None]
 # a noise with good arguments, and those of its parameters for which values are bad
 BAD = [
-    ("RandomNormalNoisyObservation", {"scale": 0.5}, "scale loc noise_rate", BAD_NUMBERS),
+    ("RandomNormalNoisyObservation", {"scale": 0.5}, "scale loc", BAD_NUMBERS),
+    ("RandomNormalNoisyObservation", {"scale": 0.5}, "noise_rate", [math.nan, True, None, [0.5]]),
     ("RandomNormalNoisyObservation", {}, "scale", [-0.1, (), (0.1,), (0.1, -0.1), ((1, 2), 3)]),
     ("RandomNormalNoisyReward", {"scale": 0.5}, "scale", [*BAD_NUMBERS, (0.1, 0.2)]),
     ("RandomNormalNoisyAction", {}, "scale", [*BAD_NUMBERS, -0.1, (0.1, 0.2)]),
