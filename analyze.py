@@ -27,7 +27,7 @@ import pandas as pd
 import tyro
 
 from analysis.choice import read_choice
-from analysis.comparisons import as_chosen, compare_all
+from analysis.comparisons import are_in, as_chosen, compare_all
 from analysis.errors import fail, take_over_terminal
 from analysis.figures import INTERVAL, figures, write_figure
 from analysis.folders import CONFIRMATION, RETURN, SUCCESS, is_phase, is_run
@@ -35,7 +35,7 @@ from analysis.formatting import WHOLE_WORDS, in_markdown, shown, text_table
 from analysis.latex import latex_table
 from analysis.report import Results, write_report
 from analysis.robustness import analyse_robustness, read_robustness
-from analysis.runs import KEYS, MORE_TO_COME, finished, in_short, left_out, read_runs
+from analysis.runs import MORE_TO_COME, finished, in_short, left_out, read_runs
 from analysis.studies import make_studies, version_notes
 from analysis.style import COLUMN, PAGE
 from analysis.tables import in_words, lopsided_notes, make_tables, success_table, table_of
@@ -83,7 +83,7 @@ def no_finished_run(runs_dir):
 def verdicts_in_short(results):
     """Yield the tally of each study, then the sentences of clear verdicts."""
     if not results.headlines:
-        yield "There is no noise to compare with a baseline yet."
+        yield "No comparison has a verdict yet."
     for line in results.headlines:
         counts = ", ".join(f"{count:,} {word}" for word, count in line["counts"])
         yield f"{line['name']}: {line['tried']}: {counts}. {line['luck']}".strip()
@@ -219,8 +219,8 @@ def analyse(args, entries, choice):
         clear=clear,
         others=others,
         rates=said(
-            not_alone(compared.rates_together, compared.noises_together),
-            not_alone(compared.rates, compared.noises),
+            compared.rates_together[~are_in(compared.rates_together, compared.noises_together)],
+            compared.rates[~are_in(compared.rates, compared.noises)],
         ),
         robustness=robustness,
         overview=overview_of(entries, studies),
@@ -228,12 +228,6 @@ def analyse(args, entries, choice):
         notes=[*incomplete_note(number, compared), *lopsided_notes(compared), *notes, *unreadable],
         versions=version_notes(entries),
     )
-
-
-def not_alone(rates, noises):
-    """Return the comparisons of rates that are not, with one rate, those of noises, too."""
-    keys = pd.MultiIndex.from_frame(noises[KEYS])
-    return rates[~pd.MultiIndex.from_frame(rates[KEYS]).isin(keys)]
 
 
 def incomplete_note(number, compared):

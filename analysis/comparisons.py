@@ -12,7 +12,7 @@ import pandas as pd
 from scipy import stats
 
 from analysis import iqm, statistics, verdicts
-from analysis.folders import CONFIRMATION, PHASES, SEARCH, SUCCESS
+from analysis.folders import CONFIRMATION, PHASES, SEARCH
 from analysis.runs import KEYS, STUDY
 from analysis.verdicts import ALL_EQUAL
 from noisy_wrappers import BASELINE
@@ -23,7 +23,7 @@ IQM_CHANGE = ["iqm_change_percent", "iqm_change_low", "iqm_change_high"]
 # What a comparison does not tell where all returns are equal
 UNKNOWN = ["t", "p", "difference_low", "difference_high", *IQM_CHANGE]
 UNKNOWN += ["difference_percent", "percent_low", "percent_high"]
-VERDICT = ["p_adjusted", "comparisons", "smallest_p_adjusted", "verdict"]
+VERDICT = ["p_adjusted", "comparisons", "verdict"]
 COMPARED = [*statistics.Comparison._fields, *VERDICT, *IQM_CHANGE, *PROBABILITY]
 RESULTS = ["mean", "std", "n", "baseline_mean", "baseline_std", "n_baseline", *IQM]
 RESULTS += ["steps_to_baseline"]
@@ -155,16 +155,20 @@ def judged_beside(noises, rates, family, metric, smallest_gain=None):
     verdict of its only comparison. Where the numbers of seeds differ so much that a test may be
     wrong too often, there is neither p nor verdict.
     """
-    keys = [*STUDY, "environment", "noise"]
-    several = rates.groupby(keys)["noise"].transform("size") > 1
+    several = ~are_in(rates, noises)
     pairs = zip(rates["n"], rates["n_baseline"], strict=True)
     lopsided = [verdicts.is_lopsided(*pair, verdicts.MOST_RATIO_OF_RATES) for pair in pairs]
-    lopsided = several & np.array(lopsided, bool)
+    lopsided = several & rates["p"].notna() & np.array(lopsided, bool)
     rates.loc[lopsided, ["t", "p", "smallest_p"]] = np.nan
     many = judged(rates[several].copy(), family, metric, smallest_gain)
-    found = noises.set_index(keys)[VERDICT]
-    only = rates[~several].drop(columns=VERDICT).join(found, on=keys)
+    found = noises.set_index(KEYS)[VERDICT]
+    only = rates[~several].drop(columns=VERDICT).join(found, on=KEYS)
     return pd.concat([many, only[many.columns]]).sort_index() if len(many) else only[rates.columns]
+
+
+def are_in(rates, noises):
+    """Tell which comparisons of rates are those of noises, too: of a noise that has one rate."""
+    return pd.MultiIndex.from_frame(rates[KEYS]).isin(pd.MultiIndex.from_frame(noises[KEYS]))
 
 
 def as_chosen(compared, choice):
@@ -177,14 +181,14 @@ def as_chosen(compared, choice):
     if choice is not None:
         for row in choice[choice["phase"] == CONFIRMATION].itertuples():
             key = row.algorithm, row.environment, row.noise, row.noise_rate
-            said[key] = {"yes": verdicts.BETTER, "worse": verdicts.WORSE}.get(row.survives)
+            words = {"yes": verdicts.BETTER, "worse": verdicts.WORSE}
+            said[key] = words.get(row.survives, verdicts.UNCLEAR)
 
     def verdict(row):
-        tested = row["verdict"] in (*verdicts.CLEAR, verdicts.UNCLEAR)
-        if row["phase"] != CONFIRMATION or not tested:
+        if row["phase"] != CONFIRMATION or row["verdict"] in (verdicts.TOO_FEW, ALL_EQUAL):
             return row["verdict"]
         key = row["algorithm"], row["environment"], row["noise"], row["noise_rate"]
-        return (said[key] or verdicts.UNCLEAR) if key in said else np.nan
+        return said.get(key, np.nan)
 
     judged = {}
     for name in ("noises", "rates"):
@@ -208,20 +212,12 @@ def results(studies, compared):
             row = row_keys(study, environment, config.noise, config.noise_rate)
             row |= zip(RESULTS[:3], statistics.mean_std(sample), strict=True)
             row |= zip(RESULTS[3:6], statistics.mean_std(baseline), strict=True)
-            row |= zip(IQM, iqm_of(sample, study.metric), strict=True)
+            row |= zip(IQM, iqm.bootstrap_iqm(sample), strict=True)
             curves, target = study.curves[config][..., e], row["baseline_mean"]
             row["steps_to_baseline"] = statistics.steps_to_reach(curves, study.steps, target)
             rows.append(row)
     beside = compared.rates.drop(columns=["n", "n_baseline"])
     return frame(rows, RESULTS).merge(beside, how="left", on=KEYS)
-
-
-def iqm_of(sample, metric):
-    """Return the IQM with its interval, which rates of success that are all alike do not have."""
-    value, low, high = iqm.bootstrap_iqm(sample)
-    if metric == SUCCESS and low == high:
-        low = high = np.nan
-    return value, low, high
 
 
 def judged(rows, family, metric, smallest_gain=None):
@@ -238,7 +234,6 @@ def judged(rows, family, metric, smallest_gain=None):
         corrected = stats.false_discovery_control(group["p"].to_numpy(float))
         rows.loc[group.index, "p_adjusted"] = corrected
         rows.loc[group.index, "comparisons"] = len(group)
-    rows["smallest_p_adjusted"] = (rows["smallest_p"] * rows["comparisons"]).clip(upper=1)
     found = [verdicts.verdict(row, smallest_gain, metric) for row in rows.to_dict("records")]
     rows["verdict"] = pd.Series(found, index=rows.index, dtype=object)
     return rows

@@ -22,7 +22,7 @@ _COLUMNS_WITH = {  # a format of numbers that have no spread
     "z.2f": "probability_of_improvement probability_low probability_high effect_size t",
     "g": "steps_millions",
 }
-P_VALUES = ["p", "p_adjusted", "p_holm", "p_luck", "smallest_p", "smallest_p_adjusted"]
+P_VALUES = ["p", "p_adjusted", "p_holm", "p_luck", "smallest_p"]
 SELDOM = ["exp_name", "phase", "tested", "without_percent"]  # columns that may be empty as a whole
 PERCENTS = ["difference_percent", "percent_low", "percent_high"]
 FORMATS = {name: form for form, names in _COLUMNS_WITH.items() for name in names.split()}

@@ -45,10 +45,8 @@ def by_training_and_test(name, rows, clean, metric):
         values, form = rows["mean"] - clean, rounded
         unit = "percentage points" if metric == SUCCESS else "units of the return"
         limit = abs(values).max() or 1.0
-    trained = (rows["noise"] + ", " + rows["noise_rate"]).where(rows["noise"] != "", "no noise")
-    tested = (rows["test_noise"] + ", " + rows["test_rate"]).where(
-        rows["test_noise"] != "", "clean"
-    )
+    trained = named(rows["noise"], rows["noise_rate"], "no noise")
+    tested = named(rows["test_noise"], rows["test_rate"], "clean")
     texts = [form(value).removesuffix(" %") for value in values]
     cells = pd.DataFrame({"trained with": trained, "tested with": tested, "number": values})
     cells = cells.assign(text=texts, dot=rows["tested_on"] == "the same noise")
@@ -77,7 +75,8 @@ def matrix_figure(matrix, rows, metric, width):
         texts = {test: rounded(row["mean"], row["std"]) for test, row in tests.iterrows()}
         title = f"trained with {noise}, {rate}" if noise else "trained without noise"
         numbers = matrix.frame(tests["mean"]).astype(float)
-        panels[title] = numbers, matrix.frame(texts), numbers.isna() & False
+        no_dots = pd.DataFrame(False, numbers.index, numbers.columns)
+        panels[title] = numbers, matrix.frame(texts), no_dots
     values = np.concatenate([numbers.to_numpy().ravel() for numbers, *_ in panels.values()])
     look = {"cmap": "viridis", "vmin": np.nanmin(values), "vmax": np.nanmax(values)}
     return heatmap_figure(panels, look, matrix.name, width, f"mean {metric}")

@@ -74,6 +74,7 @@ def bootstrap_iqm(scores, baseline=None, resamples=2000):
             estimates = estimate([*observed[:i], drawn, *observed[i + 1 :]])
         variances[i] = n[i] / (n[i] - 1) * estimates.var(ddof=1)
     _, half = satterthwaite(variances, n)
+    half = half if half > 0 else nan  # values that are all alike are no proof that all would be
     return value, max(value - half, least), value + half
 
 

@@ -35,16 +35,17 @@ FIGURES_OF = {"best_curves": "early_performance", "curves": "early_performance"}
 FOLDED = ("curves", "parameters")  # where there are several: one for each noise
 # What the columns of tables say, and the words of verdicts; for people who have only the report
 TERMS = {
-    "better": "The mean final return is higher than without noise; p corrected is at most 0.05.",
-    "worse": "The mean final return is lower than without noise; p corrected is at most 0.05.",
+    "better": """The final mean is higher than without noise; p corrected is at most 0.05. (For a
+        confirmation of `./benchmark.sh choose`: by the rule of that.)""",
+    "worse": "The final mean is lower than without noise; otherwise as better.",
     "no clear difference": """p corrected is above 0.05: the noise may help a little, harm a little,
         or do nothing. The interval says how much of either is excluded.""",
     "no such gain": "The interval excludes a gain as large as --smallest-gain asked for.",
     "too few seeds": "One side has fewer than two seeds, so nothing can be tested.",
     "all equal": "All tests of all runs have the same result, so nothing can be compared.",
     "noise rate": "The probability with which the noise acts, at each step or in each episode.",
-    "difference": """Mean final return with noise minus that without, and its 95 % interval
-        (Welch's), which needs five seeds on both sides.""",
+    "difference": """The final mean with noise minus that without, and its 95 % interval (Welch's),
+        which needs five seeds on both sides.""",
     "difference %": """The same in percent of the mean without noise, where that is clearly not
         zero; its interval is Fieller's.""",
     "effect size": """The difference in standard deviations over seeds; over several environments
@@ -52,7 +53,7 @@ TERMS = {
     "p": """How often chance alone makes a difference as large, in either direction: a permutation
         test with Welch's t.""",
     "p corrected": """p, corrected for all comparisons with the same baseline (Benjamini and
-        Hochberg), or for all confirmations (Holm).""",
+        Hochberg). The p of a confirmation needs no correction.""",
     "n": """The number of seeds, or with rates together of runs; with / without noise where they
         differ.""",
     "n baseline": "The number of seeds without noise.",

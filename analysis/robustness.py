@@ -252,14 +252,14 @@ def analyse_robustness(runs, metric=RETURN):
 
 
 def robustness_sentences(scores, metric):
-    """Yield one plain sentence for each training configuration: is it more robust?"""
+    """Yield one plain sentence for each training configuration: does it return more under noise?"""
     unit = verdicts.POINTS if metric == SUCCESS else ""
     for row in scores.itertuples():
         where = row.environment or row.where
         study = study_name(*(getattr(row, name) for name in STUDY))
         start = f"{study} on {where}, trained with {row.noise} at rate {row.noise_rate}"
         over = f"over {row.conditions} of {counted(row.conditions_tested, 'test condition')}"
-        shown, limit = "no clear difference in robustness", ""
+        shown, limit = "no clear difference under noise", ""
         evidence = verdicts.difference_in_words(row, unit)
         if pd.isna(row.p):
             shown = "too few seeds for a test of robustness"
@@ -268,7 +268,7 @@ def robustness_sentences(scores, metric):
             evidence += f", p {p_value(row.p)}{verdicts.smallest(row)}, Holm {corrected}"
             limit = verdicts.excluded(row, unit) + verdicts.cannot_show(row)
         if verdicts.significant(row.p_holm):
-            shown = "more robust" if row.t > 0 else "less robust"
+            shown = f"returns {'more' if row.t > 0 else 'less'} under noise"
             limit = ""
         if pd.notna(row.clean_change_percent):
             evidence += f"; clean return {percent(row.clean_change_percent)}"

@@ -106,18 +106,13 @@ def leave_out_different(entries):
     for (_, exp_name), group in groups.items():
         usual = Counter(entry.run.release for entry in group)
         release = max(usual, key=lambda name: (usual[name], name))
-        others = [entry for entry in group if entry.run.release != release]
-        for entry in others:
-            entry.status = "different"
-            entry.reason = (
-                f"of release {entry.run.release}, whose numbers differ from those of {release}, "
-                f"as the runs of {exp_name} that count: finish a study with one release, or give "
-                "its runs another --exp-name"
-            )
-        same = [entry for entry in group if entry.run.release == release]
-        reference = usual_config([entry.run.config for entry in same])
-        for entry in same:
-            if difference := what_differs(entry.run.config, reference):
+        same = [entry.run.config for entry in group if entry.run.release == release]
+        reference = usual_config(same)
+        for entry in group:
+            difference = what_differs(entry.run.config, reference)
+            if entry.run.release != release:
+                difference = f"release is {entry.run.release}, not {release} (numbers differ)"
+            if difference:
                 entry.status = "different"
                 entry.reason = (
                     f"{difference} as in the runs of {exp_name} that count: give such runs another "
@@ -213,7 +208,9 @@ def missing_runs(entries):
         counts = Counter(seed for seeds in usual for seed in seeds)
         expected = {seed for seed, n in counts.items() if 2 * n >= len(usual)}
         for environment, configuration in sorted(found.keys() | baselines):
-            for seed in sorted(expected - found.get((environment, configuration), set())):
+            seeds = found.get((environment, configuration), set())
+            others = configuration == BASELINE and len(seeds) >= len(expected)
+            for seed in sorted(set() if others else expected - seeds):
                 run = replace(example[environment], configuration=configuration, seed=seed)
                 if folder_of(run) not in silent:
                     missing.append(Entry("", "missing", "no run folder", run))

@@ -38,15 +38,15 @@ class Study:
         return study_name(*self.key)
 
     def all_equal(self):
-        """Return the environments where all tests of two or more runs are equal: {name: value}."""
-        found = {}
+        """Return the environments where all tests of two or more runs are equal."""
+        found = []
         for e, env in enumerate(self.environments):
             runs = sum(np.isfinite(finals[:, e]).sum() for finals in self.finals.values())
             parts = [*self.curves.values(), *self.finals.values()]
             tests = np.concatenate([values[..., e].ravel() for values in parts])
             tests = tests[np.isfinite(tests)]
             if runs > 1 and np.ptp(tests) <= 1e-12 * abs(tests).max():
-                found[env] = tests[0]
+                found.append(env)
         return found
 
     def sample(self, config, e):

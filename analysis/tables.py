@@ -22,7 +22,7 @@ _NOISES = ["verdict", "noise", "algorithm, environment", "difference", "p_adjust
 IN_WORDS = {"best": _BEST, "noises": [*_NOISES, "noise_rate"]}
 DIFFERENCE = ["difference", "difference_low", "difference_high"]
 DIFFERENCE += ["difference_percent", "percent_low", "percent_high"]
-MORE = ["t", "pooled_std", "environments", "comparisons", "smallest_p", "smallest_p_adjusted"]
+MORE = ["t", "pooled_std", "environments", "comparisons", "smallest_p"]
 NOISES = ["noise", "noise_rate", "verdict", *DIFFERENCE, "effect_size", "p", "p_adjusted", "n"]
 RATES = [*NOISES, "n_baseline", "n_baseline_most", "detectable"]
 NOISES += ["n_baseline", "n_baseline_most", *MORE]
@@ -125,7 +125,7 @@ def lopsided_notes(compared):
     noises = compared.noises[compared.noises["p"].notna()]
     pairs = zip(noises["n"], noises["n_baseline"], strict=True)
     noises = noises[np.array([verdicts.is_lopsided(*pair) for pair in pairs], bool)]
-    rates = compared.rates[compared.rates["n"].ge(2) & compared.rates["smallest_p"].isna()]
+    rates = compared.rates[compared.rates["smallest_p"].isna()]
     notes = []
     for rows, said in (
         (noises, "a verdict may be wrong more often than in 5 %"),
@@ -157,7 +157,7 @@ equally. The effect size is the median difference in standard deviations.""",
 \u00b1 standard deviation of the final return over n seeds (with / without noise).""",
     "consistent": f"""Noise that matches or beats no noise in at least {CONSISTENT_PERCENT} % of two
 or more environments. Average improvement \u00b1 standard deviation over environments.""",
-    "consistently_worse": "Noise that is worse than no noise in each of two or more environments.",
+    "consistently_worse": "Noise with a lower mean than none in each of two or more environments.",
     "early_performance": """Mean test return \u00b1 standard deviation during training, by noise
 rate (0.00: no noise), with the number of seeds in brackets.""",
     "summary": """Final test return of every configuration: mean \u00b1 standard deviation over n
@@ -212,7 +212,7 @@ def make_tables(studies, compared):
     early = pd.DataFrame(returns, columns=COLUMNS["early_performance"])
     failing = bad[bad["fails_at_every_rate"] == "yes"][[*STUDY, "noise"]].drop_duplicates()
     failing = "; ".join(f"{noise} ({study_name(*study)})" for *study, noise in failing.values)
-    failing = f"Worse at every rate that was tried: {failing or 'none'}."
+    failing = f"Lower at every rate that was tried: {failing or 'none'}."
     note = percent_note(judged, metric)
     has_comparison = judged["difference"].notna()
     rates = judged.assign(n_baseline=judged["n_baseline"].where(has_comparison))

@@ -20,7 +20,7 @@ from analysis.formatting import (
 )
 from analysis.power import LEVEL
 from analysis.runs import STUDY, rows_of, study_name
-from analysis.statistics import SEEDS_FOR_INTERVAL, holm
+from analysis.statistics import holm
 from analysis.words import counted
 
 BETTER, WORSE = CLEAR = ["better", "worse"]
@@ -98,24 +98,25 @@ def difference_in_words(row, unit=""):
 
 def percent_interval(row):
     """Write the interval of a change in percent: " [15, 28]", or ""."""
-    ends = getattr(row, "percent_low", nan), getattr(row, "percent_high", nan)
-    if pd.isna(ends[0]):
+    if pd.isna(row.percent_low):
         return ""
+    ends = row.percent_low, row.percent_high
     return f" [{', '.join(percent_end(end).removesuffix(' %') for end in ends)}]"
 
 
 def excluded(row, unit=""):
-    """Say which gains and losses the interval of a comparison excludes, or ""."""
-    if not row.difference_low < row.difference_high:  # there is none, or nothing varies
+    """Say which gains and losses the interval of a comparison excludes, or "".
+
+    An interval on one side of zero says nothing: it is not corrected, and the verdict is.
+    """
+    if not row.difference_low < 0 < row.difference_high:
         return ""
     spread = spread_of(row)
 
-    def beyond(what, end, end_in_percent):  # above zero there is more than nothing
+    def beyond(what, end, end_in_percent):
         if end_in_percent > 0:
             return f"a {what} of more than {percent_end(end_in_percent)}"
-        if end > 0:
-            return f"a {what} of more than {not_zero(end, spread)}{unit}"
-        return f"any {what}"
+        return f"a {what} of more than {not_zero(end, spread)}{unit}"
 
     gain = beyond("gain", row.difference_high, row.percent_high)
     loss = beyond("loss", -row.difference_low, -row.percent_low)
@@ -141,10 +142,10 @@ def borderline(row, level=LEVEL):
 
 def smallest(row):
     """Say which p is the smallest possible where a comparison has too few seeds for an interval."""
-    if min(row.n, row.n_baseline) >= SEEDS_FOR_INTERVAL or not significant(row.smallest_p):
+    has_interval = pd.notna(row.difference_low) or pd.isna(row.difference)  # of one environment
+    if has_interval or not significant(row.smallest_p):
         return ""
-    none = "; too few seeds for an interval" if pd.notna(row.difference) else ""  # of one place
-    return f" (smallest possible: {p_text(row.smallest_p)}{none})"
+    return f" (smallest possible: {p_text(row.smallest_p)}; too few seeds for an interval)"
 
 
 def cannot_show(row):

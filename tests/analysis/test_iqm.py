@@ -142,7 +142,8 @@ def test_an_iqm_has_no_percent_of_what_may_be_zero_or_is_small_beside_the_span()
     x, y = np.array([[92.0], [93], [94]]), np.array([[1.0], [1.1], [1.2]])
     assert np.isnan(bootstrap_iqm(x, y)).all()
     assert np.isfinite(bootstrap_iqm(x / 10, y)).all()
-    assert bootstrap_iqm(np.full((5, 1), 30.0), np.full((3, 1), 20.0)) == (50, 50, 50)
+    alike = bootstrap_iqm(np.full((5, 1), 30.0), np.full((3, 1), 20.0))
+    np.testing.assert_equal(alike, (50, np.nan, np.nan))  # no proof that others are
     few_low = np.array([[3000.0], [3000], [3000], [3000], [100]])  # whose IQM is not their mean
     assert bootstrap_iqm(np.full((5, 1), 30.0), few_low)[0] == pytest.approx(-99)
 

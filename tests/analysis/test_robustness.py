@@ -104,7 +104,7 @@ def test_score_and_conditions_by_hand(tmp_path, capsys):
     assert clean["tested_on"] == "clean" and clean["mean"] == 100
 
     text = capsys.readouterr().out
-    assert "no clear difference in robustness over 3 of 5 test conditions" in text
+    assert "no clear difference under noise over 3 of 5 test conditions" in text
     few = "(smallest possible: 0.029; too few seeds for an interval)"
     assert f"p = 0.029 {few}, Holm 0.057; clean return -10 %" in text
 

@@ -91,6 +91,10 @@ def test_more_seeds_for_the_baseline_or_for_one_noise_are_nothing_missing(tmp_pa
         if seed <= 3:
             write_run(tmp_path, [10], seed=seed, noise=SCALE, rate=0.5)
             write_run(tmp_path, [10], seed=seed, noise=SCALE, rate=0.2)
+        write_run(tmp_path / "other", [10], seed=seed, noise=ENDING, rate=0.5)
+        write_run(tmp_path / "other", [10], seed=100 + seed)  # --baseline-seeds
+    assert not missing_runs(read_runs(tmp_path / "other"))
+    shutil.rmtree(tmp_path / "other")
     assert not missing_runs(read_runs(tmp_path))
     write_run(tmp_path, [10], seed=4, noise=SCALE, rate=0.2)  # now two of three noises have it
     write_run(tmp_path, [10], env="Pusher-v5", seed=2, noise=ENDING, rate=0.1)
@@ -170,7 +174,7 @@ def test_runs_of_two_releases_are_never_pooled(tmp_path, capsys):
     tables = run(tmp_path)
     assert tables["summary_SAC"][["n", "mean"]].to_numpy().tolist() == [[3, 10]]
     assert set(tables["missing"]["status"]) == {"different", "duplicate", "unfinished"}
-    assert "of release 0.3, whose numbers differ from those of 0.4" in capsys.readouterr().out
+    assert "release is 0.3, not 0.4 (numbers differ)" in capsys.readouterr().out
 
 
 def test_where_runs_were_tested_is_said_and_tells_studies_apart(tmp_path, capsys):

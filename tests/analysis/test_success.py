@@ -117,7 +117,7 @@ def test_robustness_is_judged_by_success(tmp_path, capsys):
                 (folder / "robustness.csv").write_text(header + text)
     analyze.main(analyze.Args(root, tmp_path / "out", metric="success_rate"))
     said = capsys.readouterr().out
-    assert "more robust over 1 of 1 test condition (+40 [" in said
+    assert "returns more under noise over 1 of 1 test condition (+40 [" in said
     assert "] percentage points of success, p = 0.0079" in said
     scores = pd.read_csv(tmp_path / "out/robustness_score.csv")
     assert scores["difference"].tolist() == [40] and scores["conditions"].tolist() == [1]
