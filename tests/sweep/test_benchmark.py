@@ -257,7 +257,7 @@ def test_a_failing_and_a_killed_run(engine, tmp_path):
     finished = (good / "result.json").stat().st_mtime_ns
     again = run(*grid, *executor, env=env)
     assert again.code == 0, again.out + again.err
-    assert "3 runs, 2 to do" in again.err
+    assert "3 runs (1 of them without noise), 2 to do" in again.err
     assert f"analyze.py --runs-dir '{tmp_path}/my runs'\n" in again.out
     assert [len(attempts(f)) for f in (fails, killed, good)] == [2, 2, 1]
     assert (good / "result.json").stat().st_mtime_ns == finished
