@@ -118,12 +118,16 @@ def show_list(args, runs, choices):
 
     A dry run also says what they will take. A choice says it of each of its batches, see begin.
     """
+    all_found, notes = refuse_others(runs, from_caller(args, args.runs_dir))
     done, todo = [], []
-    for run, found in zip(runs, refuse_others(runs, from_caller(args, args.runs_dir)), strict=True):
+    for run, found in zip(runs, all_found, strict=True):
         if found.damage:
             print(f"warning: {found.damage}", file=sys.stderr)
         else:
             (done if found.finished else todo).append(run)
+    if todo or args.view == "dry-run":  # otherwise the report follows, which has them, too
+        for line in notes:
+            print(f"note: {line}", file=sys.stderr)
     for run in todo:
         folder = f"{run.folder.parent}/{run.folder.name}"  # with a slash, for --runs-dir . too
         print(folder, command_line(run), sep="\t")
@@ -201,7 +205,11 @@ def show_stopped(args, runs, choices):
 
 def show_report(args, runs, choices):
     """Print what came out of a sweep; the exit status is 1 unless all runs are done."""
-    progresses = show_progress(args, runs, map(look, runs), over=True, everything=True)
+    found = list(map(look, runs))
+    progresses = show_progress(args, runs, found, over=True, everything=True)
+    _, notes = remarks(found, from_caller(args, args.runs_dir))
+    for line in notes:  # a script may have been edited meanwhile
+        print(f"note: {line}")
     refused = {p.run.script.file: p.log.last_line for p in progresses if p.reason == "exit 2"}
     for script, reason in refused.items():
         print(f"{script} refused arguments, so no other seeds of these were started: {reason}")

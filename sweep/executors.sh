@@ -63,8 +63,11 @@ slurm_task() {
   IFS=$'\t' read -r folder command < <(sed -n "$(($2 + SLURM_ARRAY_TASK_ID + 1))p" "$1")
   sweep=${1##*/lines-} # its id stands in the name of the list
   run_one "${sweep%.tsv}" "$folder" "$command" || status=$?
-  # SLURM_CLUSTERS came along from where it was submitted: the task is one of this cluster
-  if [ -n "$asked" ] && [ "$status" -eq 143 ]; then env -u SLURM_CLUSTERS scontrol requeue "$job"; fi
+  # A script that ends without a checkpoint would begin anew, time after time. SLURM_CLUSTERS came
+  # along from where it was submitted: the task is one of this cluster.
+  if [ -n "$asked" ] && [ "$status" -eq 143 ] && [ -e "$folder/checkpoint.pt" ]; then
+    env -u SLURM_CLUSTERS scontrol requeue "$job"
+  fi
   exit "$status"
 }
 

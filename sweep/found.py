@@ -5,7 +5,6 @@ this one. A script that was changed since does not hinder it: that is said.
 """
 
 import os
-import sys
 from collections import Counter
 from pathlib import Path
 from typing import NamedTuple
@@ -104,15 +103,13 @@ def runs_were(number):
 def refuse_others(runs, place):
     """Look at runs before any is started; exit if there are some that cannot be continued.
 
-    Returns what was found, run by run; says what else there is to know.
+    Returns what was found, run by run, and notes on it.
     """
     found = list(map(look, runs))
     hindrances, notes = remarks(found, place)
     if hindrances:
         fail("\nerror: ".join(hindrances))
-    for line in notes:
-        print(f"note: {line}", file=sys.stderr)
-    return found
+    return found, notes
 
 
 def runs_in(folder, caller):

@@ -440,6 +440,20 @@ def test_a_task_is_requeued_alone(array, requeued, no_slurm, tmp_path):
     assert task.returncode == 143 and asked.read_text() == f"scontrol requeue {requeued}\n"
 
 
+def test_a_task_without_a_checkpoint_is_not_requeued(no_slurm, tmp_path):
+    """As a script that SIGTERM ends at once: it would begin anew for ever."""
+    env, asked = no_slurm
+    folder, lines = tmp_path / "run", tmp_path / "logs/lines-host-1-2.tsv"
+    lines.parent.mkdir()
+    lines.write_text(f"{folder}\tbash -c 'mkdir {folder}; sleep 1; exec sleep 1000'\n")
+    env |= {"SLURM_JOB_ID": "7", "SLURM_ARRAY_TASK_ID": "0"}
+    task = start("slurm-task", lines, "0", env=env)
+    wait_for(folder.exists, "the run")
+    task.send_signal(signal.SIGUSR1)
+    task.communicate(timeout=PATIENCE)
+    assert task.returncode == 143 and not asked.exists()
+
+
 @pytest.mark.slow
 def test_ctrl_c_while_arrays_are_submitted(no_slurm, tmp_path):
     """On a terminal Ctrl-C reaches sbatch, too: here its second call."""

@@ -228,10 +228,10 @@ def test_runs_of_another_text_of_the_script_are_counted(one):
     for sha256, said in ((text, 0), ("ab", 1), (f"ab, {text}", 1)):
         more = {"script": "sac_continuous_noisy.py", "script_sha256": sha256}
         finish(folder, more=more, **made)
-        listed, status = view("list", *grid), view("status", *grid)
-        whole = view("status", "--runs-dir", folder.parent)
+        listed, status = view("dry-run", *grid), view("status", *grid)
+        whole, report = view("status", "--runs-dir", folder.parent), view("report", *grid)
         assert listed.code == 0 and "0 to do" in listed.err and "1 done" in status.out
-        for shown in (listed.err, status.out, whole.out):
+        for shown in (listed.err, status.out, whole.out, report.out):
             assert shown.count("1 run was made") == said == shown.count("another text of sac_con")
 
 
@@ -244,7 +244,7 @@ def test_runs_of_two_releases_are_two_studies(tmp_path):
     assert "Finish them with 0.3, or give this sweep another --exp-name" in refused.err
     assert "by release 0.3" in view("status", *grid).out
     finish(new, more={"versions": {}}, env_id="Pendulum-v1", seed=2)
-    both = view("list", *grid)  # it is finished: all are of one study
+    both = view("dry-run", *grid)  # it is finished: all are of one study
     assert both.code == 0 and "2 runs were made" in both.err and "0 to do" in both.err
 
 
