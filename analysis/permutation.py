@@ -22,7 +22,7 @@ def columns(scores):
     return [column[np.isfinite(column)] for column in scores]
 
 
-@lru_cache(maxsize=4)  # one may take 10 MB
+@lru_cache(maxsize=16)  # one may take 10 MB
 def partitions(n, m):
     """Return ways to divide n + m values, the actual one first; 1: first sample, 0: second.
 
