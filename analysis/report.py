@@ -39,7 +39,8 @@ TERMS = {
         confirmation of `./benchmark.sh choose`: by the rule of that.)""",
     "worse": "The final mean is lower than without noise; otherwise as better.",
     "no clear difference": """p corrected is above 0.05: the noise may help a little, harm a little,
-        or do nothing. The interval says how much of either is excluded.""",
+        or do nothing. The interval says how much of either is excluded. Also where averages over
+        environments differ in their direction.""",
     "no such gain": "The interval excludes a gain as large as --smallest-gain asked for.",
     "too few seeds": "One side has fewer than two seeds, so nothing can be tested.",
     "all equal": "All tests of all runs have the same result, so nothing can be compared.",

@@ -33,6 +33,10 @@ SCORE_COLUMNS = """environment noise noise_rate n n_baseline conditions conditio
     baseline_score_percent clean_change_percent t pooled_std smallest_p"""
 SCORE_COLUMNS = [*STUDY, *SCORE_COLUMNS.split()]
 
+# What a score says, by the sign of the difference
+DIRECTIONS = {1: "returns more under noise", -1: "returns less under noise"}
+DIRECTIONS |= {0: "no clear difference under noise"}
+
 
 def read_robustness(runs, metric=RETURN):
     """Read robustness.csv of runs that count: one row per run and condition.
@@ -259,7 +263,7 @@ def robustness_sentences(scores, metric):
         study = study_name(*(getattr(row, name) for name in STUDY))
         start = f"{study} on {where}, trained with {row.noise} at rate {row.noise_rate}"
         over = f"over {row.conditions} of {counted(row.conditions_tested, 'test condition')}"
-        shown, limit = "no clear difference under noise", ""
+        shown, limit = DIRECTIONS[0], ""
         evidence = verdicts.difference_in_words(row, unit)
         if pd.isna(row.p):
             shown = "too few seeds for a test of robustness"
@@ -268,8 +272,9 @@ def robustness_sentences(scores, metric):
             evidence += f", p {p_value(row.p)}{verdicts.smallest(row)}, Holm {corrected}"
             limit = verdicts.excluded(row, unit) + verdicts.cannot_show(row)
         if verdicts.significant(row.p_holm):
-            shown = f"returns {'more' if row.t > 0 else 'less'} under noise"
-            limit = ""
+            way = verdicts.direction(row.t, row.effect_size, row.difference_percent)
+            shown = DIRECTIONS[way]
+            limit = verdicts.undirected(row)
         if pd.notna(row.clean_change_percent):
             evidence += f"; clean return {percent(row.clean_change_percent)}"
         yield f"{start}: {shown} {over} ({evidence}){limit}.{verdicts.borderline(row)}"

@@ -5,6 +5,7 @@ A comparison is a row of a frame of analysis/comparisons.py.
 
 from math import nan
 
+import numpy as np
 import pandas as pd
 
 from analysis.folders import SUCCESS
@@ -45,7 +46,8 @@ def verdict(row, smallest_gain=None, metric=None):
     if pd.isna(row["p"]):
         return TOO_FEW
     if significant(row["p_adjusted"]):
-        return BETTER if row["t"] > 0 else WORSE
+        way = direction(row["t"], row["effect_size"], row["difference_percent"])
+        return {1: BETTER, -1: WORSE, 0: UNCLEAR}[way]
     if smallest_gain is not None and row["difference_low"] < row["difference_high"]:
         limit = row["difference_high"] if metric == SUCCESS else row["percent_high"]
         if limit < smallest_gain:
@@ -56,6 +58,15 @@ def verdict(row, smallest_gain=None, metric=None):
 def significant(p, level=LEVEL):
     """Tell whether a p-value is at most the level, in spite of rounding errors."""
     return round(p, 12) <= level
+
+
+def direction(*sizes):
+    """Return the sign of all sizes of a comparison that are not NaN, or 0 where they have several.
+
+    Over several environments they may: t, the median effect and the mean of the percentages.
+    """
+    signs = {np.sign(size) for size in sizes if not np.isnan(size)}
+    return signs.pop() if len(signs) == 1 else 0
 
 
 def is_lopsided(n, n_baseline, most=MOST_RATIO):
@@ -148,6 +159,13 @@ def smallest(row):
     return f" (smallest possible: {p_text(row.smallest_p)}; too few seeds for an interval)"
 
 
+def undirected(row):
+    """Say where the environments of a comparison differ and have no common direction, or ""."""
+    if direction(row.t, row.effect_size, row.difference_percent):
+        return ""
+    return "; its direction depends on how the environments are averaged"
+
+
 def cannot_show(row):
     """Say where the seeds of a comparison cannot show any difference, or ""."""
     if significant(row.smallest_p):
@@ -183,6 +201,7 @@ def sentence(row, unit="", smallest_gain=None):
     if row["verdict"] == NO_SUCH_GAIN:
         shows = f"no gain of {smallest_gain:g}{unit or ' %'}"
     evidence += several if significant(row["p"]) else ""
+    evidence += undirected(row) if significant(row["p_adjusted"]) else ""
     evidence += excluded(row, unit) + cannot_show(row)
     return f"{start} shows {shows}: {evidence}.{borderline(row)}"
 

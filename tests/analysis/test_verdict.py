@@ -7,6 +7,7 @@ import pytest
 import analysis.formatting
 import analysis.verdicts
 from analysis.comparisons import compare_all
+from analysis.robustness import robustness_sentences
 from analysis.studies import Study
 from noisy_wrappers import BASELINE, Configuration
 
@@ -55,8 +56,9 @@ def test_better_needs_the_corrected_p():
 
 def test_p_of_exactly_five_percent_is_enough():
     row = {"smallest_p": 0.01, "p": 0.05 + 1e-15, "p_adjusted": 0.05, "t": 2.0}
+    row |= {"effect_size": np.inf, "difference_percent": np.nan}
     assert analysis.verdicts.verdict(row) == "better"
-    assert analysis.verdicts.verdict(row | {"t": -2.0}) == "worse"
+    assert analysis.verdicts.verdict(row | {"t": -2.0, "effect_size": -1.0}) == "worse"
     assert analysis.verdicts.verdict(row | {"p_adjusted": 0.0501}) == "no clear difference"
     assert analysis.verdicts.verdict(row | {"p": np.nan}) == "too few seeds"
     assert pd.isna(analysis.verdicts.verdict(row | {"smallest_p": np.nan}))
@@ -118,6 +120,23 @@ def test_together_are_the_environments_that_can_tell_something():
     assert compared.noises_together["environments"].tolist() == [2]
     [text] = analysis.verdicts.in_sentences(compared.noises_together)["sentence"]
     assert "PPO on 2 environments together" in text
+
+
+def test_averages_that_differ_in_direction_are_no_verdict():
+    """Three environments gain 1 %, always, and one may lose more."""
+    baseline = np.stack([TEN[:5] + 900] * 3 + [np.array([10.0, 60, 100, 140, 190])], axis=1)
+    noisy = baseline + [10, 10, 10, -25]
+    finals = {BASELINE: baseline, Configuration.parse("RandomEarlyTermination(50)", 1.0): noisy}
+    table = compare_all([study(list("ABCD"), finals)]).noises_together
+    assert table["p"][0] < 0.05 and table["t"][0] > 0 > table["difference_percent"][0]
+    assert list(table["verdict"]) == ["no clear difference"]
+    tested = table.assign(p_holm=table["p"], conditions=1, conditions_tested=1, where="all")
+    tested = tested.assign(clean_change_percent=np.nan)
+    for said in (
+        *analysis.verdicts.in_sentences(table)["sentence"],
+        *robustness_sentences(tested, "return"),
+    ):
+        assert "no clear difference" in said and "direction" in said
 
 
 def test_a_rate_that_alone_ran_everywhere_has_its_own_verdict():
