@@ -15,10 +15,11 @@ import numpy as np
 import pandas as pd
 
 from analysis import verdicts
+from analysis.comparisons import are_in
 from analysis.episodes import read_episodes
 from analysis.folders import RETURN, SUCCESS, DamageError
-from analysis.formatting import p_value, percent
-from analysis.runs import KEYS, STUDY, study_name, study_of, where_tested
+from analysis.formatting import listed, p_value, percent
+from analysis.runs import KEYS, STUDY, rows_of, study_name, study_of, where_tested
 from analysis.statistics import compare, holm, mean_std, percent_of
 from analysis.tables import table_of
 from analysis.words import counted
@@ -36,6 +37,15 @@ SCORE_COLUMNS = [*STUDY, *SCORE_COLUMNS.split()]
 # What a score says, by the sign of the difference
 DIRECTIONS = {1: "returns more under noise", -1: "returns less under noise"}
 DIRECTIONS |= {0: "no clear difference under noise"}
+# Why policies that were tested are not compared
+UNTESTED = (
+    "no policy trained without noise was tested; python evaluate.py, with the folder of all these "
+    "runs and the options of the other tests, plays what is missing"
+)
+NOTHING_SHARED = (
+    "they share no test condition with the policies trained without noise, but for noise on "
+    "rewards and the noise of the training itself, which do not count"
+)
 
 
 def read_robustness(runs, metric=RETURN):
@@ -243,7 +253,8 @@ def analyse_robustness(runs, metric=RETURN):
         score_note = note
         for frame in (scores, table):
             frame[frame.filter(regex="_percent$").columns] = np.nan
-    sentences = robustness_sentences(scores.loc[primary.index], metric)
+    sentences = list(robustness_sentences(scores.loc[primary.index], metric))
+    sentences += not_compared(table, scores)
     more = {"section": "robustness", "only_csv": ("t", "pooled_std", "smallest_p")}
     tables, is_alone = {}, scores["environment"] != ""
     for name, rows in (("robustness_together", ~is_alone), ("robustness_score", is_alone)):
@@ -252,7 +263,23 @@ def analyse_robustness(runs, metric=RETURN):
             part = part.drop(columns="environment")
         tables[name] = table_of(name, part, note=score_note, **more)
     tables["robustness"] = table_of("robustness", table, note=note, only_csv=("score_percent",))
-    return tables, list(sentences)
+    return tables, sentences
+
+
+def not_compared(table, scores):
+    """Yield a sentence where policies trained with noise were tested under noise and have no score.
+
+    table: the results under all conditions.
+    """
+    without, tested = table[table["noise"] == ""], table[table["test_noise"] != ""][KEYS]
+    lost = tested[~are_in(tested, pd.concat([without, scores]))].drop_duplicates()
+    for key, rows in lost.groupby(STUDY):
+        alone = ~rows["environment"].isin(without[rows_of(without, key)]["environment"])
+        for part, why in ((rows[alone], UNTESTED), (rows[~alone], NOTHING_SHARED)):
+            where = listed(sorted(set(part["environment"])))
+            number = counted(len(part), "training configuration")
+            if len(part):
+                yield f"{study_name(*key)} on {where}: {number} not compared under noise: {why}."
 
 
 def robustness_sentences(scores, metric):

@@ -3,7 +3,6 @@
 import gzip
 import json
 import re
-import shutil
 
 import numpy as np
 import pandas as pd
@@ -185,7 +184,7 @@ def test_conditions_and_episodes_that_a_run_lacks_do_not_count(tmp_path, capsys)
 
 
 def test_damaged_and_unfinished_runs(tmp_path, capsys):
-    """They do not count; and without a baseline there is nothing to compare with."""
+    """They do not count."""
     write_tests(tmp_path / "runs", HOPPER, "Hopper-v5")
     damaged, unfinished, *_ = (tmp_path / "runs").glob(f"*{PUSH}*")
     path = damaged / "robustness.csv"
@@ -197,9 +196,24 @@ def test_damaged_and_unfinished_runs(tmp_path, capsys):
     assert row(run(tmp_path)["robustness_score"], noise=PUSH)["n"] == 2
     said = f"{damaged.name} has no tests of robustness: robustness.csv.gz: "
     assert said in capsys.readouterr().out
-    for path in (tmp_path / "runs").glob("*baseline*"):
-        shutil.rmtree(path)
-    assert run(tmp_path)["robustness_score"].empty
+
+
+def test_policies_that_nothing_is_compared_with_are_told(tmp_path):
+    """Where no baseline was tested, and where the training's own noise is the only test."""
+    write_tests(tmp_path, HOPPER, "Hopper-v5")
+    write_tests(tmp_path, {config: HOPPER[config] for config in (("", 0.0), (PUSH, 1.0))}, "A-v0")
+    for path in tmp_path.glob("A-v0*/robustness.csv"):
+        lines = path.read_text().splitlines(keepends=True)
+        path.write_text("".join(line for line in lines if SENSOR not in line))
+    everything, sentences = tables_of(tmp_path)
+    assert set(everything["robustness_score"].frame["environment"]) == {"Hopper-v5"}
+    assert "PPO on A-v0: 1 training configuration not compared" in sentences[-1]
+    assert "evaluate.py" not in sentences[-1] and len(sentences) == 3
+    for path in tmp_path.glob("Hopper*baseline*/robustness.csv"):
+        path.unlink()
+    tables, [untested, _] = tables_of(tmp_path)
+    assert tables["robustness_score"].frame.empty
+    assert "on Hopper-v5: 2 training configurations" in untested and "evaluate.py" in untested
 
 
 def tables_of(runs_dir):
@@ -232,7 +246,7 @@ def test_robustness_of_another_experiment_is_apart(tmp_path):
         config["args"]["exp_name"] = "other"
         path.write_text(json.dumps(config))
     tables, sentences = tables_of(tmp_path)
-    assert tables["robustness_score"].frame.empty and not sentences
+    assert tables["robustness_score"].frame.empty and "evaluate.py" in sentences[0]
     assert set(tables["robustness"].frame["exp_name"]) == {"ppo_continuous_noisy", "other"}
 
 
