@@ -27,11 +27,11 @@ import pandas as pd
 import tyro
 
 from analysis.choice import read_choice
-from analysis.comparisons import are_in, as_chosen, compare_all
+from analysis.comparisons import are_in, as_chosen, compare_all, runs_in
 from analysis.errors import fail, take_over_terminal
 from analysis.figures import INTERVAL, figures, write_figure
 from analysis.folders import CONFIRMATION, RETURN, SUCCESS, is_phase, is_run
-from analysis.formatting import WHOLE_WORDS, in_markdown, shown, text_table
+from analysis.formatting import WHOLE_WORDS, in_markdown, listed, shown, text_table
 from analysis.latex import latex_table
 from analysis.report import Results, write_report
 from analysis.robustness import analyse_robustness, read_robustness
@@ -40,6 +40,7 @@ from analysis.studies import make_studies, version_notes
 from analysis.style import COLUMN, PAGE
 from analysis.tables import in_words, lopsided_notes, make_tables, success_table, table_of
 from analysis.verdicts import POINTS, clear_first, headlines, in_sentences, tally
+from analysis.words import counted
 
 MOST_ROWS = 15  # of the first table in a terminal; the report has all
 # Columns that a terminal may have room for, the most important ones first
@@ -95,13 +96,15 @@ def verdicts_in_short(results):
     yield from results.robustness
 
 
-def overview_of(entries, studies):
+def overview_of(studies):
     """Say in words what was analysed."""
-    parts = [f"Finished runs: {len(finished(entries)):,}."]
+    numbers = [runs_in(study, study.finals).sum() for study in studies]
+    parts = [f"Runs that count: {sum(numbers):,}."]
     parts += [
-        f"{study.name}: {study.steps[-1]:,} steps, seeds: {len(study.seeds)}, "
-        f"environments: {len(study.environments)}, noise configurations: {len(study.finals) - 1}."
-        for study in studies
+        f"{study.name}: {counted(number, 'run')} of {study.steps[-1]:,} steps, seeds: "
+        f"{len(study.seeds)}, environments: {len(study.environments)}, noise configurations: "
+        f"{len(study.finals) - 1}."
+        for study, number in zip(studies, numbers, strict=True)
     ]
     return " ".join(parts)
 
@@ -140,6 +143,8 @@ def print_left_out(missing, width):
 def print_results(out, results):
     """Print the verdicts, what to know about them, and where the report is."""
     width, tables = terminal_width(), results.tables
+    of_success = results.studies[0].metric == SUCCESS
+    unit = " (rates of success in percent, differences in percentage points)" if of_success else ""
 
     def say(text):
         print(textwrap.fill(text, width, subsequent_indent="  ", **WHOLE_WORDS))
@@ -149,11 +154,11 @@ def print_results(out, results):
     print()
     first = tables["noises"]
     if 0 < len(first.frame) <= MOST_ROWS:
-        say("Does a noise help at all? Its rates together, against no noise:")
+        say(f"Does a noise help at all? Its rates together, against no noise{unit}:")
         first = replace(first, view=in_words(first.frame, "noises"))
         print(f"\n{text_table(first, width)}\n")
     if len(tables["best"].frame) and "best" not in results.repeated:
-        say("The best noise in each environment, which may still be worse than no noise:")
+        say(f"The best noise in each environment, which may still be worse than no noise{unit}:")
         print(f"\n{text_table(tables['best'], width)}\n")
     say(results.overview)
     for note in results.notes + results.versions:
@@ -184,9 +189,12 @@ def analyse(args, entries, choice):
     tables = make_tables(studies, compared) | robustness_tables
     if metric == SUCCESS:
         told = {environment for study in studies for environment in study.environments}
-        silent = sorted({run.environment for run in finished(entries)} - told)
+        silent = [run.environment for run in finished(entries) if run.environment not in told]
         if silent:
-            notes.append(f"left out, because they never tell success: {', '.join(silent)}")
+            notes.append(
+                f"not judged, because their environments never tell success: "
+                f"{counted(len(silent), 'run')} on {listed(sorted(set(silent)))}"
+            )
         for name, table in tables.items():
             tables[name] = replace(table, caption=table.caption.replace("return", metric))
     else:
@@ -223,7 +231,7 @@ def analyse(args, entries, choice):
             compared.rates[~are_in(compared.rates, compared.noises)],
         ),
         robustness=robustness,
-        overview=overview_of(entries, studies),
+        overview=overview_of(studies),
         problems=f"Runs left out: {number.sum():,} ({counts})." if len(number) else "",
         notes=[*incomplete_note(number, compared), *lopsided_notes(compared), *notes, *unreadable],
         versions=version_notes(entries),

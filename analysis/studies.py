@@ -118,16 +118,17 @@ def shared_steps(runs):
 def notes_on(study, runs):
     """Say what to know of a study: runs that were cut, and what it lacks."""
     notes = []
-    ended = [run for run in runs if run.curve.steps[-1] < run.total_timesteps]
-    if ended:
-        last = [run.curve.steps[-1] for run in ended]
-        steps = " to ".join(f"{step:,}" for step in sorted({min(last), max(last)}))
-        notes.append(
-            f"{study.name}: runs that ended by themselves before their "
-            f"{runs[0].total_timesteps:,} steps: {len(ended)} of {len(runs)}, at step {steps}; "
-            "they count with their own last tests"
-        )
     for e, env in enumerate(study.environments):
+        here = [run for run in runs if run.environment == env]
+        ended = [run for run in here if run.curve.steps[-1] < run.total_timesteps]
+        if ended:
+            last = [run.curve.steps[-1] for run in ended]
+            steps = " to ".join(f"{step:,}" for step in sorted({min(last), max(last)}))
+            notes.append(
+                f"{study.name} on {env}: runs that ended by themselves before their "
+                f"{runs[0].total_timesteps:,} steps: {len(ended)} of {len(here)}, at step {steps}; "
+                "they count with their own last tests"
+            )
         if study.phase != SEARCH and len(study.sample(BASELINE, e)) == 0:
             notes.append(f"{study.name}: no finished baseline on {env}, so no comparison there")
     versions = defaultdict(list)

@@ -121,7 +121,7 @@ def test_a_damaged_run_hides_no_other_anywhere(case, capsys):
     for folder in case.bad:
         damage(folder)
     assert analyze.main(analyze.Args(case.runs, case.runs.parent / "out")) == 1
-    assert "Finished runs: 3." in capsys.readouterr().out
+    assert "Runs that count: 3." in capsys.readouterr().out
     missing = (case.runs.parent / "out/missing.csv").read_text()
     assert case.bad[1].name in missing and said in missing
 
@@ -160,7 +160,7 @@ def test_what_is_no_run_is_left_alone(case, capsys):
     assert view("status", "--runs-dir", case.runs) == 0
     assert evaluate.main(evaluate.Args(tuple(case.runs.iterdir()), episodes=1)) == 0
     out, err = capsys.readouterr()
-    assert "Finished runs: 4." in out and "5 runs: 4 done" in out
+    assert "Runs that count: 4." in out and "5 runs: 4 done" in out
     assert "(1 unfinished, 2 missing)" in out and "unfinished runs are left out: 1" in out
     assert "delete" not in out + err and not err
 
@@ -189,7 +189,7 @@ def test_a_folder_that_cannot_be_entered_hides_no_run(case):
     shown = subprocess.run(words, capture_output=True, text=True)
     case.bad[1].chmod(0o755)
     assert shown.returncode == 1, shown.stderr
-    assert "Finished runs: 3." in shown.stdout and "(1 corrupt" in shown.stdout
+    assert "Runs that count: 3." in shown.stdout and "(1 corrupt" in shown.stdout
     missing = (case.runs / "results/missing.csv").read_text()
     assert case.bad[1].name in missing and "config.json: Permission denied" in missing
 

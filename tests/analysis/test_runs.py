@@ -135,7 +135,8 @@ def test_the_most_frequent_arguments_of_an_exp_name_are_its_study(tmp_path, caps
     studies, _ = make_studies(entries)
     assert [study.name for study in studies] == ["SAC", "SAC [trial]"]
     assert reason in set(run(tmp_path)["missing"]["reason"])
-    assert "1 different" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "Runs that count: 7. SAC: 6 runs of" in said and "1 different" in said
 
 
 def test_an_argument_that_a_run_of_0_3_lacks_is_no_difference(tmp_path):
@@ -218,6 +219,8 @@ def test_a_run_that_ended_by_itself_counts_with_its_own_last_tests(tmp_path):
     curve = study.curves[BASELINE][:, 2, 0]
     assert curve[:3].tolist() == [1, 2, 3] and np.isnan(curve[3:]).all()
     assert "ended by themselves before their 100,000 steps: 1 of 3, at step 34,567" in notes[0]
+    write_run(tmp_path, [1], env="Pusher-v5", total_timesteps=100_000)
+    assert make_studies(read_runs(tmp_path))[1][0] == notes[0]  # also by success, on Hopper alone
 
 
 @pytest.mark.parametrize(

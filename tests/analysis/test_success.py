@@ -47,7 +47,9 @@ def test_the_verdict_is_in_percentage_points(runs_dir, capsys):
     found = rf"{ENV} with {re.escape(SCALE)} at rate 1.00 is better than no noise: \+40 \[.*\]"
     assert re.search(f"{found} percentage points of success, p = 0.048", said)
     assert not re.search(r"\(\+\d+ %\)", said)
-    assert "note: left out, because they never tell success: Hopper-v5\n" in said
+    assert "Runs that count: 10. SAC: 10 runs of" in said
+    assert "never tell success: 1 run on Hopper-v5\n" in said
+    assert re.search(r"against no noise \(.* in percentage points\):\n", said)
     for name in ("best", "noises", "summary_SAC"):
         table = pd.read_csv(out / f"{name}.csv")
         assert len(table) and table.filter(regex="_percent$").isna().all(axis=None)
