@@ -110,8 +110,8 @@ def fitting(text, points):
 def latex_table(table, text, inches):
     """Write a table in LaTeX that is at most so wide; text: as a person reads it.
 
-    Columns are left out where there is no room for them, and a comment names them. A value that is
-    that of the row above is not said again. What all rows share is said in the caption.
+    Columns are left out where there is no room for them, and a comment names them. What all rows
+    share is said in the caption.
     """
     caption = f"{table.caption} {table.note}".strip()
     shared = [name for name in OF_STUDY if name in text and text[name].nunique() == 1]
@@ -121,6 +121,7 @@ def latex_table(table, text, inches):
     if len(text):
         text = text.loc[:, (text != DASH).any()]  # a column of dashes says nothing
     columns, left_out = fitting(text, 72 * inches)
+    rows = [" & ".join(row) + r" \\" for row in zip(*(c.cells for c in columns), strict=True)]
     lines = []
     if left_out:
         lines.append(f"% no room for: {', '.join(left_out)} (see {table.name}.csv)")
@@ -137,19 +138,9 @@ def latex_table(table, text, inches):
             r"\toprule",
             " & ".join(column.head for column in columns) + r" \\",
             r"\midrule",
-            *rows_of(columns, start, min(start + MOST_ROWS, len(text))),
+            *rows[start : start + MOST_ROWS],
             r"\bottomrule",
             r"\end{tabular}}",
             r"\end{table*}",
         ]
     return "\n".join(lines) + "\n"
-
-
-def rows_of(columns, start, end):
-    """Yield the rows of a table; a text that the row above has, too, is left out."""
-    for i in range(start, end):
-        cells, same = [], i > start
-        for column in columns:
-            same = same and column.form not in NUMBERS and column.cells[i] == column.cells[i - 1]
-            cells.append("" if same else column.cells[i])
-        yield " & ".join(cells) + r" \\"

@@ -33,7 +33,7 @@ _COLUMNS = {
         difference difference_percent p p_adjusted luck_median luck_95 p_luck n n_baseline
         chosen_from""",
     "consistency": """noise noise_rate percent_of_environments average_improvement_percent
-        std_improvement_percent p p_adjusted environments without_percent n fails_at_every_rate""",
+        std_improvement_percent p p_adjusted environments without_percent n""",
     "success": """environment noise noise_rate mean std baseline_mean baseline_std difference
         difference_low difference_high p p_adjusted n n_baseline""",
     "early_performance": "environment noise steps_millions noise_rate mean std n",
@@ -113,11 +113,9 @@ def split_consistency(consistency):
     share = consistency["percent_of_environments"]
     shares = ["percent_of_environments", "average_improvement_percent"]
     ascending = [True] * len(STUDY) + [False] * len(shares)
-    good = consistency[share >= CONSISTENT_PERCENT].drop(columns="fails_at_every_rate")
+    good = consistency[share >= CONSISTENT_PERCENT]
     good = good.sort_values([*STUDY, *shares], ascending=ascending, kind="stable")
-    highest = share.groupby([consistency[name] for name in (*STUDY, "noise")]).transform("max")
-    bad = consistency.assign(fails_at_every_rate=np.where(highest == 0, "yes", "no"))[share == 0]
-    return good, bad
+    return good, consistency[share == 0]
 
 
 def lopsided_notes(compared):
@@ -210,9 +208,6 @@ def make_tables(studies, compared):
     good, bad = split_consistency(pd.DataFrame(rows, columns=COLUMNS["consistency"]))
     returns = (row for study in studies for row in early_rows(study))
     early = pd.DataFrame(returns, columns=COLUMNS["early_performance"])
-    failing = bad[bad["fails_at_every_rate"] == "yes"][[*STUDY, "noise"]].drop_duplicates()
-    failing = "; ".join(f"{noise} ({study_name(*study)})" for *study, noise in failing.values)
-    failing = f"Lower at every rate that was tried: {failing or 'none'}."
     note = percent_note(judged, metric)
     has_comparison = judged["difference"].notna()
     rates = judged.assign(n_baseline=judged["n_baseline"].where(has_comparison))
@@ -222,7 +217,7 @@ def make_tables(studies, compared):
         table_of("noises", compared.noises, only_csv=MORE, note=note),
         table_of("best", best, view=in_words(best, "best"), note=note),
         table_of("consistent", good, note=note),
-        table_of("consistently_worse", bad, note=f"{failing} {note}".strip()),
+        table_of("consistently_worse", bad, note=note),
         table_of(
             "statistics_together", compared.rates_together, section="statistics", only_csv=ONLY_CSV
         ),

@@ -41,7 +41,7 @@ def test_what_rows_share_is_said_once():
     columns = {"algorithm": ["SAC"] * 3, "environment": ["Hopper-v5"] * 2 + ["Ant-v5"]}
     text = table_of(columns | {"noise": ["A", "B", "B"], "n": [5, 5, 5]})
     assert r"\caption{SAC: Caption.}" in text
-    assert rows_of(text) == ["Hopper-v5 & A & 5", " & B & 5", "Ant-v5 & B & 5"]
+    assert rows_of(text) == ["Hopper-v5 & A & 5", "Hopper-v5 & B & 5", "Ant-v5 & B & 5"]
 
 
 def test_a_long_table_goes_on_in_others():

@@ -112,17 +112,6 @@ def test_consistent_is_80_percent_or_more_best_first():
     assert list(good["noise"]) == ["c", "e", "a"] and list(bad["noise"]) == ["f"]
 
 
-def test_fails_at_every_rate_needs_every_rate(tmp_path):
-    configs = [((), (), 10), (SCALE, 0.1, 5), (SCALE, 0.2, 20), (ENDING, 0.1, 5), (ENDING, 0.2, 9)]
-    for noise, rate, final in configs:
-        for env in ("Hopper-v5", "Walker2d-v5"):
-            write_run(tmp_path / "runs", [final], env=env, noise=noise, rate=rate)
-    table = run(tmp_path)["consistently_worse"].set_index("noise")["fails_at_every_rate"]
-    assert table[SCALE] == "no" and set(table[[ENDING]]) == {"yes"}
-    text = (tmp_path / "results/consistently_worse.md").read_text()
-    assert f"every rate that was tried: {ENDING} (SAC)." in text
-
-
 def test_early_performance(sweep):
     table = sweep["early_performance"]
     assert set(table["steps_millions"]) == {0.01, 0.02, 0.03, 0.04, 0.05}  # fifths of a short run
