@@ -10,7 +10,6 @@ from matplotlib.patches import Patch
 from analysis import style
 from analysis.folders import SUCCESS
 from analysis.formatting import seeds_between
-from analysis.power import detectable_shift
 from analysis.statistics import SEEDS_FOR_INTERVAL
 from analysis.verdicts import BETTER, UNCLEAR, WORSE
 from noisy_wrappers import BASELINE, rate_order
@@ -33,8 +32,8 @@ def effects_caption(study, rows):
     if has_few(rows).any():
         text += (
             " With fewer than five, small dots are the seeds, and a difference beyond the grey bar "
-            "would be found in 80 % of cases (three against three find none: then the bar is that "
-            "of four against four)."
+            "would be found in 80 % of cases: the column detectable of the csv file. Where the bar "
+            "spans the panel, no difference would."
         )
     return text
 
@@ -144,9 +143,11 @@ def forest_panel(ax, study, rows, lines):
             ends = row.difference_low, row.difference_high
             ax.hlines(y, *ends, color=mark.get_color(), linewidth=1.1)
         if few:
-            numbers = (max(4, int(n)) for n in (row.n, row.n_baseline))
-            shift = detectable_shift(*numbers) * row.pooled_std
-            ax.hlines(y, -shift, shift, color="0.88", linewidth=6, zorder=0.5)
+            bar = {"color": "0.88", "linewidth": 6, "zorder": 0.5}
+            if np.isnan(row.detectable):
+                ax.axhline(y, **bar)
+            else:
+                ax.hlines(y, -row.detectable, row.detectable, **bar)
             rates = row.noise_rate.split(", ")
             same = [c for c in study.finals if c.noise == row.noise and c.noise_rate in rates]
             seeds = np.concatenate([study.sample(config, e) for config in same])

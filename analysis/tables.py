@@ -22,9 +22,9 @@ _NOISES = ["verdict", "noise", "algorithm, environment", "difference", "p_adjust
 IN_WORDS = {"best": _BEST, "noises": [*_NOISES, "noise_rate"]}
 DIFFERENCE = ["difference", "difference_low", "difference_high"]
 DIFFERENCE += ["difference_percent", "percent_low", "percent_high"]
-MORE = ["t", "pooled_std", "environments", "comparisons", "smallest_p"]
+MORE = ["t", "pooled_std", "environments", "comparisons", "smallest_p", "detectable"]
 NOISES = ["noise", "noise_rate", "verdict", *DIFFERENCE, "effect_size", "p", "p_adjusted", "n"]
-RATES = [*NOISES, "n_baseline", "n_baseline_most", "detectable"]
+RATES = [*NOISES, "n_baseline", "n_baseline_most"]
 NOISES += ["n_baseline", "n_baseline_most", *MORE]
 _COLUMNS = {
     "summary": """environment noise noise_rate n mean std n_baseline baseline_mean baseline_std
@@ -45,7 +45,7 @@ COLUMNS = {name: text.split() for name, text in _COLUMNS.items()} | {
     "statistics_together": [*RATES, *IQM_CHANGE, *PROBABILITY, *MORE],
 }  # after those that name a study
 COLUMNS = {name: [*STUDY, *columns] for name, columns in COLUMNS.items()}
-ONLY_CSV = (*IQM, *MORE, "detectable")  # wide tables lack these where people read them
+ONLY_CSV = (*IQM, *MORE)  # wide tables lack these where people read them
 
 # --------------------------------------------------------------------------------------------- rows
 

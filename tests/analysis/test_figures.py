@@ -5,7 +5,7 @@ from itertools import combinations, product
 import numpy as np
 import pandas as pd
 import pytest
-from sweeps import ENDING, NAN, SCALE, drawn_of, small_sweep, write_pairs, write_run
+from sweeps import ENDING, NAN, SCALE, drawn_of, run, small_sweep, write_pairs, write_run
 
 import analysis.effects
 import analysis.figures
@@ -106,21 +106,23 @@ def test_effects_are_rows_with_filled_marks_where_verdicts_are_clear(tmp_path):
     assert looks == [{2: better, 3: "white"}, {0: worse, 1: "white"}]
 
 
-@pytest.mark.parametrize(("seeds", "reach"), [(3, 30), (4, 30), (5, None)])
-def test_few_seeds_are_shown_with_room_for_what_could_be_found(seeds, reach, tmp_path):
-    spread = 10 * np.arange(seeds)
-    write_pairs(tmp_path, 100 + spread, 101 + spread)
-    [ax] = drawn_of(tmp_path)["effects_SAC"].draw().axes
+@pytest.mark.parametrize("seeds", [3, 4, 5])
+def test_few_seeds_are_shown_with_what_could_be_found(seeds, tmp_path):
+    """As the column detectable has it; three against three find nothing, however large."""
+    noisy, baseline = 20.0 * np.arange(seeds), 10.0 * np.arange(7 if seeds == 4 else seeds)
+    write_pairs(tmp_path / "runs", baseline, noisy)
+    found = run(tmp_path)["noises"]["detectable"].item()
+    [ax] = drawn_of(tmp_path / "runs")["effects_SAC"].draw().axes
     dots = [line.get_xdata().tolist() for line in ax.lines if line.get_marker() == "."]
-    if reach is None:
-        assert not dots
-        return
-    assert dots == [
-        pytest.approx(spread - spread.mean()),
-        pytest.approx(1 + spread - spread.mean()),
-    ]
-    low, high = ax.get_xlim()
-    assert low < -reach and high > reach
+    bars = [bar.get_segments()[0][:, 0] for bar in ax.collections]
+    whole = [line for line in ax.lines if line.get_linewidth() == 6]
+    assert np.isnan(found) == (len(whole) == 1) == (seeds == 3)
+    shown = [values - baseline.mean() for values in (baseline, noisy) if len(values) < 5]
+    assert dots == [pytest.approx(values) for values in shown]
+    if seeds == 4:
+        assert bars == [pytest.approx([-found, found])]
+        low, high = ax.get_xlim()
+        assert low < -found and high > found
 
 
 def test_effects_of_many_configurations_have_a_line_a_noise(tmp_path):
