@@ -10,6 +10,7 @@ from matplotlib.patches import Patch
 from analysis import style
 from analysis.folders import SUCCESS
 from analysis.formatting import seeds_between
+from analysis.power import CONFIDENCE
 from analysis.statistics import SEEDS_FOR_INTERVAL
 from analysis.verdicts import BETTER, UNCLEAR, WORSE
 from noisy_wrappers import BASELINE, rate_order
@@ -24,8 +25,9 @@ def effects_caption(study, rows):
     """Say what effects_figure shows."""
     clear = rows["verdict"].isin(style.COLORS).any()
     text = (
-        f"{study.name}: difference from no noise in mean final {study.metric}, with its 95 % "
-        "interval from five seeds on, by noise and rate; every environment has its own scale. "
+        f"{study.name}: difference from no noise in mean final {study.metric}, with its "
+        f"{CONFIDENCE} interval from five seeds on, by noise and rate; every environment has its "
+        "own scale. "
     )
     text += "Filled marks are clear verdicts" if clear else "No single verdict is clear"
     text += ". n: seeds (with / without noise)."

@@ -15,7 +15,7 @@ from analysis import effects, style
 from analysis.folders import RETURN, SUCCESS
 from analysis.formatting import seeds_between, seeds_of, slug
 from analysis.heatmap import heatmaps
-from analysis.power import LEVEL
+from analysis.power import CONFIDENCE, LEVEL
 from analysis.runs import KEYS, rows_of
 from analysis.statistics import SEEDS_FOR_INTERVAL
 from noisy_wrappers import BASELINE, rate_order
@@ -23,7 +23,7 @@ from noisy_wrappers import BASELINE, rate_order
 COLUMN_END = "_column"  # of the name of a figure that is as wide as a column
 INTERVAL, STD = "interval", "std"  # what a band shows
 BANDS = {
-    INTERVAL: "the 95 % interval of the mean, with fewer than five seeds each seed",
+    INTERVAL: f"the {CONFIDENCE} interval of the mean, with fewer than five seeds each seed",
     STD: "\u00b1 one standard deviation over seeds",
 }
 LABELS = {RETURN: "test return", SUCCESS: "test success rate (%)"}

@@ -9,6 +9,7 @@ import scipy
 from analysis.permutation import partitions, tails, welch_t
 
 LEVEL, POWER = 0.05, 0.8
+CONFIDENCE = f"{100 * (1 - LEVEL):g} %"  # of all intervals, in captions
 
 
 @cache

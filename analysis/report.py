@@ -15,6 +15,7 @@ from markupsafe import Markup, escape
 
 from analysis.figures import COLUMN_END
 from analysis.formatting import DASH, shown, title
+from analysis.power import CONFIDENCE, LEVEL
 from analysis.verdicts import tally
 
 SECTIONS = {
@@ -35,18 +36,18 @@ FIGURES_OF = {"best_curves": "early_performance", "curves": "early_performance"}
 FOLDED = ("curves", "parameters")  # where there are several: one for each noise
 # What the columns of tables say, and the words of verdicts; for people who have only the report
 TERMS = {
-    "better": """The final mean is higher than without noise; p corrected is at most 0.05. (For a
-        confirmation of `./benchmark.sh choose`: by the rule of that.)""",
+    "better": f"""The final mean is higher than without noise; p corrected is at most {LEVEL}. (For
+        a confirmation of `./benchmark.sh choose`: by the rule of that.)""",
     "worse": "The final mean is lower than without noise; otherwise as better.",
-    "no clear difference": """p corrected is above 0.05: the noise may help a little, harm a little,
-        or do nothing. The interval says how much of either is excluded. Also where averages over
-        environments differ in their direction.""",
+    "no clear difference": f"""p corrected is above {LEVEL}: the noise may help a little, harm a
+        little, or do nothing. The interval says how much of either is excluded. Also where averages
+        over environments differ in their direction.""",
     "no such gain": "The interval excludes a gain as large as --smallest-gain asked for.",
     "too few seeds": "One side has fewer than two seeds, so nothing can be tested.",
     "all equal": "All tests of all runs have the same result, so nothing can be compared.",
     "noise rate": "The probability with which the noise acts, at each step or in each episode.",
-    "difference": """The final mean with noise minus that without, and its 95 % interval (Welch's),
-        which needs five seeds on both sides.""",
+    "difference": f"""The final mean with noise minus that without, and its {CONFIDENCE} interval
+        (Welch's), which needs five seeds on both sides.""",
     "difference %": """The same in percent of the mean without noise, where that is clearly not
         zero; its interval is Fieller's.""",
     "effect size": """The difference in standard deviations over seeds; over several environments
@@ -64,7 +65,7 @@ TERMS = {
         by at least what was observed.""",
     "steps to baseline": """The first step at which the mean over seeds reaches the final mean
         without noise.""",
-    "IQM": "Interquartile mean over seeds, with its 95 % interval.",
+    "IQM": f"Interquartile mean over seeds, with its {CONFIDENCE} interval.",
     "IQM change %": "The change of the interquartile mean, in percent of that without noise.",
     "P(improvement)": "The probability that a run with noise returns more than one without.",
     "average improvement %": """Mean and standard deviation over environments of the difference in
@@ -155,6 +156,7 @@ def write_report(out, results, drawn):
         figures=figures,
         folded=folded,
         column_end=COLUMN_END,
+        level=LEVEL,
         terms={name: text for name, text in TERMS.items() if name in used},
     )
     (out / "report.html").write_text(html, "utf-8")

@@ -10,6 +10,7 @@ from analysis.comparisons import IQM, IQM_CHANGE, PROBABILITY, compare_all, resu
 from analysis.folders import SEARCH, SUCCESS
 from analysis.formatting import Table, listed, seeds_of, slug
 from analysis.luck import add_luck, luck_of_studies
+from analysis.power import CONFIDENCE
 from analysis.runs import KEYS, STUDY, study_name
 from analysis.verdicts import ALL_EQUAL
 from noisy_wrappers import BASELINE
@@ -147,8 +148,8 @@ def success_table(studies):
 
 # At most two lines in the report; docs/statistics.md says how the numbers are computed.
 CAPTIONS = {
-    "noises": """Does a noise help at all? All its runs, its rates together, against no noise: the
-difference of the mean final returns with its 95 % interval. n: runs.""",
+    "noises": f"""Does a noise help at all? All its runs, its rates together, against no noise: the
+difference of the mean final returns with its {CONFIDENCE} interval. n: runs.""",
     "noises_together": """Does a noise help at all? The same over all environments, which count
 equally. The effect size is the median difference in standard deviations.""",
     "best": """The best noise in each environment, which may still be worse than no noise. Mean
@@ -160,8 +161,9 @@ or more environments. Average improvement \u00b1 standard deviation over environ
 rate (0.00: no noise), with the number of seeds in brackets.""",
     "summary": """Final test return of every configuration: mean \u00b1 standard deviation over n
 seeds, and the difference from no noise. Here p is not corrected.""",
-    "statistics": """Every rate alone against no noise, which is secondary: the difference of the
-mean final returns with its 95 % interval, and its test. Effect sizes are standard deviations.""",
+    "statistics": f"""Every rate alone against no noise, which is secondary: the difference of the
+mean final returns with its {CONFIDENCE} interval, and its test. Effect sizes are standard
+deviations.""",
     "statistics_together": """The same over all environments, which count equally.""",
     "success": """Success rate in the final test, in percent of its episodes: mean \u00b1 standard
 deviation over n seeds, and the difference from no noise in percentage points.""",
