@@ -70,6 +70,9 @@ def read_robustness(runs, metric=RETURN):
     table = pd.DataFrame(rows, columns=RUN_COLUMNS)
     place = [table["environment"], table["condition"]]
     told = table["mean"].map(np.mean).notna().groupby(place).transform("any")
+    silent = table[~told].groupby(["environment", "condition"]).ngroups
+    if silent:
+        notes.append(f"no test of robustness tells success in {counted(silent, 'test condition')}")
     table, more = shortened(table[told])
     return table.fillna({"mean": 0.0}), notes + more
 
@@ -162,6 +165,7 @@ def score_rows(runs, metric=RETURN):
     Tests in another environment are apart: they leave those at home as they are.
     """
     for _, group in runs.groupby(STUDY):
+        tested = group.loc[group["elsewhere"] == "", "environment"].nunique()
         for config in sorted({*group["configuration"]} - {BASELINE}):
             scores = [
                 environment_score(same, config, metric) for _, same in group.groupby("environment")
@@ -171,7 +175,7 @@ def score_rows(runs, metric=RETURN):
             counting = [score for score in at_home if min(score["n"], score["n_baseline"]) >= 2]
             counting = counting or at_home
             if len(counting) > 1:
-                of = f"{len(counting)} of {len(at_home)}" if len(counting) < len(at_home) else "all"
+                of = f"{len(counting)} of {tested}" if len(counting) < tested else "all"
                 where = f"{of} environments together"
                 yield average_score(counting, metric) | {"primary": True, "where": where}
             for score in scores:

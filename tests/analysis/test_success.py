@@ -121,6 +121,7 @@ def test_robustness_is_judged_by_success(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "returns more under noise over 1 of 1 test condition (+40 [" in said
     assert "] percentage points of success, p = 0.0079" in said
+    assert "no test of robustness tells success in 1 test condition\n" in said
     scores = pd.read_csv(tmp_path / "out/robustness_score.csv")
     assert scores["difference"].tolist() == [40] and scores["conditions"].tolist() == [1]
     assert scores.filter(regex="percent$").isna().all(axis=None)
