@@ -134,7 +134,7 @@ def lopsided_notes(compared):
             seeds = sorted({seeds_of(*pair) for pair in group[["n", "n_baseline"]].to_numpy()})
             notes.append(
                 f"{study_name(*key)}, {', '.join(group['environment'].unique())}: with "
-                f"{listed(seeds)} seeds with and without noise {said}"
+                f"{listed(seeds)} runs with and without noise {said}"
             )
     return notes
 

@@ -167,16 +167,16 @@ def undirected(row):
 
 
 def cannot_show(row):
-    """Say where the seeds of a comparison cannot show any difference, or ""."""
+    """Say where the runs of a comparison cannot show any difference, or ""."""
     if significant(row.smallest_p):
         return ""
     n, m, most = int(row.n), int(row.n_baseline), int(row.n_baseline_most)
-    seeds = counted(n, "seed")
+    runs = counted(n, "run")
     if m < most:
-        seeds += f" against {m} to {most}"
+        runs += f" against {m} to {most}"
     elif n != m:
-        seeds += f" against {m}"
-    return f"; {seeds} cannot show any (smallest possible p: {p_text(row.smallest_p)})"
+        runs += f" against {m}"
+    return f"; {runs} cannot show any (smallest possible p: {p_text(row.smallest_p)})"
 
 
 # ---------------------------------------------------------------------------------------- sentences

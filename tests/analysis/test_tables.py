@@ -58,7 +58,7 @@ def test_rates_with_too_few_of_all_seeds_have_no_verdict(tmp_path, capsys):
     rates = tables["statistics"].query("noise == @SCALE")
     assert rates[["p", "verdict"]].isna().all(axis=None) and rates["difference_low"].notna().all()
     assert tables["noises"]["verdict"].tolist() == ["better"]  # 10 against 20
-    assert "with 5/20 seeds with and without noise single rates" in capsys.readouterr().out
+    assert "with 5/20 runs with and without noise single rates" in capsys.readouterr().out
 
 
 def test_a_note_on_lopsided_seeds_needs_a_verdict(tmp_path, capsys):

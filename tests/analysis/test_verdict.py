@@ -73,7 +73,7 @@ def test_few_seeds():
     expected = "better than no noise: +100.0 (+870 %), p = 0.029 (smallest possible: 0.029; too few"
     assert expected in said["sentence"].iloc[0]
     _, said = judge([10.0, 11, 12], [9.0, 10])
-    assert "2 seeds against 3 cannot show any (smallest possible p" in said["sentence"].iloc[0]
+    assert "2 runs against 3 cannot show any (smallest possible p" in said["sentence"].iloc[0]
     _, said = judge([10.0], [5.0])
     assert said["verdict"].tolist() == ["too few seeds"]
     _, said = judge([5.0] * 5, [5.0] * 5)
