@@ -19,7 +19,7 @@ from analysis.comparisons import are_in
 from analysis.episodes import read_episodes
 from analysis.folders import RETURN, SUCCESS, DamageError
 from analysis.formatting import listed, p_value, percent
-from analysis.runs import KEYS, STUDY, rows_of, study_name, study_of, where_tested
+from analysis.runs import KEYS, STUDY, study_name, study_of, where_tested
 from analysis.statistics import compare, holm, mean_std, percent_of
 from analysis.tables import table_of
 from analysis.words import counted
@@ -37,15 +37,6 @@ SCORE_COLUMNS = [*STUDY, *SCORE_COLUMNS.split()]
 # What a score says, by the sign of the difference
 DIRECTIONS = {1: "returns more under noise", -1: "returns less under noise"}
 DIRECTIONS |= {0: "no clear difference under noise"}
-# Why policies that were tested are not compared
-UNTESTED = (
-    "no policy trained without noise was tested; python evaluate.py, with the folder of all these "
-    "runs and the options of the other tests, plays what is missing"
-)
-NOTHING_SHARED = (
-    "they share no test condition with the policies trained without noise, but for noise on "
-    "rewards and the noise of the training itself, which do not count"
-)
 
 
 def read_robustness(runs, metric=RETURN):
@@ -275,15 +266,16 @@ def not_compared(table, scores):
 
     table: the results under all conditions.
     """
-    without, tested = table[table["noise"] == ""], table[table["test_noise"] != ""][KEYS]
-    lost = tested[~are_in(tested, pd.concat([without, scores]))].drop_duplicates()
-    for key, rows in lost.groupby(STUDY):
-        alone = ~rows["environment"].isin(without[rows_of(without, key)]["environment"])
-        for part, why in ((rows[alone], UNTESTED), (rows[~alone], NOTHING_SHARED)):
-            where = listed(sorted(set(part["environment"])))
-            number = counted(len(part), "training configuration")
-            if len(part):
-                yield f"{study_name(*key)} on {where}: {number} not compared under noise: {why}."
+    tested = table[(table["noise"] != "") & (table["test_noise"] != "")][KEYS].drop_duplicates()
+    for key, rows in tested[~are_in(tested, scores)].groupby(STUDY):
+        where = listed(sorted(set(rows["environment"])))
+        yield (
+            f"{study_name(*key)} on {where}: {counted(len(rows), 'training configuration')} not "
+            "compared under noise, because no policy trained without noise was tested under the "
+            "same conditions; python evaluate.py, with the folder of all these runs and the "
+            "options of the other tests, plays what is missing (noise on rewards and the noise of "
+            "the training itself do not count)."
+        )
 
 
 def robustness_sentences(scores, metric):

