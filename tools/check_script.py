@@ -25,7 +25,7 @@ from analysis.formatting import rounded
 def trains(trial):
     """It trains."""
     check(trial.run.updates, "nothing was updated: let updater() take the gradients in learn()")
-    return "".join(f" (with these options nothing learns by {name}())" for name in trial.run.idle)
+    return "".join(watched_run.remarks(trial.run))
 
 
 def acts(trial):

@@ -23,6 +23,7 @@ from torch.overrides import TorchFunctionMode
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import noisy_wrappers as noisy  # noqa: E402
+from analysis.errors import fail  # noqa: E402
 from sweep.options import GIVEN_BY_THE_GRID  # noqa: E402
 
 # A test and the end of a rollout fall within an episode; the buffer is filled twice.
@@ -107,8 +108,13 @@ class Trial:
 
     @functools.cached_property
     def run(self):
-        """The run that others are compared with."""
-        return self.train("whole")
+        """The run that others are compared with; exits where the script refuses the options."""
+        try:
+            return self.train("whole")
+        except BrokenError as error:
+            if self.options and getattr(error.__cause__, "code", 0) == 2:
+                fail(str(error).removeprefix("error: "))
+            raise
 
     @functools.cached_property
     def resumed(self):
@@ -165,15 +171,14 @@ def train(path, options, runs_dir, episodes=0, updates=0, **changed):
             small = {name: value for name, value in SMALL.items() if hasattr(args, name)}
             args = tyro.cli(script.Args, args=options, default=replace(args, **small))
             seen.args = replace(args, **{"runs_dir": str(runs_dir)} | changed)
-            seen.folder = noisy.run_folder(asdict(seen.args))
             script.updater = watch_updates(script.updater, seen)
             script.learn = watch_environment(script.learn, seen)
             script.Run.resume = watch_networks(script.Run.resume, seen)
             seen.finished = script.train(seen.args, stop)
         except SystemExit as error:
-            lines = re.sub("[╭─╮│╰╯]+", "", said.getvalue()).strip().splitlines()
-            ours = [line for line in lines if line.startswith("error: ")]
-            raise BrokenError(ours[-1] if ours else " ".join(lines)) from error
+            text = re.sub("[╭─╮│╰╯]+|-{3,}", "", said.getvalue())
+            ours = [line for line in text.splitlines() if line.startswith("error: ")]
+            raise BrokenError(ours[-1] if ours else " ".join(text.split())) from error
     seen.said = said.getvalue()
     return seen
 
@@ -195,7 +200,8 @@ def watch_updates(updater, seen):
         before = {name: p.detach().clone() for name, p in parameters.items()}
         own = SimpleNamespace(name=getattr(loss, "__name__", "a loss"), loss=loss, network=network)
         own.parameters, known = parameters, set(map(id, network.parameters()))
-        stepped = {id(p) for group in optimizer.param_groups for p in group["params"]}
+        own.optimizer = optimizer
+        own.stepped = stepped = {id(p) for group in optimizer.param_groups for p in group["params"]}
         text = f"the optimizer of {own.name}() also steps {len(stepped - known)} tensors of others"
         check(
             stepped <= known, f"{text}, by old gradients: give it this network's parameters alone"
@@ -290,6 +296,16 @@ def check_transitions(name, inputs, places):
         check(not (is_flag or is_discount), f"{name}() takes a time limit for an end: {advice}")
 
 
+def remarks(seen):
+    """Yield what may be meant so."""
+    for name in seen.idle:
+        yield f" (with these options nothing learns by {name}())"
+    for one, other in itertools.combinations(seen.updates, 2):
+        both = len(one.stepped & other.stepped)
+        if both and one.optimizer is not other.optimizer:
+            yield f" (the optimizers of {one.name}() and {other.name}() share {both} tensors)"
+
+
 def watch_environment(learn, seen):
     """Return a script's learn(), whose environment notes what it returns.
 
@@ -297,6 +313,7 @@ def watch_environment(learn, seen):
     """
 
     def watched_learn(args, env, *others):
+        seen.folder = noisy.run_folder(asdict(args))
         reset, step, policy_pt, written = env.reset, env.step, seen.folder / "policy.pt", 0
         episode = steps = 0
         observation = given = None

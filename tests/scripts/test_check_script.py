@@ -197,8 +197,23 @@ def test_no_more_than_a_line_where_it_does_not_train(tmp_path, capsys):
     path = broken(tmp_path, "ppo", before("    # SETUP\n", "fail('no', 1)")).path
     assert check_script.main(path) == 1
     assert capsys.readouterr().out == "FAILED  It trains: error: no\n"
-    assert check_script.main(path, "--no-such-option", "64") == 1
-    assert "FAILED  It trains: " in (out := capsys.readouterr().out) and "--no-such-option" in out
+    for word in ("--no-such-option", "--gamma=2"):
+        with pytest.raises(SystemExit) as exit_:
+            check_script.main(broken(tmp_path, "ppo").path, word)
+        out, err = capsys.readouterr()
+        assert (exit_.value.code, out, err.count("\n")) == (2, "", 1)
+        assert err.startswith("error: ") and word.partition("=")[0] in err
+
+
+def test_an_environment_may_be_named_without_its_version(tmp_path):
+    trial = broken(tmp_path, "ppo")
+    trial.options = ["--env-id", "Pendulum"]
+    assert trial.read(trial.run, "eval.csv")
+
+
+def test_a_part_that_two_optimizers_hold_is_told(tmp_path):
+    layer = before("    actor_optimizer = torch", "actor.network[2] = critic.networks[0][2]")
+    assert "and actor_loss() share 2 tensors" in check_script.trains(broken(tmp_path, "sac", layer))
 
 
 def test_a_gradient_in_one_update_will_do():
