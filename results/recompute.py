@@ -293,23 +293,28 @@ def new_set(name, algorithm):
     corrected = dict(zip(together, holm(together.values()), strict=True))
     for row in alone:
         x, y = pairs[row["noise"]][row["environment"]]
-        change, low, high = fieller(x, y)
+        _, low, high = fieller(x, y)
         if min(len(x), len(y)) < 5:  # too few for an interval
             low = high = np.nan
         cells = {"n": len(x), "mean": x.mean(), "sd": x.std(ddof=1)}
         cells |= {"n_without": len(y), "mean_without": y.mean(), "sd_without": y.std(ddof=1)}
         cells |= {"difference": x.mean() - y.mean(), "effect_size": effect_size(x, y)}
-        cells |= {"difference_percent": change, "low_percent": low, "high_percent": high}
+        cells |= {"difference_percent": percent(x, y), "low_percent": low, "high_percent": high}
         for column, value in cells.items():
             check(name, row, column, value)
         check(name, row, "p", one(x, y), drawn=True)
     for row in rows[len(alone) :]:
         found = list(pairs[row["noise"]].values())
-        change = np.mean([fieller(x, y)[0] for x, y in found])
-        check(name, row, "difference_percent", change)
+        check(name, row, "difference_percent", np.mean([percent(x, y) for x, y in found]))
         check(name, row, "effect_size", np.median([effect_size(x, y) for x, y in found]))
         check(name, row, "p", together[row["noise"]], drawn=True)
         check(name, row, "holm", corrected[row["noise"]], drawn=True)
+
+
+def percent(x, y):
+    """Return the change in percent, or NaN where the mean without noise may be zero."""
+    margin = quantile(len(y) - 1) * y.std(ddof=1) / len(y) ** 0.5
+    return fieller(x, y)[0] if abs(y.mean()) > margin else np.nan
 
 
 def effect_size(x, y):
