@@ -108,7 +108,7 @@ def test_a_changed_script_is_swept(number, tmp_path):
     trial = check_script.Trial(path, [], tmp_path)
     trial.command(ROOT / "benchmark.sh", *sweep, *small, *OPTIONS.get(number, []))
     analysed = commands.run(ROOT / "analyze.py", ["--runs-dir", "runs"], cwd=tmp_path)
-    assert f"{algorithm.upper()}: 100 steps, seeds: 2" in analysed.out, analysed.err
+    assert f"{algorithm.upper()}: 2 runs of 100 steps, seeds: 2" in analysed.out, analysed.err
 
 
 def test_n_step_returns_are_those_of_the_episodes(tmp_path):

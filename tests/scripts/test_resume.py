@@ -497,7 +497,7 @@ def test_tools_read_runs_of_0_3(tmp_path):
     analysed = commands.run(ROOT / "analyze.py", ["--runs-dir", "."], cwd=tmp_path)
     for algorithm in SCRIPTS:
         assert f"Pendulum-v1    {algorithm}  " in tested.out
-        assert f"{algorithm}: 600 steps, seeds: 1, " in analysed.out
+        assert f"{algorithm}: 1 run of 600 steps, seeds: 1, " in analysed.out
     assert tested.code == analysed.code == 0 and tested.err == analysed.err == ""
     line = [ROOT / "benchmark.sh", "status", "--runs-dir", tmp_path]
     environment = os.environ | {"PYTHON": sys.executable}
