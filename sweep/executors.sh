@@ -46,7 +46,8 @@ run_one() {
   local child=$! status=0
   trap : TERM INT
   trap '[ -n "$asked" ] || kill -TERM "$child" || true; asked=1' USR1
-  while kill -0 "$child" 2>/dev/null; do wait "$child" || true; done # a signal interrupts wait
+  # A signal interrupts wait. Of a run that was killed, bash would say the line of this file.
+  while kill -0 "$child"; do wait "$child" || true; done 2>/dev/null
   wait "$child" || status=$?
   # analysis/logs.py reads the last line. What the run printed may have ended within one, as the
   # bar of a killed program does.
