@@ -5,7 +5,7 @@ import os
 import re
 from pathlib import Path
 
-from analysis.errors import fail
+from analysis.errors import fail, with_place
 from noisy_wrappers import canonical_env_id, split_noises
 from sweep import scripts
 from sweep.grid import ENVS, PRESETS, SEEDS
@@ -149,8 +149,8 @@ def check(args):
     args.scripts = {name: scripts.find(name, args.caller) for name in args.algos}
     try:
         args.envs = list(dict.fromkeys(map(canonical_env_id, args.envs)))
-    except ValueError as error:
-        fail(f"--envs: {error}")
+    except (Exception, SystemExit) as error:  # a module of the user's may raise anything
+        fail(f"--envs: {with_place(error, (ValueError, SyntaxError))}")
     for name in ("--exclude", "--budget", "--confirm", "--looks", "--metric"):
         if name in args.given and args.preset != "choose":
             fail(f"{name} is an option of choose")

@@ -72,6 +72,14 @@ def test_what_cannot_be_trained_is_refused_in_a_line(env, algos, message, tmp_pa
         assert message in line and shown.err.count("error: ") == 1 and not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("text", ["1 / 0", "def f(:", "raise SystemExit(3)"])
+def test_a_module_that_cannot_be_imported_is_one_line(text, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "bad_envs.py").write_text(text)
+    shown = view("list", "demo", "--envs", "bad_envs:Bad-v0")
+    assert shown.code == 2 and re.fullmatch(r"error: --envs: .*bad_envs.py, line 1\)\n", shown.err)
+
+
 def test_noises_that_cannot_act_are_left_out_or_refused(tmp_path):
     shown = choose("CategoryObservation", "--runs-dir", tmp_path)
     assert shown.code == 0 and shown.out.count("\n") == 8  # actions, delays at two rates and seeds
