@@ -66,11 +66,11 @@ def scripts_in(folder):
 
 @functools.cache
 def read(path):
-    """Read a script from its source; exits where that is no Python, or has no class Args."""
-    content = path.read_bytes()
+    """Read a script from its source; exits where that cannot be read, or has no class Args."""
     try:
+        content = path.read_bytes()
         nodes = ast.parse(content).body
-    except (SyntaxError, ValueError) as error:
+    except (OSError, SyntaxError, ValueError) as error:
         fail(f"{path}: {error}")
     classes = {node.name: node for node in nodes if isinstance(node, ast.ClassDef)}
     if "Args" not in classes:

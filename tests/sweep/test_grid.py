@@ -300,10 +300,11 @@ def test_an_algorithm_is_a_script_of_the_project_or_of_the_callers_folder(elsewh
     assert unknown.code == 2 and unknown.err.endswith("; choose from ppo, redq, sac, td3\n")
     (elsewhere / "sac_continuous_noisy.py").write_text(OWN)  # which one is meant?
     (elsewhere / "bad_continuous_noisy.py").write_text("class Args(:")
+    (elsewhere / "gone_continuous_noisy.py").symlink_to("nowhere")
     scripts.scripts_in.cache_clear()
     both = listed("sac")
     assert both.code == 2 and "differ: give one of them another name" in both.err
-    assert "bad_continuous_noisy.py: " in listed("bad").err
+    assert all(f"{name}_continuous_noisy.py: " in listed(name).err for name in ("bad", "gone"))
 
 
 @pytest.mark.parametrize(
