@@ -46,7 +46,7 @@ run_one() {
   local child=$! status=0
   trap : TERM INT
   trap '[ -n "$asked" ] || kill -TERM "$child" || true; asked=1' USR1
-  # A signal interrupts wait. Of a run that was killed, bash would say the line of this file.
+  # A signal interrupts wait, so ask again. bash would report a killed run with a line of this file.
   while kill -0 "$child"; do wait "$child" || true; done 2>/dev/null
   wait "$child" || status=$?
   # analysis/logs.py reads the last line. What the run printed may have ended within one, as the
@@ -64,9 +64,9 @@ slurm_task() {
   IFS=$'\t' read -r folder command < <(sed -n "$(($2 + SLURM_ARRAY_TASK_ID + 1))p" "$1")
   sweep=${1##*/lines-} # its id stands in the name of the list
   run_one "${sweep%.tsv}" "$folder" "$command" || status=$?
-  # A script that ends without a checkpoint would begin anew, time after time. SLURM_CLUSTERS came
-  # along from where it was submitted: the task is one of this cluster.
+  # Without a checkpoint it would begin anew, time after time
   if [ -n "$asked" ] && [ "$status" -eq 143 ] && [ -e "$folder/checkpoint.pt" ]; then
+    # SLURM_CLUSTERS came along from where it was submitted: the task is one of this cluster
     env -u SLURM_CLUSTERS scontrol requeue "$job"
   fi
   exit "$status"

@@ -24,7 +24,7 @@ def test_iqm_is_rliables():
     for scores, value in [*recorded, (Z[:, :1], 64.08)]:
         assert iqm(scores.ravel()) == pytest.approx(value, rel=1e-12)
         assert bootstrap_iqm(scores)[0] == pytest.approx(value, rel=1e-12)
-    assert np.isnan(iqm([[1.0, NAN, 2.0], [1.0, 2.0, 3.0]])).tolist() == [True, False]
+    assert np.isnan(iqm([[1.0, NAN, 2.0, 3.0], [1.0, 2.0, 3.0, 4.0]])).tolist() == [True, False]
 
 
 def test_probability_of_improvement_is_rliables():

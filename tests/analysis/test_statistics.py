@@ -11,6 +11,7 @@ from scipy import stats
 from sweeps import ROOT
 
 from analysis import permutation, statistics
+from analysis.power import detectable_shift
 from analysis.verdicts import MOST_RATIO_OF_RATES, is_lopsided
 
 DOCS = ROOT / "docs/statistics.md"
@@ -327,6 +328,11 @@ def test_the_detectable_shift_is_found_in_80_percent_of_the_cases(n, m):
     values[:n] += statistics.detectable_shift(n, m)
     above, _ = permutation.tails(permutation.welch_t(values, chosen))
     assert (2 * above <= 0.05 + 1e-12).mean() == pytest.approx(0.8, abs=0.035)
+
+
+def test_what_no_number_of_seeds_can_show():
+    assert np.isnan(detectable_shift(3, 3))  # the smallest possible p is 0.1
+    assert np.isnan(detectable_shift(4, 4, 0.02))
 
 
 def test_holm_and_contrast_by_hand():

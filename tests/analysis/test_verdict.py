@@ -197,3 +197,10 @@ def test_of_many_comparisons_the_first_are_shown_and_all_are_counted():
     first, rest = analysis.verdicts.clear_first(said, 12)
     assert list(first["verdict"]) == 10 * ["better"] + 2 * ["worse"]
     assert analysis.verdicts.tally(rest["verdict"]) == "7 comparisons: 7 worse"
+
+
+def test_which_numbers_of_seeds_are_lopsided():
+    seeds = [(5, 13), (5, 14), (50, 5), (30, 50), (20, 100), (3, 3)]
+    expected = [False, True, True, False, False, False]
+    assert [analysis.verdicts.is_lopsided(*pair) for pair in seeds] == expected
+    assert analysis.verdicts.is_lopsided(5, 9, analysis.verdicts.MOST_RATIO_OF_RATES)
