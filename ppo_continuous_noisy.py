@@ -47,8 +47,7 @@ class Args:
     """Command-line arguments, CleanRL's and those of noise; --help shows their comments."""
 
     # RUN
-    # - Gymnasium environment, Name-v0, or module:Name-v0
-    env_id: str = "HalfCheetah-v5"
+    env_id: str = "HalfCheetah-v5"  # Gymnasium environment, Name-v0, or module:Name-v0
     seed: int = 1  # seed of everything that is random
     total_timesteps: int = 1_000_000  # environment steps, rounded down to whole rollouts
     env_kwargs: tuple[str, ...] = ()  # arguments of the environment, each as name:value
@@ -59,29 +58,25 @@ class Args:
     checkpoint_frequency: int = 50_000  # environment steps between two checkpoints
 
     # NOISE
-    # - noises of the training environment; none: a baseline
-    noise: tuple[str, ...] = ()
+    noise: tuple[str, ...] = ()  # noises of the training environment; none: a baseline
     noise_rate: tuple[float | str, ...] = ()  # probability of each; 1.0:0.0 falls during training
 
     # TESTS
-    # - noises of the test environment; none by default
-    test_noise: tuple[str, ...] = ()
+    test_noise: tuple[str, ...] = ()  # noises of the test environment; none by default
     test_noise_rate: tuple[float, ...] = ()  # probability of each test noise; 1 by default
     eval_episodes: int = 10  # episodes in each test
     eval_frequency: int | None = None  # steps between tests; None: 50,000 or less; 0: only the last
     keep_policies: bool = False  # keep the policy of every test as policy_STEP.pt
 
     # SPEED
-    # - train on a GPU (not tested on one yet); these networks are small
-    cuda: bool = False
+    cuda: bool = False  # train on a GPU (not tested on one yet); these networks are small
     torch_threads: int = 1  # CPU threads; runs in parallel gain more than extra threads
     compile: bool = True  # compile the updates, if there is a C++ compiler
     # precision of float32 products, raised to highest where another would cost accuracy
     matmul_precision: Literal["highest", "medium"] = "highest"
 
     # ALGORITHM
-    # - learning rate of the optimizer
-    learning_rate: float = 3e-4
+    learning_rate: float = 3e-4  # learning rate of the optimizer
     num_steps: int = 2048  # environment steps in a rollout
     anneal_lr: bool = True  # lower the learning rate linearly to 0
     gamma: float = 0.99  # discount factor

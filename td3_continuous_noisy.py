@@ -47,8 +47,7 @@ class Args:
     """Command-line arguments, CleanRL's and those of noise; --help shows their comments."""
 
     # RUN
-    # - Gymnasium environment, Name-v0, or module:Name-v0
-    env_id: str = "HalfCheetah-v5"
+    env_id: str = "HalfCheetah-v5"  # Gymnasium environment, Name-v0, or module:Name-v0
     seed: int = 1  # seed of everything that is random
     total_timesteps: int = 1_000_000  # environment steps to train for
     env_kwargs: tuple[str, ...] = ()  # arguments of the environment, each as name:value
@@ -59,21 +58,18 @@ class Args:
     checkpoint_frequency: int = 50_000  # environment steps between two checkpoints
 
     # NOISE
-    # - noises of the training environment; none: a baseline
-    noise: tuple[str, ...] = ()
+    noise: tuple[str, ...] = ()  # noises of the training environment; none: a baseline
     noise_rate: tuple[float | str, ...] = ()  # probability of each; 1.0:0.0 falls during training
 
     # TESTS
-    # - noises of the test environment; none by default
-    test_noise: tuple[str, ...] = ()
+    test_noise: tuple[str, ...] = ()  # noises of the test environment; none by default
     test_noise_rate: tuple[float, ...] = ()  # probability of each test noise; 1 by default
     eval_episodes: int = 10  # episodes in each test
     eval_frequency: int | None = None  # steps between tests; None: 10,000 or less; 0: only the last
     keep_policies: bool = False  # keep the policy of every test as policy_STEP.pt
 
     # SPEED
-    # - train on a GPU (not tested on one yet); these networks are small
-    cuda: bool = False
+    cuda: bool = False  # train on a GPU (not tested on one yet); these networks are small
     torch_threads: int = 1  # CPU threads; runs in parallel gain more than extra threads
     compile: bool = True  # compile the updates, if there is a C++ compiler
     # precision of float32 products. medium: faster on some processors, and used only where it costs
@@ -81,8 +77,7 @@ class Args:
     matmul_precision: Literal["highest", "medium", "bf16"] = "medium"
 
     # ALGORITHM
-    # - steps in the replay buffer; the end of each episode takes the room of one
-    buffer_size: int = 1_000_000
+    buffer_size: int = 1_000_000  # steps in the replay buffer; an episode's end takes room for one
     gamma: float = 0.99  # discount factor
     tau: float = 0.005  # target smoothing coefficient
     batch_size: int = 256  # transitions in a minibatch
@@ -287,8 +282,8 @@ def learn(args, env, test_env, stop):
                 curves |= update_actor(critic, observations)
 
                 # LEARN: targets
-                # target += tau * (online - target)
-                torch._foreach_lerp_(target_parameters, online_parameters, args.tau)
+                for param, target_param in zip(online_parameters, target_parameters, strict=True):
+                    target_param.lerp_(param, args.tau)  # target += tau * (online - target)
 
             if is_last or global_step % 100 == 0:
                 run.log(global_step, losses=curves, noise=noisy.noise_statistics(env))

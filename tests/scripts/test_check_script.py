@@ -99,7 +99,7 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
     ("follows", "sac", "0.networks.0.0.weight of 'target' never changes"): [
         before("    alpha = torch.tensor(", "target = nn.Sequential(target)"),
         ("target(next_observations, next_actions)", "target[0](next_observations, next_actions)"),
-        ("torch._foreach_lerp_(target_parameters, critic_parameters, args.tau)", "pass"),
+        ("target_param.lerp_(param, args.tau)", "pass"),
     ],
     ("resumes", "td3", MISSING): [('state |= {"target_actor": target_actor, ', "state |= {")],
     ("resumes", "sac", MISSING): [  # which changes after the first stop
