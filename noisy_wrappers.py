@@ -1787,15 +1787,18 @@ def play(
     """Play test episodes, of which the first begins with ``reset(seed=seed)``, the next with + 1.
 
     ``env`` records its returns (:func:`make_noisy`); ``policy`` gives the action for an
-    observation. Returns an array (episodes, 3): the true return of each, its length, and its
-    :func:`outcome`. The global generators are seeded for each episode, and restored afterwards;
-    those of ``env`` go on from the last test, so do not train in it.
+    observation. If it has a method ``begin_episode()``, that is called after each reset: a policy
+    with memory forgets there. Returns an array (episodes, 3): the true return of each, its length,
+    and its :func:`outcome`. The global generators are seeded for each episode, and restored
+    afterwards; those of ``env`` go on from the last test, so do not train in it.
     """
     results = np.zeros((episodes, 3))
     with kept_generators(env):
         for episode in range(episodes):
             seed_globals(seed + episode)
             observation, info = env.reset(seed=seed + episode)
+            if hasattr(policy, "begin_episode"):
+                policy.begin_episode()
             terminated = truncated = False
             while not (terminated or truncated):
                 observation, _, terminated, truncated, info = env.step(policy(observation))

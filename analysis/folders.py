@@ -94,6 +94,14 @@ class Run:
         return {**self.config.get("versions", {}), **more}
 
     @property
+    def idle_noises(self):
+        """The names of the noises that changed nothing in the training of a finished run."""
+        applied = self.result.get("noise_applied")  # {name: [steps or episodes, of how many]}
+        if not isinstance(applied, dict):
+            return []
+        return [name for name, n in applied.items() if isinstance(n, list) and n[:1] == [0]]
+
+    @property
     def tested(self):
         """Where it was tested, if that is not the clean environment as its id makes it."""
         told = [f"under {self.tested_under}"] if self.tested_under != BASELINE else []

@@ -8,6 +8,7 @@ import numpy as np
 from analysis.folders import RETURN, SEARCH, SUCCESS
 from analysis.runs import by_study, finished, study_name
 from analysis.statistics import final_value
+from analysis.words import counted
 from noisy_wrappers import BASELINE
 
 
@@ -116,7 +117,7 @@ def shared_steps(runs):
 
 
 def notes_on(study, runs):
-    """Say what to know of a study: runs that were cut, and what it lacks."""
+    """Say what to know of a study: runs that were cut, noises that never acted, what it lacks."""
     notes = []
     for e, env in enumerate(study.environments):
         here = [run for run in runs if run.environment == env]
@@ -128,6 +129,12 @@ def notes_on(study, runs):
                 f"{study.name} on {env}: runs that ended by themselves before their "
                 f"{runs[0].total_timesteps:,} steps: {len(ended)} of {len(here)}, at step {steps}; "
                 "they count with their own last tests"
+            )
+        idle = Counter(name for run in here for name in run.idle_noises)
+        for noise, number in sorted(idle.items()):
+            notes.append(
+                f"{study.name} on {env}: {noise} changed nothing in {counted(number, 'run')}, "
+                "trained as if without it (noise_applied in result.json)"
             )
         if study.phase != SEARCH and len(study.sample(BASELINE, e)) == 0:
             notes.append(f"{study.name}: no finished baseline on {env}, so no comparison there")

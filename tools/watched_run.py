@@ -4,6 +4,7 @@ import contextlib
 import copy
 import functools
 import importlib.util
+import inspect
 import io
 import itertools
 import os
@@ -26,8 +27,9 @@ import noisy_wrappers as noisy  # noqa: E402
 from analysis.errors import fail  # noqa: E402
 from sweep.options import GIVEN_BY_THE_GRID  # noqa: E402
 
-# A test and the end of a rollout fall within an episode; the buffer is filled twice.
-SMALL = {"env_id": "Pendulum-v1", "total_timesteps": 150, "max_episode_steps": 20}
+# A test and the end of a rollout fall within an episode; the buffer is filled twice. Episodes have
+# an odd number of steps, so that what counts steps or updates is not at 0 again where one ends.
+SMALL = {"env_id": "Pendulum-v1", "total_timesteps": 150, "max_episode_steps": 21}
 SMALL |= {"eval_frequency": 47, "eval_episodes": 2, "compile": False, "buffer_size": 80}
 SMALL |= {"matmul_precision": "highest", "learning_starts": 40, "batch_size": 16}
 SMALL |= {"num_steps": 50, "num_minibatches": 2, "update_epochs": 2}
@@ -211,7 +213,10 @@ def watch_updates(updater, seen):
         def watched(*inputs):
             if not hasattr(own, "first"):
                 with noisy.kept_generators(), Broadcasts(own.name):
-                    loss(network, *inputs)
+                    _, curves = loss(network, *inputs)
+                for name, value in curves.items():
+                    one = torch.as_tensor(value).numel() == 1
+                    check(one, f"the curve {name!r} of {own.name}() is no number: take its mean()")
             if seen.start == 0:
                 check_transitions(own.name, inputs, seen.places)
             curves, own.inputs = update(*inputs), inputs
@@ -300,10 +305,63 @@ def remarks(seen):
     """Yield what may be meant so."""
     for name in seen.idle:
         yield f" (with these options nothing learns by {name}())"
+    for update in seen.updates:
+        for name in unused_inputs(update):
+            yield f" ({update.name}() does not depend on {name})"
+    for name in unused_options(seen):
+        yield f" (nothing reads --{name.replace('_', '-')})"
     for one, other in itertools.combinations(seen.updates, 2):
         both = len(one.stepped & other.stepped)
         if both and one.optimizer is not other.optimizer:
             yield f" (the optimizers of {one.name}() and {other.name}() share {both} tensors)"
+
+
+def unused_inputs(update):
+    """Return the inputs that a loss does not depend on, such as "target" or "batch[4]".
+
+    Those are networks, tensors and numbers, but not whole numbers, which may be sizes.
+    """
+    unused = []
+    expected = outcome_of(update, update.inputs)
+    names = list(inspect.signature(update.loss).parameters)[1:]
+    for i, (name, given) in enumerate(zip(names, update.inputs, strict=False)):
+        is_list = isinstance(given, list | tuple)
+        for j, part in enumerate(given if is_list else [given]):
+            other = changed(part)
+            if other is part:
+                continue
+            inputs = list(update.inputs)
+            inputs[i] = [*given[:j], other, *given[j + 1 :]] if is_list else other
+            if outcome_of(update, inputs) == expected:
+                unused.append(f"{name}[{j}]" if is_list else name)
+    return unused
+
+
+def outcome_of(update, inputs):
+    """Return a loss and its curves as numbers."""
+    with noisy.kept_generators():  # a loss may draw, though it should not
+        loss, curves = update.loss(update.network, *inputs)
+    return [float(torch.as_tensor(value).detach()) for value in (loss, *curves.values())]
+
+
+def changed(given):
+    """Return another network, tensor or number in place of one; anything else as it is."""
+    if isinstance(given, torch.nn.Module):
+        given = copy.deepcopy(given)
+        with torch.no_grad():
+            for parameter in given.parameters():
+                parameter.add_(torch.rand_like(parameter) + 0.5)
+    elif isinstance(given, float) or (torch.is_tensor(given) and given.is_floating_point()):
+        given = given + torch.rand_like(torch.as_tensor(given)) + 0.5
+    return given
+
+
+def unused_options(seen):
+    """Return the options that stand nowhere in the script but where they are defined."""
+    source = Path(seen.script.__file__).read_text("utf-8")
+    names = {name for name in asdict(seen.args) if len(re.findall(rf"\b{name}\b", source)) == 1}
+    elsewhere = Path(noisy.__file__).read_text("utf-8")  # it is given all arguments
+    return sorted(name for name in names if f'"{name}"' not in elsewhere)
 
 
 def watch_environment(learn, seen):

@@ -1,5 +1,6 @@
 """Reading a folder of runs: which runs count, what is in no table, and why."""
 
+import json
 import shutil
 
 import numpy as np
@@ -221,6 +222,16 @@ def test_a_run_that_ended_by_itself_counts_with_its_own_last_tests(tmp_path):
     assert "ended by themselves before their 100,000 steps: 1 of 3, at step 34,567" in notes[0]
     write_run(tmp_path, [1], env="Pusher-v5", total_timesteps=100_000)
     assert make_studies(read_runs(tmp_path))[1][0] == notes[0]  # also by success, on Hopper alone
+
+
+def test_a_noise_that_never_acted_is_noted(tmp_path):
+    """As where a script learns from stored data and never steps the noisy environment."""
+    for seed, counts in enumerate(([0, 0], [0, 500], [3, 500], None, "damaged")):
+        folder = write_run(tmp_path, [10], seed=seed, noise=SCALE, rate=0.1)
+        result = {"final_return_mean": 10.0, "noise_applied": counts and {"Scale": counts}}
+        (folder / "result.json").write_text(json.dumps(result))
+    notes = [note for note in make_studies(read_runs(tmp_path))[1] if "changed nothing" in note]
+    assert len(notes) == 1 and "Hopper-v5: Scale changed nothing in 2 runs" in notes[0]
 
 
 @pytest.mark.parametrize(

@@ -67,6 +67,9 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
         before("            action = actor.policy(observation, eps)", "observation += 0.1")
     ],
     ("trains", "td3", "makes (16, 16) of (16, 1) and (16,)"): [(".squeeze(1) for", " for")],
+    ("trains", "sac", "the curve 'alpha' of actor_loss() is no number"): [
+        ('"alpha": alpha}', '"alpha": log_prob}')
+    ],
     ("trains", "sac", "takes a time limit for an end"): [
         (
             "reward, next_observation, terminated, truncated)\n        observation =",
@@ -108,6 +111,14 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
         (
             "action = actor.policy(observation, eps)",
             "action = actor.policy(observation, scale * eps)",
+        ),
+    ],
+    ("resumes", "td3", "draw by torch, rng or env"): [  # counts updates, and is not resumed
+        before("    online_parameters = [*actor", "updates = 0"),
+        before("            if global_step % args.policy_frequency == 0:", "updates += 1"),
+        (
+            "if global_step % args.policy_frequency == 0:",
+            "if updates % args.policy_frequency == 0:",
         ),
     ],
     ("resumes", "ppo", "ask stop()"): [("stopping = stop()", "stopping = 0")],
@@ -214,6 +225,27 @@ def test_an_environment_may_be_named_without_its_version(tmp_path):
 def test_a_part_that_two_optimizers_hold_is_told(tmp_path):
     layer = before("    actor_optimizer = torch", "actor.network[2] = critic.networks[0][2]")
     assert "and actor_loss() share 2 tensors" in check_script.trains(broken(tmp_path, "sac", layer))
+
+
+REMARKS = {  # what is told: the script, and the texts that are replaced
+    "critic_loss() does not depend on target": (
+        "sac",
+        ("target(next_observations, next_actions)", "critic(next_observations, next_actions)"),
+    ),
+    "critic_loss() does not depend on batch[4]": ("td3", ("(1 - terminated) * gamma", "gamma")),
+    "critic_loss() does not depend on gamma": ("td3", (" * gamma * next", " * 0.99 * next")),
+    "nothing reads --hidden-units": (
+        "ppo",
+        before("    num_steps: int = 2048", "hidden_units: int = 64"),
+    ),
+}
+
+
+@pytest.mark.parametrize("remark", REMARKS)
+def test_what_is_given_and_not_used_is_told(remark, tmp_path):
+    algorithm, change = REMARKS[remark]
+    told = check_script.trains(broken(tmp_path, algorithm, change))
+    assert told == f" ({remark})"
 
 
 def test_a_gradient_in_one_update_will_do():

@@ -20,6 +20,7 @@ from noisy_wrappers import (
     make_flat,
     make_noisy,
     outcome,
+    play,
 )
 
 
@@ -144,24 +145,40 @@ class Drawing(gym.Env):
 
 
 def test_an_env_state_has_the_generators_among_the_attributes():
-    def play(env):
+    def draw(env):
         return [*env.reset()[0], env.action_space.sample()["a"][0]]
 
     env = gym.wrappers.TransformReward(Drawing(), abs)
     env.reset(seed=1)
-    first = play(env)
+    first = draw(env)
     saved = json.loads(json.dumps(EnvState(env).state_dict()))
-    second, third = play(env), play(env)
+    second, third = draw(env), draw(env)
     other = gym.wrappers.TransformReward(Drawing(), abs)
     for episodes in (0, 3):  # fewer children have been spawned, then more
         other.reset(seed=2)
-        [play(other) for _ in range(episodes)]
+        [draw(other) for _ in range(episodes)]
         EnvState(other).load_state_dict(saved)
-        assert play(other) == second
+        assert draw(other) == second
     assert all(one != two for one, two in zip(first, second, strict=True))
     with kept_generators(other):
-        assert play(other) == third
-    assert play(other) == third
+        assert draw(other) == third
+    assert draw(other) == third
+
+
+def test_a_policy_with_memory_is_told_where_a_test_episode_begins():
+    class Second:
+        """Acts from its second step on."""
+
+        def begin_episode(self):
+            self.steps = 0
+
+        def __call__(self, observation):
+            self.steps += 1
+            return np.array([2.0 if self.steps > 1 else 0.0])
+
+    env = make_noisy(gym.make("Pendulum-v1", max_episode_steps=3), (), ())
+    once = [play(env, Second(), 1, seed)[0] for seed in (7, 8)]
+    np.testing.assert_array_equal(play(env, Second(), 2, 7), once)
 
 
 def test_outcomes():
