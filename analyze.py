@@ -120,14 +120,16 @@ def write_table(out, table, latex, inches):
 
 
 def write_results(out, results, args):
-    """Write all tables, all figures and the report."""
+    """Write all tables, all figures and the report; return the names of files from before."""
     out.mkdir(parents=True, exist_ok=True)
+    before = {path: path.stat().st_mtime_ns for path in out.iterdir() if path.is_file()}
     for table in results.tables.values():
         write_table(out, table, args.latex, args.figure_width)
     drawn = figures(results.studies, results.tables, args.band)
     for drawing in drawn:
         write_figure(out, drawing, args.latex, args.figure_width)
     write_report(out, results, drawn)
+    return sorted(path.name for path, time in before.items() if path.stat().st_mtime_ns == time)
 
 
 def terminal_width():
@@ -140,8 +142,11 @@ def print_left_out(missing, width):
     print(text_table(replace(missing, view=missing.view[MISSING_IN_SHORT][:20]), width))
 
 
-def print_results(out, results):
-    """Print the verdicts, what to know about them, and where the report is."""
+def print_results(out, results, older):
+    """Print the verdicts, what to know about them, and where the report is.
+
+    older: names of files in the same folder that were there before.
+    """
     width, tables = terminal_width(), results.tables
     of_success = results.studies[0].metric == SUCCESS
     unit = " (rates of success in percent, differences in percentage points)" if of_success else ""
@@ -163,6 +168,9 @@ def print_results(out, results):
     say(results.overview)
     for note in results.notes + results.versions:
         say(f"note: {note}")
+    if older:
+        names = ", ".join([*older[:3], *(["..."] if len(older) > 3 else [])])
+        say(f"note: {counted(len(older), 'file')} in {out} not of this analysis: {names}")
     if results.problems:
         print()
         say(f"WARNING: {results.problems}")
@@ -282,10 +290,10 @@ def main(args):
     entries = read_runs(args.runs_dir)
     results = analyse(args, entries, choice)
     try:
-        write_results(out, results, args)
+        older = write_results(out, results, args)
     except OSError as error:
         fail(f"--out: {error}")
-    print_results(out, results)
+    print_results(out, results, older)
     return int(any(entry.status == "corrupt" for entry in entries))
 
 

@@ -45,10 +45,14 @@ def test_nothing_to_read_or_no_place_to_write_is_an_error(case, tmp_path, capsys
     assert ("--metric" in printed.err) == (case == "no success")
 
 
-def test_results_go_beside_the_runs(tmp_path, monkeypatch):
+def test_results_go_beside_the_runs(tmp_path, monkeypatch, capsys):
     write_run(tmp_path / "runs", [1])
     for _ in range(2):  # its own results are renewed
         main(analyze.Args(runs_dir=tmp_path / "runs"))
+    assert "not of this analysis" not in capsys.readouterr().out
+    (tmp_path / "runs/results/curves_of_runs_deleted_since.svg").touch()
+    main(analyze.Args(runs_dir=tmp_path / "runs"))
+    assert "not of this analysis: curves_of_runs_deleted_since.svg\n" in capsys.readouterr().out
     monkeypatch.chdir(tmp_path)
     for out in (Path("results/../runs"), Path("")):
         with pytest.raises(SystemExit):
