@@ -73,8 +73,7 @@ class Args:
     cuda: bool = False  # train on a GPU (not tested on one yet); these networks are small
     torch_threads: int = 1  # CPU threads; runs in parallel gain more than extra threads
     compile: bool = True  # compile the updates, if there is a C++ compiler
-    # precision of float32 products. medium: faster on some processors, and used only where it costs
-    # no accuracy; bf16: updates in bfloat16, much faster where the processor has it, less accurate
+    # medium: faster, used only where it costs no accuracy; bf16: fast on new processors, less exact
     matmul_precision: Literal["highest", "medium", "bf16"] = "medium"
 
     # ALGORITHM

@@ -72,8 +72,7 @@ class Args:
     cuda: bool = False  # train on a GPU (not tested on one yet); these networks are small
     torch_threads: int = 1  # CPU threads; runs in parallel gain more than extra threads
     compile: bool = True  # compile the updates, if there is a C++ compiler
-    # precision of float32 products. medium: faster on some processors, and used only where it costs
-    # no accuracy; bf16: updates in bfloat16, much faster where the processor has it, less accurate
+    # medium: faster, used only where it costs no accuracy; bf16: fast on new processors, less exact
     matmul_precision: Literal["highest", "medium", "bf16"] = "medium"
 
     # ALGORITHM
@@ -277,11 +276,9 @@ def learn(args, env, test_env, stop):
             eps = eps.clamp(-args.noise_clip, args.noise_clip)
             curves = update_critic(target_critic, target_actor, batch, eps, args.gamma)
 
+            # LEARN: actor and targets
             if global_step % args.policy_frequency == 0:
-                # LEARN: actor
                 curves |= update_actor(critic, observations)
-
-                # LEARN: targets
                 for param, target_param in zip(online_parameters, target_parameters, strict=True):
                     target_param.lerp_(param, args.tau)  # target += tau * (online - target)
 
