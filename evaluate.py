@@ -69,8 +69,8 @@ class Args:
     noise_rates: tuple[float | str, ...] = (1.0,)
     """noise rates; every noise is tested at every rate"""
     env_id: str | None = None
-    """another environment to test in, with the same spaces and without the training's --env-kwargs;
-    by default that of the training"""
+    """another environment to test in, of the same action space and shape of observations, without
+    the training's --env-kwargs; by default that of the training"""
     episodes: int = 100
     """test episodes per policy and condition"""
     seed: int = 2_000_000

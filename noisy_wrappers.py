@@ -503,7 +503,7 @@ class RandomMixupObservation(ObservationNoise):
     ``factor`` is the paper's lambda. o_(t-1) is what this wrapper received at the last step;
     ``recursive=True`` blends with what it returned instead, as noisyenv 0.1.1 does. The first
     observation of an episode passes untouched and is no opportunity. With factor = 0 the agent sees
-    the observation before; with ``recursive``, too, the last one that arrived: a packet was lost.
+    the observation before; with ``recursive``, the last one that arrived: a packet was lost.
 
     >>> env = RandomMixupObservation(gym.make("CartPole-v1"), 1.0, 0.0)
     >>> bool((env.reset(seed=0)[0] == env.step(0)[0]).all())
@@ -876,7 +876,7 @@ class RandomDynamics(NoiseWrapper):
     """Scales masses, frictions and the like of a MuJoCo model for an episode. Not in the paper.
 
     At ``reset()`` the episode is chosen with probability p. In a chosen one, each row of the named
-    ``fields`` of the simulator's model (that of a body, a joint, an actuator) is its own value
+    ``fields`` of the model (that of a body, a degree of freedom, an actuator) is its own value
     times e ~ U(low, high), ``noise.uniform(low, high, number of rows)`` for each field in turn.
     docs/wrappers.md says what the fields mean, and where a model is found. ``body_mass`` takes
     ``body_inertia`` along, and ``actuator_gainprm`` the bias of servos (``actuator_biasprm``),
@@ -1136,7 +1136,7 @@ def parse_noise(text: str) -> Noise:
 
     "my_noises:StickyAction(3)" is a wrapper of your own: the module is imported, one of the folder
     that Python was started in first; what it raises passes through. Unknown names and bad arguments
-    are a ValueError that lists the wrappers below its first line.
+    are a ValueError, which lists our wrappers below its first line if the noise is one of ours.
 
     >>> str(parse_noise("RandomUniformScaleReward(.50, high=1.5)"))
     'RandomUniformScaleReward(0.5, 1.5)'
@@ -1656,8 +1656,8 @@ def canonical_env_id(env_id: str) -> str:
 def parse_env_kwargs(texts: Sequence[str]) -> dict[str, Any]:
     """Read arguments of an environment, "name:value", as a script's ``--env-kwargs`` has them.
 
-    A value is a literal of Python, or else text. ValueError if that is no name, given twice, an
-    option of the scripts, or ``false``, a text that would count as true.
+    A value is a literal of Python, or else text. ValueError if a name is none, is given twice or is
+    ``max_episode_steps``, an option of the scripts, or if a value is ``false``: no literal.
     """
     found: dict[str, Any] = {}
     for text in _listed("env_kwargs", texts, '["mass:2.0"]'):
@@ -1992,12 +1992,12 @@ def _check_numbers(args: Mapping[str, Any]) -> None:
 def canonical_arguments(args: Mapping[str, Any]) -> dict[str, Any]:
     """Check a script's arguments, {name: value}; return those that have one way to be written.
 
-    They are ``env_id``, with its version, and the noises and rates of training and of tests, where
-    the rate is 1 if none is given. The module of "module:Env-v0" is imported.
+    They are ``env_id``, with its version, and the noises and rates of training and of tests; the
+    rate of tests is 1 if none is given. The module of "module:Env-v0" is imported.
 
     Raises:
-        ValueError: a number out of its range, a bad ``exp_name``, noise or rate, or an environment
-            that does not exist.
+        ValueError: a number out of its range, a bad ``exp_name``, ``runs_dir``, noise, rate or
+            argument of the environment, or an environment that does not exist.
     """
     _check_numbers(args)
     if args["exp_name"] in ("", ".", ".."):

@@ -4,6 +4,7 @@ import importlib
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -85,6 +86,7 @@ def follow_page(algorithm, env_id, folder):
     load, save, play, *onnx = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     assert len(onnx) == 2
     names = {}
+    shutil.copy(run_dir / "config.json", folder)
     for block in (load, save, play):
         exec(block.replace("Pendulum-v1", env_id), names)
     assert folder / names["run_dir"] == run_dir
