@@ -48,8 +48,8 @@ Options of choose
   --budget N               about how many runs the search may take (default: 3 for each noise and
                            rate, at least 1); even with the least it takes about two for each
   --confirm N              fresh seeds for the final comparison, at most (default: 25)
-  --looks N                how often the comparison is looked at, and may end (default: after each
-                           fifth of the seeds; 1: at the end)
+  --looks N                how often the comparison is looked at, and may end (default: after every
+                           five seeds, at most five times; 1: at the end)
   --metric success_rate    choose by the rate of success (default: return), where the info of an
                            episode's last step has is_success or success
 
