@@ -59,7 +59,7 @@ class Args:
 
     # NOISE
     noise: tuple[str, ...] = ()  # noises of the training environment; none: a baseline
-    noise_rate: tuple[float | str, ...] = ()  # probability of each; 1.0:0.0 falls during training
+    noise_rate: tuple[float | str, ...] = ()  # probability, of all or each; 1:0 falls in training
 
     # TESTS
     test_noise: tuple[str, ...] = ()  # noises of the test environment; none by default
@@ -72,7 +72,7 @@ class Args:
     cuda: bool = False  # train on a GPU (not tested on one yet); these networks are small
     torch_threads: int = 1  # CPU threads; runs in parallel gain more than extra threads
     compile: bool = True  # compile the updates, if there is a C++ compiler
-    # precision of float32 products, raised to highest where another would cost accuracy
+    # medium: other kernels, used only where they are as exact
     matmul_precision: Literal["highest", "medium"] = "highest"
 
     # ALGORITHM
@@ -95,8 +95,8 @@ class Args:
 
 
 def make_env(env_id, **kwargs):
-    """Make the environment, with vectors as observations and actions; noise comes on top."""
-    env = gym.make(env_id, disable_env_checker=True, **kwargs)
+    """Make an environment of vectors, still without noise: make_environments() adds that."""
+    env = gym.make(env_id, disable_env_checker=True, **kwargs)  # make_flat() checks every step
     return noisy.make_flat(env, STEP_LIMIT)
 
 
@@ -127,7 +127,7 @@ class Agent(nn.Module):
         return log_prob, entropy, self.critic(observations).squeeze(1)
 
     def acting(self):
-        """Return the policy's mean as a function, NumPy to NumPy, and its standard deviation."""
+        """Return what acting needs: the policy's mean, NumPy to NumPy, and its std (A,)."""
         return in_numpy(self.actor_mean), self.actor_logstd.exp().cpu().numpy()
 
 
@@ -150,7 +150,7 @@ class Normalizer(Saved):
         self.mean, self.var, self.count = np.zeros(shape), np.ones(shape), 1e-4
 
     def update(self, observation):
-        """Take one observation into account."""
+        """Take one observation into account, as a batch of one in Gymnasium's wrapper."""
         delta, total = observation - self.mean, self.count + 1
         self.mean += delta / total
         self.var += (delta * delta * (self.count / total) - self.var) / total
@@ -163,17 +163,18 @@ class Normalizer(Saved):
 
 
 class RewardScaler(Normalizer):
-    """Running variance of the discounted return, as in Gymnasium's NormalizeReward."""
+    """Running variance of the discounted return, as in NormalizeReward; it needs update() only."""
 
     def __init__(self):
         self.discounted_return, self.mean, self.var, self.count = 0.0, 0.0, 1.0, 1e-4
 
     def scale(self, reward, terminated, gamma):
         """Take a reward into account; return it in standard deviations, at most 10 of them."""
+        # as in Gymnasium: the past is dropped at the last step of an episode, not after it
         self.discounted_return = self.discounted_return * gamma * (1 - terminated) + reward
         self.update(self.discounted_return)
         scaled = reward / math.sqrt(self.var + 1e-8)
-        return max(min(scaled, 10.0), -10.0)  # in this order NaN stays NaN
+        return max(min(scaled, 10.0), -10.0)  # in this order NaN stays, and ends the run
 
 
 class Rollout(Saved):
@@ -265,14 +266,14 @@ def learn(args, env, test_env, stop):
     for global_step in range(start + 1, total_steps + 1):
         step = (global_step - 1) % args.num_steps
         if step == 0:
-            rollout.eps[:] = torch.randn(rollout.eps.shape)
+            rollout.eps[:] = torch.randn(rollout.eps.shape)  # the policy's noise
 
         # ACT: log-probabilities and values are computed later, for whole rollouts
         rollout.observations[step] = observation_stats.normalize(observation)
         rollout.actions[step] = act(rollout.observations[step]) + std * rollout.eps[step]
 
         # STEP
-        action = noisy.into_space(rollout.actions[step], env.action_space)
+        action = noisy.into_space(rollout.actions[step], env.action_space)  # clipped
         observation, reward, terminated, truncated, info = env.step(action)
         observation_stats.update(observation)
 
@@ -290,7 +291,7 @@ def learn(args, env, test_env, stop):
             observations = torch.from_numpy(rollout.observations).to(device)
             actions = torch.from_numpy(rollout.actions).to(device)
             log_probs, _, values = agent(observations[:-1], actions)
-            check_acting(log_probs, rollout, std)
+            check_acting(log_probs, rollout, std)  # for you who change the agent
             all_values = torch.cat([values, agent.critic(observations[-1])])
             advantages = compute_gae(rollout.rewards, all_values, rollout.dones, args).to(device)
             returns = advantages + values
@@ -306,7 +307,7 @@ def learn(args, env, test_env, stop):
                 order = torch.from_numpy(rng.permutation(args.num_steps)).to(device)
                 shuffled = [tensor[order].tensor_split(args.num_minibatches) for tensor in batch]
                 for minibatch in zip(*shuffled, strict=True):
-                    curves = update(minibatch, args)
+                    curves = update(minibatch, args)  # the inputs of ppo_loss()
                     clipfracs.append(curves["clipfrac"])
                 if args.target_kl is not None and curves["approx_kl"] > args.target_kl:
                     break
@@ -317,7 +318,7 @@ def learn(args, env, test_env, stop):
             charts = {"learning_rate": optimizer.param_groups[0]["lr"]}
             run.log(global_step, charts=charts, losses=curves, noise=noisy.noise_statistics(env))
 
-            # TEST: if one fell due during the rollout; eval.csv has the step at which it fell due
+            # TEST: if a multiple of --eval-frequency is in the rollout; eval.csv has that multiple
             steps_late = global_step % args.eval_frequency if args.eval_frequency > 0 else math.inf
             if is_last or steps_late < args.num_steps:
                 policy = make_policy(agent, observation_stats, env)
@@ -346,7 +347,7 @@ def learn(args, env, test_env, stop):
 
 
 def check_acting(log_probs, rollout, std):
-    """Exit if the policy that acted, in NumPy, is not the one of forward(), in PyTorch."""
+    """Exit if acting(), in NumPy, and forward(), in PyTorch, are not the same policy."""
     # the density of the normal, where (x - mean) / std is eps
     expected = (-0.5 * rollout.eps**2 - np.log(std) - 0.5 * math.log(2 * math.pi)).sum(1)
     rounding = 1e-3 * (1 + np.abs(rollout.actions / std).sum(1))
@@ -361,7 +362,7 @@ def make_policy(agent, observation_stats, env):
 
 
 def load_policy(run_dir, env=None):
-    """Return the policy of a run's last test; only runs of 0.3, without spaces, need `env`."""
+    """Return the policy of a run's last test; `env` is for runs of this project's version 0.3."""
     config = json.loads(Path(run_dir, "config.json").read_text())
     env = env or noisy.Spaces(config)
     agent, observation_stats = Agent(env), Normalizer(env.observation_space.shape)
@@ -388,7 +389,7 @@ def updater(loss, network, optimizer, args):
         call = functools.partial(functional_call, module)
         gradient, (_, curves) = grad_and_value(call, has_aux=True)(learned, inputs)
         norm = torch.stack([value.norm() for value in gradient.values()]).norm()
-        scale = (args.max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
+        scale = (args.max_grad_norm / (norm + 1e-6)).clamp(max=1.0)  # as clip_grad_norm_()
         return {name: value * scale for name, value in gradient.items()}, curves
 
     gradient_of = compiled(clipped_gradient) if args.compile else clipped_gradient
@@ -396,7 +397,7 @@ def updater(loss, network, optimizer, args):
     def update(*inputs):
         learned = {name: p for name, p in parameters.items() if p.requires_grad}  # not frozen
         # a compiled graph takes a Python number as a constant, and is compiled again for another
-        numbers = (int, float, np.float32, np.float64, np.int32, np.int64)  # a bool may be a switch
+        numbers = (int, float, np.float32, np.float64, np.int32, np.int64)  # bools stay: `if flag`
         inputs = [torch.tensor(float(x)) if type(x) in numbers else x for x in inputs]
         gradient, curves = gradient_of(learned, tuple(inputs))
         for name, parameter in parameters.items():
@@ -411,13 +412,13 @@ def updater(loss, network, optimizer, args):
 def in_numpy(network):
     """Return a network as a function of one observation, NumPy to NumPy.
 
-    Linear, Tanh and ReLU are computed in NumPy, several times faster than in PyTorch. A network
-    that has anything else is called as it is.
+    Linear, Tanh and ReLU are computed in NumPy, several times faster than in PyTorch; any other
+    network is called as it is. Call this again after an update: weights from a GPU are copies.
     """
     activations = {nn.Tanh: np.tanh, nn.ReLU: lambda x: np.maximum(x, 0)}
     functions = []
     for layer in network if type(network) is nn.Sequential else [network]:
-        has_hooks = layer._forward_hooks or layer._forward_pre_hooks
+        has_hooks = layer._forward_hooks or layer._forward_pre_hooks  # as of spectral_norm()
         if type(layer) is nn.Linear and layer.bias is not None and not has_hooks:
             weight, bias = layer.weight.numpy(force=True), layer.bias.numpy(force=True)
             functions.append(lambda x, weight=weight, bias=bias: weight @ x + bias)
@@ -439,7 +440,7 @@ def in_numpy(network):
 
 
 def fail(message, code=2):
-    """Exit after a line that says what is wrong and what to do."""
+    """Exit after a line that says what is wrong; code 2: in the arguments, 1: elsewhere."""
     print(f"error: {message}", file=sys.stderr)
     raise SystemExit(code)
 
@@ -487,7 +488,7 @@ def train(args, stop=lambda: 0):
     if args.cuda and not torch.cuda.is_available():
         fail("--cuda: PyTorch finds no GPU; leave it out to run on the CPU")
     try:
-        args = replace(args, **noisy.canonical_arguments(asdict(args)))
+        args = replace(args, **noisy.canonical_arguments(asdict(args)))  # checks them, too
     except ValueError as error:
         fail(error)
     if args.eval_frequency is None:
@@ -503,7 +504,7 @@ def train(args, stop=lambda: 0):
     is_medium = args.matmul_precision == "medium" and not would_round
     torch.set_float32_matmul_precision("medium" if is_medium else "highest")
     with fail_on((gym.error.Error, noisy.SpaceError), f"--env-id {args.env_id}"):
-        env, test_env = noisy.make_environments(make_env, asdict(args), TEST_SEED)
+        env, test_env = noisy.make_environments(make_env, asdict(args), TEST_SEED)  # adds noise
     with env, test_env:  # they are closed at the end
         return learn(args, env, test_env, stop)
 
@@ -534,7 +535,7 @@ class Run:
         config = self.folder / "config.json"
         with fail_on(ValueError, str(self.folder)):
             old = json.loads(config.read_text()) if config.exists() else new
-            self.config = noisy.resumed_run(old, new)
+            self.config = noisy.resumed_run(old, new)  # ValueError: a run with other arguments
         if self.config["script_sha256"] != new["script_sha256"]:
             say("the script has changed since the run began; if it matters, use --exp-name")
         self.is_finished = (self.folder / "result.json").exists()
@@ -581,7 +582,7 @@ class Run:
         return step
 
     def _log_hyperparameters(self):
-        """Log all arguments as a table, and as columns of HPARAMS with what they achieve."""
+        """Log all arguments as a table and for HPARAMS (add_hparams() would make a subfolder)."""
         args = {name: str(value) for name, value in asdict(self.args).items()}
         table = "".join(f"|{name}|{value}|\n" for name, value in args.items())
         self.writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + table)
@@ -624,7 +625,7 @@ class Run:
             self.printed = now
 
     def log_episode(self, step, info):
-        """Log a training episode by the info of its last step; its return is without noise."""
+        """Log a training episode by the info of its last step; its return has no reward noise."""
         charts = {"episodic_return": info["episode"]["r"], "episodic_length": info["episode"]["l"]}
         self.log(step, charts=charts | noisy.success_rate([noisy.outcome(info)]))
 
@@ -697,14 +698,14 @@ def stop_at_signals():
 
     def remember(number, frame):
         received.append(number)
-        # a process that the environment forked: the episode that goes on needs it
+        # Ctrl-C also reaches processes that the environment forked; the last episode needs them
         is_worker = os.getpid() != script_pid
         is_second_ctrl_c = number == signal.SIGINT and len(received) > 1
         if is_second_ctrl_c or (is_worker and number != signal.SIGINT):
             os._exit(128 + number)
         if not is_worker:
             with contextlib.suppress(OSError):  # print() is not safe in here
-                os.write(1, b"stopping after this episode; Ctrl-C again: without a checkpoint\n")
+                os.write(1, b"stopping after this episode; Ctrl-C again: at once, without saving\n")
 
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         if signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP

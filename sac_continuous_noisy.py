@@ -60,7 +60,7 @@ class Args:
 
     # NOISE
     noise: tuple[str, ...] = ()  # noises of the training environment; none: a baseline
-    noise_rate: tuple[float | str, ...] = ()  # probability of each; 1.0:0.0 falls during training
+    noise_rate: tuple[float | str, ...] = ()  # probability, of all or each; 1:0 falls in training
 
     # TESTS
     test_noise: tuple[str, ...] = ()  # noises of the test environment; none by default
@@ -73,11 +73,11 @@ class Args:
     cuda: bool = False  # train on a GPU (not tested on one yet); these networks are small
     torch_threads: int = 1  # CPU threads; runs in parallel gain more than extra threads
     compile: bool = True  # compile the updates, if there is a C++ compiler
-    # medium: faster, used only where it costs no accuracy; bf16: fast on new processors, less exact
+    # medium: other kernels, used only where they are as exact; bf16: fast where it exists, rounds
     matmul_precision: Literal["highest", "medium", "bf16"] = "medium"
 
     # ALGORITHM
-    buffer_size: int = 1_000_000  # steps in the replay buffer; an episode's end takes room for one
+    buffer_size: int = 1_000_000  # rows; a step takes one, an episode's last observation another
     gamma: float = 0.99  # discount factor
     tau: float = 0.005  # target smoothing coefficient
     batch_size: int = 256  # transitions in a minibatch
@@ -91,8 +91,8 @@ class Args:
 
 
 def make_env(env_id, **kwargs):
-    """Make the environment, with vectors as observations and actions; noise comes on top."""
-    env = gym.make(env_id, disable_env_checker=True, **kwargs)
+    """Make an environment of vectors, still without noise: make_environments() adds that."""
+    env = gym.make(env_id, disable_env_checker=True, **kwargs)  # make_flat() checks every step
     return noisy.make_flat(env, STEP_LIMIT)
 
 
@@ -117,7 +117,7 @@ class Critic(nn.Module):
 
 
 class Actor(nn.Module):
-    """A Gaussian policy, squashed to the action bounds; learn() draws its standard normal `eps`."""
+    """A Gaussian policy, squashed to the bounds; learn() draws its input `eps` ~ N(0, 1)."""
 
     def __init__(self, env):
         super().__init__()
@@ -128,7 +128,7 @@ class Actor(nn.Module):
         self.register_buffer("action_bias", (high + low) / 2)
 
     def forward(self, observations, eps):
-        """Return actions (B, A), the same before scaling, in (-1, 1), and the log of the std."""
+        """Return actions (B, A), these before scaling, in (-1, 1), and log_std (B, A)."""
         mean, log_std = self.network(observations).chunk(2, dim=-1)
         # a smooth clamp, from SpinUp / Denis Yarats
         log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (torch.tanh(log_std) + 1)
@@ -255,7 +255,7 @@ def learn(args, env, test_env, stop):
     actor, critic, target = Actor(env).to(device), Critic(env).to(device), Critic(env).to(device)
     target.load_state_dict(critic.state_dict())
     alpha = torch.tensor(1.0 if args.autotune else args.alpha)
-    temperature = nn.ParameterDict({"log_alpha": alpha.log()}).to(device)  # for updater()
+    temperature = nn.ParameterDict({"log_alpha": alpha.log()}).to(device)  # a module, for updater()
     target_entropy = -float(env.action_space.shape[0])
     q_optimizer = torch.optim.Adam(critic.parameters(), lr=args.q_lr, fused=True)
     actor_optimizer = torch.optim.Adam(actor.parameters(), lr=args.policy_lr, fused=True)
@@ -339,7 +339,7 @@ def learn(args, env, test_env, stop):
 
 
 def load_policy(run_dir, env=None):
-    """Return the policy of a run's last test; only runs of 0.3, without spaces, need `env`."""
+    """Return the policy of a run's last test; `env` is for runs of this project's version 0.3."""
     config = json.loads(Path(run_dir, "config.json").read_text())
     actor = Actor(env or noisy.Spaces(config))
     saved = read_state(Path(run_dir, "policy.pt"))
@@ -365,14 +365,14 @@ def updater(loss, network, optimizer, args):
     def update(*inputs):
         learned = {name: p for name, p in parameters.items() if p.requires_grad}  # not frozen
         # a compiled graph takes a Python number as a constant, and is compiled again for another
-        numbers = (int, float, np.float32, np.float64, np.int32, np.int64)  # a bool may be a switch
+        numbers = (int, float, np.float32, np.float64, np.int32, np.int64)  # bools stay: `if flag`
         inputs = [torch.tensor(float(x)) if type(x) in numbers else x for x in inputs]
         with precision:
             gradient, (_, curves) = gradient_of(learned, tuple(inputs))
         for name, parameter in parameters.items():
             # the fused Adam of PyTorch 2.13 silently misreads gradients that are not contiguous
             parameter.grad = gradient[name].contiguous() if name in learned else None
-        # Adam's momentum of dead units decays to 1e-45, and Intel's processors are slow with that
+        # Intel's processors are slow with 1e-45, the momentum of dead units: flush it here
         torch.set_flush_denormal(True)
         optimizer.step()
         torch.set_flush_denormal(False)
@@ -385,7 +385,7 @@ def updater(loss, network, optimizer, args):
 
 
 def fail(message, code=2):
-    """Exit after a line that says what is wrong and what to do."""
+    """Exit after a line that says what is wrong; code 2: in the arguments, 1: elsewhere."""
     print(f"error: {message}", file=sys.stderr)
     raise SystemExit(code)
 
@@ -433,7 +433,7 @@ def train(args, stop=lambda: 0):
     if args.cuda and not torch.cuda.is_available():
         fail("--cuda: PyTorch finds no GPU; leave it out to run on the CPU")
     try:
-        args = replace(args, **noisy.canonical_arguments(asdict(args)))
+        args = replace(args, **noisy.canonical_arguments(asdict(args)))  # checks them, too
     except ValueError as error:
         fail(error)
     if args.eval_frequency is None:
@@ -449,7 +449,7 @@ def train(args, stop=lambda: 0):
     is_medium = args.matmul_precision == "medium" and not would_round
     torch.set_float32_matmul_precision("medium" if is_medium else "highest")
     with fail_on((gym.error.Error, noisy.SpaceError), f"--env-id {args.env_id}"):
-        env, test_env = noisy.make_environments(make_env, asdict(args), TEST_SEED)
+        env, test_env = noisy.make_environments(make_env, asdict(args), TEST_SEED)  # adds noise
     with env, test_env:  # they are closed at the end
         return learn(args, env, test_env, stop)
 
@@ -480,7 +480,7 @@ class Run:
         config = self.folder / "config.json"
         with fail_on(ValueError, str(self.folder)):
             old = json.loads(config.read_text()) if config.exists() else new
-            self.config = noisy.resumed_run(old, new)
+            self.config = noisy.resumed_run(old, new)  # ValueError: a run with other arguments
         if self.config["script_sha256"] != new["script_sha256"]:
             say("the script has changed since the run began; if it matters, use --exp-name")
         self.is_finished = (self.folder / "result.json").exists()
@@ -527,7 +527,7 @@ class Run:
         return step
 
     def _log_hyperparameters(self):
-        """Log all arguments as a table, and as columns of HPARAMS with what they achieve."""
+        """Log all arguments as a table and for HPARAMS (add_hparams() would make a subfolder)."""
         args = {name: str(value) for name, value in asdict(self.args).items()}
         table = "".join(f"|{name}|{value}|\n" for name, value in args.items())
         self.writer.add_text("hyperparameters", "|param|value|\n|-|-|\n" + table)
@@ -570,7 +570,7 @@ class Run:
             self.printed = now
 
     def log_episode(self, step, info):
-        """Log a training episode by the info of its last step; its return is without noise."""
+        """Log a training episode by the info of its last step; its return has no reward noise."""
         charts = {"episodic_return": info["episode"]["r"], "episodic_length": info["episode"]["l"]}
         self.log(step, charts=charts | noisy.success_rate([noisy.outcome(info)]))
 
@@ -643,14 +643,14 @@ def stop_at_signals():
 
     def remember(number, frame):
         received.append(number)
-        # a process that the environment forked: the episode that goes on needs it
+        # Ctrl-C also reaches processes that the environment forked; the last episode needs them
         is_worker = os.getpid() != script_pid
         is_second_ctrl_c = number == signal.SIGINT and len(received) > 1
         if is_second_ctrl_c or (is_worker and number != signal.SIGINT):
             os._exit(128 + number)
         if not is_worker:
             with contextlib.suppress(OSError):  # print() is not safe in here
-                os.write(1, b"stopping after this episode; Ctrl-C again: without a checkpoint\n")
+                os.write(1, b"stopping after this episode; Ctrl-C again: at once, without saving\n")
 
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         if signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP
