@@ -353,7 +353,7 @@ def updater(loss, network, optimizer, args):
     Numbers among the inputs may change from one update to the next. The optimizer may be any whose
     step() needs no closure. Loss and gradient in one compiled graph are faster than backward().
     """
-    # functional_call calls a module with other parameters: one whose forward() is the loss
+    # the loss as forward() of a module, because functional_call() swaps parameters only in there
     module = nn.ModuleList([network])
     module.forward = functools.partial(loss, network)
     parameters = dict(module.named_parameters())
