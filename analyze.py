@@ -35,7 +35,7 @@ from analysis.formatting import WHOLE_WORDS, in_markdown, listed, shown, text_ta
 from analysis.latex import latex_table
 from analysis.report import Results, write_report
 from analysis.robustness import analyse_robustness, read_robustness
-from analysis.runs import MORE_TO_COME, finished, in_short, left_out, read_runs
+from analysis.runs import MORE_TO_COME, few, finished, in_short, left_out, read_runs
 from analysis.studies import make_studies, version_notes
 from analysis.style import COLUMN, PAGE
 from analysis.tables import in_words, lopsided_notes, make_tables, success_table, table_of
@@ -169,7 +169,7 @@ def print_results(out, results, older):
     for note in results.notes + results.versions:
         say(f"note: {note}")
     if older:
-        names = ", ".join([*older[:3], *(["..."] if len(older) > 3 else [])])
+        names = few(pd.Series(older))
         say(f"note: {counted(len(older), 'file')} in {out} not of this analysis: {names}")
     if results.problems:
         print()
