@@ -318,12 +318,12 @@ def learn(args, env, test_env, stop):
             charts = {"learning_rate": optimizer.param_groups[0]["lr"]}
             run.log(global_step, charts=charts, losses=curves, noise=noisy.noise_statistics(env))
 
-            # TEST: if a multiple of --eval-frequency is in the rollout; eval.csv has that multiple
-            steps_late = global_step % args.eval_frequency if args.eval_frequency > 0 else math.inf
-            if is_last or steps_late < args.num_steps:
+            # TEST: if it was due in this rollout, at the step that eval.csv has
+            frequency = args.eval_frequency or args.total_timesteps
+            due = args.total_timesteps if is_last else global_step // frequency * frequency
+            if due > global_step - args.num_steps:
                 policy = make_policy(agent, observation_stats, env)
                 results = noisy.play(test_env, policy, args.eval_episodes, TEST_SEED)
-                due = args.total_timesteps if is_last else global_step - steps_late
                 saved = {"agent": agent.state_dict()}
                 saved["observation_stats"] = observation_stats.state_dict()
                 run.log_test(global_step, results, saved, due)
