@@ -361,15 +361,20 @@ def end_with_program():
 
 
 def names_of(players):
-    """Name each run's study as analyze.py does, and in which arguments the run differs from it."""
+    """Name each run's study as analyze.py does, and in what the run differs from most of it."""
     studies = {}
     for player in players:
         studies.setdefault(study_of(player.run), []).append(player.run.config)
     usual = {key: usual_config(configs) for key, configs in studies.items()}
+    releases = {key: {noisy.release(config) for config in studies[key]} for key in studies}
     for player in players:
         key = study_of(player.run)
         differing = noisy.different_arguments(player.run.config, usual[key], NOT_SETTINGS)
         own = [f"{name}={value}" for name, (value, _) in sorted(differing.items())]
+        if len(releases[key]) > 1:
+            own.append(f"release {player.run.release}")
+        if not player.run.finished:
+            own.append(f"step {step_of(player)}, not finished")
         yield ", ".join([study_name(*key), *own])
 
 

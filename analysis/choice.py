@@ -8,8 +8,9 @@ from analysis import folders
 from analysis.folders import RETURN, SUCCESS
 from noisy_wrappers import Configuration
 
-CHOICE_COLUMNS = ["algorithm", "environment", "phase", "round", "noise", "noise_rate"]
-CHOICE_COLUMNS += ["seeds", "score", "survives"]
+# The first four tell one choice from another
+CHOICE_COLUMNS = ["algorithm", "environment", "exp_name", "tested", "phase", "round"]
+CHOICE_COLUMNS += ["noise", "noise_rate", "seeds", "score", "survives"]
 
 
 def choice_file(metric=RETURN):
@@ -25,11 +26,11 @@ def read_choice(runs_dir, metric=RETURN):
     path = Path(runs_dir) / choice_file(metric)
     if not path.exists():
         return None
-    text = dict.fromkeys(("round", "noise", "noise_rate", "survives"), str)
+    text = dict.fromkeys(set(CHOICE_COLUMNS) - {"seeds", "score"}, str)
     with folders.naming(path):
         choice = pd.read_csv(path, dtype=text, keep_default_na=False)
-    if list(choice.columns) != CHOICE_COLUMNS:
-        raise ValueError(f"{path} does not have the columns {','.join(CHOICE_COLUMNS)}")
-    pairs = zip(choice["noise"], choice["noise_rate"], strict=True)
-    choice["noise_rate"] = [Configuration.parse(*pair).noise_rate for pair in pairs]
+        if list(choice.columns) != CHOICE_COLUMNS:
+            raise ValueError(f"its columns are not {','.join(CHOICE_COLUMNS)}")
+        pairs = zip(choice["noise"], choice["noise_rate"], strict=True)
+        choice["noise_rate"] = [Configuration.parse(*pair).noise_rate for pair in pairs]
     return choice

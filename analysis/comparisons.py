@@ -24,7 +24,7 @@ IQM_CHANGE = ["iqm_change_percent", "iqm_change_low", "iqm_change_high"]
 UNKNOWN = ["t", "p", "difference_low", "difference_high", *IQM_CHANGE]
 UNKNOWN += ["difference_percent", "percent_low", "percent_high"]
 VERDICT = ["p_adjusted", "comparisons", "verdict"]
-COMPARED = [*statistics.Comparison._fields, *VERDICT, *IQM_CHANGE, *PROBABILITY]
+COMPARED = [*statistics.Comparison._fields, *VERDICT, *IQM_CHANGE, *PROBABILITY, "lopsided"]
 RESULTS = ["mean", "std", "n", "baseline_mean", "baseline_std", "n_baseline", *IQM]
 RESULTS += ["steps_to_baseline"]
 
@@ -83,7 +83,7 @@ def rows_in_one_environment(studies, by):
             tried = [config for config in study.finals if len(study.sample(config, e))]
             for (noise, rate), configs in groups_of(tried, by).items():
                 row = row_keys(study, environment, noise, rate)
-                row |= against_baseline(study, configs, [e], with_more=by == "rate")
+                row |= against_baseline(study, configs, [e], by)
                 if environment in all_equal:
                     row |= dict.fromkeys(UNKNOWN, np.nan) | {"verdict": ALL_EQUAL}
                 rows.append(row)
@@ -107,7 +107,7 @@ def rows_together(studies, by):
             places = np.flatnonzero(differing & (numbers >= 2))
             if len(places) > 1:
                 row = row_keys(study, "", noise, rate)
-                rows.append(row | against_baseline(study, configs, places, with_more=by == "rate"))
+                rows.append(row | against_baseline(study, configs, places, by))
     return frame(rows, COMPARED)
 
 
@@ -133,17 +133,20 @@ def finals_of(study, configs):
     return np.concatenate([study.finals[config] for config in configs])
 
 
-def against_baseline(study, configs, places, *, with_more):
+def against_baseline(study, configs, places, by):
     """Return the part of a row that compares some configurations together with the baseline.
 
-    places: the numbers of the environments. with_more: also the change of the IQM and the
-    probability of improvement.
+    places: the numbers of the environments. by "rate": also the change of the IQM and the
+    probability of improvement. lopsided: whether the numbers of seeds are, in any environment.
     """
     x, y = finals_of(study, configs)[:, places], study.finals[BASELINE][:, places]
     row = statistics.compare(x, y, episodes=study.episodes)._asdict()
-    if with_more:
+    most = verdicts.MOST_RATIO_OF_RATES if by == "rate" else verdicts.MOST_RATIO
+    seeds = runs_in(study, configs)[places], runs_in(study, [BASELINE])[places]
+    row["lopsided"] = any(verdicts.is_lopsided(*n, most) for n in zip(*seeds, strict=True))
+    if by == "rate":
         row |= zip(PROBABILITY, iqm.probability_of_improvement(x, y), strict=True)
-    if with_more and np.isfinite(row["difference_percent"]):
+    if by == "rate" and np.isfinite(row["difference_percent"]):
         row |= zip(IQM_CHANGE, iqm.bootstrap_iqm(x, y), strict=True)
     return row
 
@@ -156,9 +159,7 @@ def judged_beside(noises, rates, family, metric, smallest_gain=None):
     wrong too often, there is neither p nor verdict.
     """
     several = ~are_in(rates, noises)
-    pairs = zip(rates["n"], rates["n_baseline"], strict=True)
-    lopsided = [verdicts.is_lopsided(*pair, verdicts.MOST_RATIO_OF_RATES) for pair in pairs]
-    lopsided = several & rates["p"].notna() & np.array(lopsided, bool)
+    lopsided = several & rates["p"].notna() & (rates["lopsided"] == 1)
     rates.loc[lopsided, ["t", "p", "smallest_p"]] = np.nan
     many = judged(rates[several].copy(), family, metric, smallest_gain)
     found = noises.set_index(KEYS)[VERDICT]
@@ -180,14 +181,16 @@ def as_chosen(compared, choice):
     said = {}
     if choice is not None:
         for row in choice[choice["phase"] == CONFIRMATION].itertuples():
-            key = row.algorithm, row.environment, row.noise, row.noise_rate
+            study = row.algorithm, row.environment, row.exp_name, row.tested
+            key = *study, row.noise, row.noise_rate
             words = {"yes": verdicts.BETTER, "worse": verdicts.WORSE}
             said[key] = words.get(row.survives, verdicts.UNCLEAR)
 
     def verdict(row):
         if row["phase"] != CONFIRMATION or row["verdict"] in (verdicts.TOO_FEW, ALL_EQUAL):
             return row["verdict"]
-        key = row["algorithm"], row["environment"], row["noise"], row["noise_rate"]
+        study = row["algorithm"], row["environment"], row["exp_name"], row["tested"]
+        key = *study, row["noise"], row["noise_rate"]
         return said.get(key, np.nan)
 
     judged = {}

@@ -17,7 +17,7 @@ from analysis.formatting import seeds_between, seeds_of, slug
 from analysis.heatmap import heatmaps
 from analysis.power import CONFIDENCE, LEVEL
 from analysis.runs import KEYS, rows_of
-from analysis.statistics import SEEDS_FOR_INTERVAL
+from analysis.statistics import SEEDS_FOR_INTERVAL, least_variance
 from noisy_wrappers import BASELINE, rate_order
 
 COLUMN_END = "_column"  # of the name of a figure that is as wide as a column
@@ -110,27 +110,34 @@ def panels(study, titles, width, below, legend, **more):
     return fig, axes
 
 
-def spread(runs, band):
-    """Return half of the band around the mean of runs (..., seeds), or None for each seed.
+def band_of(runs, band, episodes=None):
+    """Return the mean of runs (rows, seeds), and the low and high ends of its band (rows,).
 
-    The interval is Student's, from five seeds on, as for differences.
+    The interval is Student's, from five seeds on, as for differences; of rates of success, each of
+    so many episodes, it has no width zero and stays from 0 to 100. Where there is no band, the ends
+    are NaN.
     """
-    n = np.isfinite(runs).sum(axis=-1)
-    if np.max(n) < (SEEDS_FOR_INTERVAL if band == INTERVAL else 2):
-        return None
-    std = pd.DataFrame(np.atleast_2d(runs)).std(axis=1).to_numpy()
+    table = pd.DataFrame(runs)
+    found = table.mean(axis=1), table.std(axis=1), table.count(axis=1)
+    mean, std, n = (column.to_numpy() for column in found)
     if band == STD:
-        return np.nan_to_num(std)
-    return np.nan_to_num(special.stdtrit(np.maximum(1, n - 1), 1 - LEVEL / 2) * std / np.sqrt(n))
+        return mean, mean - std, mean + std
+    variance = std**2 / np.maximum(1, n)
+    if episodes:
+        variance = np.maximum(variance, least_variance(mean, episodes * n))
+    half = special.stdtrit(np.maximum(1, n - 1), 1 - LEVEL / 2) * np.sqrt(variance)
+    half[n < SEEDS_FOR_INTERVAL] = np.nan
+    low, high = (0, 100) if episodes else (-np.inf, np.inf)
+    return mean, np.maximum(mean - half, low), np.minimum(mean + half, high)
 
 
-def curve(ax, x, runs, band, **look):
+def curve(ax, x, runs, band, episodes=None, **look):
     """Draw the mean of runs (steps x seeds) with its band, or with thin lines of the seeds."""
     runs = runs[:, np.isfinite(runs).any(axis=0)]
-    mean, half = pd.DataFrame(runs).mean(axis=1).to_numpy(), spread(runs, band)
+    mean, low, high = band_of(runs, band, episodes)
     ax.plot(x, mean, zorder=3, **look)
-    if half is not None:
-        ax.fill_between(x, mean - half, mean + half, alpha=0.2, linewidth=0, **look)
+    if np.isfinite(low).any():
+        ax.fill_between(x, low, high, alpha=0.2, linewidth=0, **look)
     elif runs.shape[1] > 1:
         ax.plot(x, runs, linewidth=0.4, alpha=0.7, **look)
 
@@ -183,7 +190,7 @@ def curves_figure(study, curves, band, width=None, noise=None):
     for ax, (e, configs, _) in zip(axes, curves, strict=True):
         for config in configs:
             runs = study.curves[config][..., e]
-            curve(ax, study.steps / unit, runs, band, color=colors[config])
+            curve(ax, study.steps / unit, runs, band, study.episodes, color=colors[config])
         ax.set_xlim(0, study.steps[-1] / unit)
         style.set_ticks(ax, "x", 5)
         style.set_ticks(ax, "y", 4)
@@ -241,7 +248,7 @@ def parameters_figure(study, configs, band=INTERVAL, width=None):
     for ax, e in zip(axes, tried, strict=True):
         for config in configs:
             x = rates.index(config.noise_rate) + beside[config.noise]
-            point(ax, x, study.sample(config, e), band, colors[config.noise])
+            point(ax, x, study.sample(config, e), band, study.episodes, colors[config.noise])
         if BASELINE in configs and len(baseline := study.sample(BASELINE, e)):
             ax.axhline(baseline.mean(), color="black", linewidth=0.6, linestyle=":")
         ax.set_xticks(range(len(ticks)), ticks, **turned)
@@ -252,15 +259,15 @@ def parameters_figure(study, configs, band=INTERVAL, width=None):
     return fig
 
 
-def point(ax, x, sample, band, color):
-    """Draw the mean of a sample with its interval, or with its seeds."""
+def point(ax, x, sample, band, episodes, color):
+    """Draw the mean of a sample with its band, or with its seeds."""
     if len(sample) == 0:
         return
-    half = spread(sample, band)
-    if half is None and len(sample) > 1:
+    mean, low, high = band_of(sample[np.newaxis], band, episodes)
+    if np.isnan(low) and len(sample) > 1:
         ax.plot(np.full(len(sample), x), sample, ".", markersize=2.5, color=color, alpha=0.6)
-    yerr = 0 if half is None else half
-    ax.errorbar(x, sample.mean(), yerr, marker="o", markersize=3, linewidth=0.9, color=color)
+    yerr = np.nan_to_num([mean - low, high - mean])
+    ax.errorbar(x, mean, yerr, marker="o", markersize=3, linewidth=0.9, color=color)
 
 
 def write_figure(out, drawing, latex=False, width=style.PAGE):

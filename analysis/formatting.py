@@ -246,8 +246,9 @@ def shown(table):
     if table.rates_beside and len(text):
         text["mean"] += " (" + text.pop("n") + ")"
         keys = [name for name in text if name not in ("noise_rate", "mean")]
-        text = text.pivot(index=keys, columns="noise_rate", values="mean").fillna(DASH)
-        text = text[sorted(text.columns, key=rate_order)].reset_index()
+        order = pd.MultiIndex.from_frame(text[keys].drop_duplicates())  # pivot() would sort texts
+        text = text.pivot(index=keys, columns="noise_rate", values="mean").reindex(order)
+        text = text[sorted(text.columns, key=rate_order)].fillna(DASH).reset_index()
     return text.rename(columns=title)
 
 

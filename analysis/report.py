@@ -13,6 +13,7 @@ import jinja2
 import pandas as pd
 from markupsafe import Markup, escape
 
+from analysis.comparisons import are_in
 from analysis.figures import COLUMN_END
 from analysis.formatting import DASH, shown, title
 from analysis.power import CONFIDENCE, LEVEL
@@ -41,7 +42,7 @@ TERMS = {
     "worse": "The final mean is lower than without noise; otherwise as better.",
     "no clear difference": f"""p corrected is above {LEVEL}: the noise may help a little, harm a
         little, or do nothing. The interval says how much of either is excluded. Also where averages
-        over environments differ in their direction.""",
+        over environments differ in their direction. (For a confirmation: by the rule of that.)""",
     "no such gain": "The interval excludes a gain as large as --smallest-gain asked for.",
     "too few seeds": "One side has fewer than two seeds, so nothing can be tested.",
     "all equal": "All tests of all runs have the same result, so nothing can be compared.",
@@ -54,8 +55,8 @@ TERMS = {
         the median.""",
     "p": """How often chance alone makes a difference as large, in either direction: a permutation
         test with Welch's t.""",
-    "p corrected": """p, corrected for all comparisons with the same baseline (Benjamini and
-        Hochberg). The p of a confirmation needs no correction.""",
+    "p corrected": """p, corrected for all comparisons of its table with the same baseline
+        (Benjamini and Hochberg). The p of a confirmation needs no correction.""",
     "n": """The number of seeds, or with rates together of runs; with / without noise where they
         differ.""",
     "n baseline": "The number of seeds without noise.",
@@ -97,7 +98,10 @@ class Results:
     @property
     def repeated(self):
         """The names of tables that say nothing but what the first one says, too."""
-        names = set() if len(self.rates) else {"statistics", "statistics_together"}
+        noises, rates = (self.tables[name].frame for name in ("noises", "statistics"))
+        rates = rates[rates["difference"].notna()]
+        is_same = are_in(rates, noises).all()  # every noise has one rate
+        names = {"statistics", "statistics_together"} if is_same else set()
         return names if (self.tables["best"].frame["chosen_from"] > 1).any() else names | {"best"}
 
 

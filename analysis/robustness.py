@@ -17,8 +17,8 @@ import pandas as pd
 from analysis import verdicts
 from analysis.comparisons import are_in
 from analysis.episodes import read_episodes
-from analysis.folders import RETURN, SUCCESS, DamageError
-from analysis.formatting import listed, p_value, percent
+from analysis.folders import RETURN, SEARCH, SUCCESS, DamageError
+from analysis.formatting import listed, p_value, percent, seeds_of
 from analysis.runs import KEYS, STUDY, study_name, study_of, where_tested
 from analysis.statistics import compare, holm, mean_std, percent_of
 from analysis.tables import table_of
@@ -33,6 +33,8 @@ SCORE_COLUMNS = """environment noise noise_rate n n_baseline conditions conditio
     difference_low difference_high difference_percent effect_size p p_holm detectable score_percent
     baseline_score_percent clean_change_percent t pooled_std smallest_p"""
 SCORE_COLUMNS = [*STUDY, *SCORE_COLUMNS.split()]
+MORE = ["percent_low", "percent_high", "n_baseline_most", "primary", "elsewhere", "where"]
+MORE += ["lopsided"]  # what sentences need besides
 
 # What a score says, by the sign of the difference
 DIRECTIONS = {1: "returns more under noise", -1: "returns less under noise"}
@@ -157,9 +159,13 @@ def score_rows(runs, metric=RETURN):
     """
     for _, group in runs.groupby(STUDY):
         tested = group.loc[group["elsewhere"] == "", "environment"].nunique()
-        for config in sorted({*group["configuration"]} - {BASELINE}):
+        configs = sorted({*group["configuration"]} - {BASELINE})
+        noises = [config.noise for config in configs]
+        for config in configs:
+            has_rates = noises.count(config.noise) > 1
             scores = [
-                environment_score(same, config, metric) for _, same in group.groupby("environment")
+                environment_score(same, config, metric, has_rates)
+                for _, same in group.groupby("environment")
             ]
             scores = [score for score in scores if score]
             at_home = [score for score in scores if not score["elsewhere"]]
@@ -174,10 +180,11 @@ def score_rows(runs, metric=RETURN):
                 yield score | {"primary": bool(score["elsewhere"]) or is_only}
 
 
-def environment_score(runs, config, metric=RETURN):
+def environment_score(runs, config, metric=RETURN, has_rates=False):
     """Score a configuration against the baseline in one environment, or return None.
 
-    runs: those of one study and environment. The result is a row of SCORE_COLUMNS with `x` (seeds)
+    runs: those of one study and environment. has_rates: the noise has other rates, too, so with
+    lopsided numbers of seeds there is no p. The result is a row of SCORE_COLUMNS with `x` (seeds)
     and `y` (baseline seeds), the mean returns over the conditions. What is in percent is relative
     to the clean return of the baseline, NaN where that has no percentages.
     """
@@ -199,6 +206,8 @@ def environment_score(runs, config, metric=RETURN):
     row = row_keys(runs, config) | {"elsewhere": runs["elsewhere"].iloc[0]}
     episodes = int(runs["number"].min()) if metric == SUCCESS else None
     row |= compare(x, y, episodes=episodes)._asdict() | {"episodes": episodes}
+    most = verdicts.MOST_RATIO_OF_RATES if has_rates else verdicts.MOST_RATIO
+    row["lopsided"] = verdicts.is_lopsided(len(x), len(y), most)
     row |= {
         "difference_percent": in_percent(x.mean() - y.mean()),
         "percent_low": np.nan,  # of the clean return, so it has no interval
@@ -229,6 +238,7 @@ def average_score(scores, metric=RETURN):
     episodes = min(table["episodes"]) if metric == SUCCESS else None
     row = scores[0] | compare(x, y, episodes=episodes)._asdict()
     row |= {"environment": "", **table[["conditions", "conditions_tested"]].sum()}
+    row["lopsided"] = table["lopsided"].any()
     return row | table.filter(like="percent").mean(skipna=False).to_dict()
 
 
@@ -237,8 +247,8 @@ def analyse_robustness(runs, metric=RETURN):
     if runs.empty:
         return {}, []
     table = pd.DataFrame(condition_rows(runs), columns=COLUMNS)
-    more = ["percent_low", "percent_high", "n_baseline_most", "primary", "elsewhere", "where"]
-    scores = pd.DataFrame(score_rows(runs, metric), columns=[*SCORE_COLUMNS, *more])
+    scores = pd.DataFrame(score_rows(runs, metric), columns=[*SCORE_COLUMNS, *MORE])
+    scores.loc[scores["lopsided"].astype(bool), ["t", "p", "smallest_p"]] = np.nan
     primary = scores[scores["primary"].astype(bool)]
     for _, family in primary[primary["p"].notna()].groupby([*STUDY, "elsewhere"]):
         scores.loc[family.index, "p_holm"] = holm(family["p"].to_numpy(float))
@@ -266,7 +276,9 @@ def not_compared(table, scores):
 
     table: the results under all conditions.
     """
-    tested = table[(table["noise"] != "") & (table["test_noise"] != "")][KEYS].drop_duplicates()
+    of_noise = (table["noise"] != "") & (table["test_noise"] != "")
+    of_noise &= table["phase"] != SEARCH  # which has no baseline
+    tested = table[of_noise][KEYS].drop_duplicates()
     for key, rows in tested[~are_in(tested, scores)].groupby(STUDY):
         where = listed(sorted(set(rows["environment"])))
         yield (
@@ -288,7 +300,10 @@ def robustness_sentences(scores, metric):
         over = f"over {row.conditions} of {counted(row.conditions_tested, 'test condition')}"
         shown, limit = DIRECTIONS[0], ""
         evidence = verdicts.difference_in_words(row, unit)
-        if pd.isna(row.p):
+        if row.lopsided:
+            seeds = seeds_of(row.n, row.n_baseline)
+            shown = f"no verdict with {seeds} seeds, which would be wrong too often,"
+        elif pd.isna(row.p):
             shown = "too few seeds for a test of robustness"
         else:
             corrected = p_value(row.p_holm).removeprefix("= ")

@@ -192,10 +192,10 @@ def missing_runs(entries):
     Expected are the seeds that at least half of a study's configurations with noise have, each
     environment counted apart. An environment in which anything was run should have the baseline
     with these seeds. The search of `./benchmark.sh choose` gives few noises many seeds: nothing is
-    missing there. Nor is a run whose folder is there, by its name, and tells nothing.
+    missing there. Nor is a run that has a folder, by its name, which tells nothing or is left out.
     """
     missing = []
-    silent = {Path(entry.folder).name for entry in entries if entry.run is None}
+    left_out = {Path(e.folder).name for e in entries if e.run is None or e.status == "different"}
     runs = [e.run for e in entries if e.run is not None and e.status != "different"]
     for study in by_study(run for run in runs if run.phase != SEARCH).values():
         found, example = defaultdict(set), {}
@@ -212,7 +212,7 @@ def missing_runs(entries):
             others = configuration == BASELINE and len(seeds) >= len(expected)
             for seed in sorted(set() if others else expected - seeds):
                 run = replace(example[environment], configuration=configuration, seed=seed)
-                if folder_of(run) not in silent:
+                if folder_of(run) not in left_out:
                     missing.append(Entry("", "missing", "no run folder", run))
     return missing
 

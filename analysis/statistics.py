@@ -203,9 +203,13 @@ def variance_of_mean(sample, episodes=None):
     variance = mean_std(sample)[1] ** 2 / len(sample)
     if not episodes:
         return variance
-    number = episodes * len(sample)
-    rate = (number * np.mean(sample) / 100 + 1) / (number + 2)
-    return max(variance, 100**2 * rate * (1 - rate) / (number + 2))
+    return max(variance, least_variance(np.mean(sample), episodes * len(sample)))
+
+
+def least_variance(mean, number):
+    """Return the least variance of a mean rate of success, in percent, of a number of episodes."""
+    rate = (number * mean / 100 + 1) / (number + 2)
+    return 100**2 * rate * (1 - rate) / (number + 2)
 
 
 def degrees_of_freedom(variances, sizes):

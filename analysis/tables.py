@@ -121,14 +121,14 @@ def split_consistency(consistency):
 
 def lopsided_notes(compared):
     """Say where verdicts may be wrong too often, because one side has few of all seeds."""
-    noises = compared.noises[compared.noises["p"].notna()]
-    pairs = zip(noises["n"], noises["n_baseline"], strict=True)
-    noises = noises[np.array([verdicts.is_lopsided(*pair) for pair in pairs], bool)]
+    noises = compared.noises[compared.noises["p"].notna() & (compared.noises["lopsided"] == 1)]
     rates = compared.rates[compared.rates["smallest_p"].isna()]
+    everywhere = compared.rates_together["smallest_p"].isna().any()
+    where = "there and over several environments" if everywhere else "there"
     notes = []
     for rows, said in (
         (noises, "a verdict may be wrong more often than in 5 %"),
-        (rates, "single rates have no verdict, which would be wrong too often"),
+        (rates, f"single rates have no verdict {where}, which would be wrong too often"),
     ):
         for key, group in rows.groupby(STUDY, sort=False):
             seeds = sorted({seeds_of(*pair) for pair in group[["n", "n_baseline"]].to_numpy()})
@@ -165,8 +165,8 @@ seeds, and the difference from no noise. Here p is not corrected.""",
 mean final returns with its {CONFIDENCE} interval, and its test. Effect sizes are standard
 deviations.""",
     "statistics_together": """The same over all environments, which count equally.""",
-    "success": """Success rate in the final test, in percent of its episodes: mean \u00b1 standard
-deviation over n seeds, and the difference from no noise in percentage points.""",
+    "success": """Final success rate, in percent of the episodes: mean \u00b1 standard deviation
+over n seeds, and the difference from no noise in percentage points.""",
     "choice": """How the noise was chosen: each round of the search drops the worse half, and fresh
 seeds confirm the winner or not.""",
     "robustness_score": """Primary figure of robustness: the mean return over all test conditions
@@ -185,6 +185,7 @@ def percent_note(summary, metric):
     if metric == SUCCESS:
         return "Success rates are in percent of the episodes, differences in percentage points."
     without = summary["difference"].notna() & summary["difference_percent"].isna()
+    without &= summary["verdict"] != ALL_EQUAL  # which has no percentages for another reason
     names = sorted(set(summary.loc[without, "environment"]))
     if not names:
         return ""

@@ -100,7 +100,8 @@ def plan_for(args, algorithm, env_id, verdicts):
                 "leave out --confirm and --looks, or use another --runs-dir"
             )
         return kept
-    fewest = next(n for n in itertools.count(4) if is_enough(n, args.looks, asked.level))
+    start = max(4, args.looks or 0)  # with fewer seeds two looks would be one
+    fewest = next(n for n in itertools.count(start) if is_enough(n, args.looks, asked.level))
     if args.confirm < fewest:
         fail(
             f"--confirm must be at least {fewest}, not {args.confirm}: with fewer seeds no "

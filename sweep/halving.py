@@ -139,9 +139,11 @@ def judge(state, plan, returns, episodes=None):
     return Verdict(comparison, len(state.seeds), plan.looks[-1], needed)
 
 
-def records(algorithm, environment, state, returns, verdict):
-    """Yield the rows of choice.csv for one finished choice; their columns are CHOICE_COLUMNS."""
-    kind = algorithm, environment
+def records(kind, state, returns, verdict):
+    """Yield the rows of choice.csv for one finished choice; their columns are CHOICE_COLUMNS.
+
+    kind: algorithm, environment, exp_name, where it was tested.
+    """
     for number, done in enumerate(state.rounds, start=1):
         for candidate, score in done.scores.items():
             survives = "yes" if candidate in done.survivors else "no"

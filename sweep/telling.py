@@ -14,6 +14,7 @@ from analysis.words import counted
 from noisy_wrappers import BASELINE
 from sweep import halving
 from sweep.environment import processor_time
+from sweep.found import look
 from sweep.looks import nominal_levels
 from sweep.options import from_caller
 
@@ -121,7 +122,9 @@ def report(found, args):
     for choice in found:
         verdict = judge(choice, args)
         print(sentence(choice, verdict, UNITS[args.metric]), flush=True)
-        rows += halving.records(*choice.kind, choice.state, choice.returns, verdict)
+        run = look(next(iter(choice.runs.values()))).run
+        kind = *choice.kind, run.exp_name, run.tested
+        rows += halving.records(kind, choice.state, choice.returns, verdict)
     write_choice(Path(args.runs_dir, choice_file(args.metric)), rows)
 
 
@@ -182,12 +185,12 @@ def write_choice(path, new):
 
     new: rows of halving.records.
     """
-    rows, chosen_now = [CHOICE_COLUMNS], {row[:2] for row in new}
+    rows, chosen_now = [CHOICE_COLUMNS], {row[:4] for row in new}
     try:
         with rewritten(path) as file:  # other commands may end at the same time
             if path.exists():
                 with open(path, newline="", encoding="utf-8") as old:
-                    rows = [row for row in csv.reader(old) if tuple(row[:2]) not in chosen_now]
+                    rows = [row for row in csv.reader(old) if tuple(row[:4]) not in chosen_now]
             if rows[:1] != [CHOICE_COLUMNS]:
                 raise ValueError(f"its columns are not {','.join(CHOICE_COLUMNS)}")
             csv.writer(file, lineterminator="\n").writerows(rows + new)

@@ -18,6 +18,7 @@ import stub_run
 import analyze
 import evaluate
 import noisy_wrappers
+from analysis.choice import CHOICE_COLUMNS
 from analysis.folders import DamageError, read_run
 from sweep import choose
 from sweep.__main__ import main as sweep
@@ -194,8 +195,9 @@ def test_a_folder_that_cannot_be_entered_hides_no_run(case):
     assert case.bad[1].name in missing and "config.json: Permission denied" in missing
 
 
-def test_an_empty_choice_file_is_named(case, capsys):
-    (case.choice / "choice.csv").touch()
+@pytest.mark.parametrize("lines", ["", ",".join(CHOICE_COLUMNS) + "\n,,,,,,A(1),x,1,1,yes\n"])
+def test_a_damaged_choice_file_is_named(lines, case, capsys):
+    (case.choice / "choice.csv").write_text(lines)
     with pytest.raises(SystemExit) as end:
         analyze.main(analyze.Args(case.choice))
     assert end.value.code == 2 and "error: choice.csv: " in capsys.readouterr().err

@@ -9,23 +9,29 @@ from analysis.choice import read_choice
 from analysis.folders import runs_of
 from analysis.runs import read_runs
 
-HEADER = "algorithm,environment,phase,round,noise,noise_rate,seeds,score,survives\n"
+HEADER = "algorithm,environment,exp_name,tested,phase,round,noise,noise_rate,seeds,score,survives\n"
+NAME = "ppo_continuous_noisy"
 
 
-def write_choice(root, env="Hopper-v5", seeds=range(1001, 1006), gain=30.0):
+def write_choice(root, env="Hopper-v5", seeds=range(1001, 1006), gain=30.0, name=NAME):
     """Runs of a search in two rounds, which flatters its winner, and of a confirmation."""
+
+    def write(phase, final, seed, *noise):
+        more = {"folder": f"{name}_{env}_{seed}_{noise}", "exp_name": name}
+        write_run(root / phase, [final], "PPO", env, *noise, seed=seed, **more)
+
     for noise, n, final in ((SCALE, 3, 900.0), (ENDING, 1, 100.0)):
         for seed in range(1, n + 1):
-            write_run(root / "search", [final + seed], "PPO", env, noise, 1.0, seed)
-    fresh = root / "confirmation"
+            write("search", final + seed, seed, noise, 1.0)
     for seed in seeds:
-        write_run(fresh, [100.0 + seed - 1000], "PPO", env, seed=seed)
-        write_run(fresh, [100.0 + gain + seed - 1000], "PPO", env, SCALE, 1.0, seed)
+        write("confirmation", 100.0 + seed - 1000, seed)
+        write("confirmation", 100.0 + gain + seed - 1000, seed, SCALE, 1.0)
+    study = f"PPO,{env},{name},"
     lines = [
-        f'PPO,{env},search,1,"{SCALE}",1.0,1,901.0,yes\n',
-        f'PPO,{env},search,1,"{ENDING}",1.0,1,101.0,no\n',
-        f"PPO,{env},confirmation,,,0.0,5,103.0,\n",
-        f'PPO,{env},confirmation,,"{SCALE}",1.0,5,133.0,yes\n',
+        f'{study},search,1,"{SCALE}",1.0,1,901.0,yes\n',
+        f'{study},search,1,"{ENDING}",1.0,1,101.0,no\n',
+        f"{study},confirmation,,,0.0,5,103.0,\n",
+        f'{study},confirmation,,"{SCALE}",1.0,5,133.0,yes\n',
     ]
     path = root / "choice.csv"
     path.write_text((path.read_text() if path.exists() else HEADER) + "".join(lines))
@@ -87,6 +93,15 @@ def test_a_confirmation_has_the_verdict_of_the_choice(gain, survives, verdict, t
     assert said == verdict or (pd.isna(said) and not verdict)
     assert list(tables["noises"]["p_adjusted"]) == list(tables["noises"]["p"])
     assert set(tables["noises"]["comparisons"]) == {1} and tables["noises_together"].empty
+
+
+def test_two_choices_of_one_environment_have_verdicts_of_their_own(tmp_path):
+    write_choice(tmp_path / "runs", name="other")
+    path = tmp_path / "runs/choice.csv"
+    path.write_text(path.read_text().replace("133.0,yes", "133.0,no"))
+    write_choice(tmp_path / "runs")
+    noises = run(tmp_path)["noises"].set_index("exp_name")["verdict"]
+    assert noises.to_dict() == {"other": "no clear difference", NAME: "better"}
 
 
 def test_a_confirmation_that_is_not_judged_yet_is_drawn(tmp_path):

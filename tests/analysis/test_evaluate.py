@@ -291,7 +291,7 @@ def test_the_table_of_known_returns(capsys):
     ]:
         folder, configuration = Path(str(len(seen))), Configuration.parse(noise, rate)
         names = "PPO", "ppo_continuous_noisy.py", "E", "ppo_continuous_noisy", configuration
-        run = Run(folder, "", {"args": {}}, *names, BASELINE, len(seen), 1, "0.4")
+        run = Run(folder, "", {"args": {}}, *names, BASELINE, len(seen), 1, "0.4", result={})
         # A third episode is stored and not asked for; the second number is the length.
         seen[evaluate.Player(run)] = {
             (condition, ""): np.array([(value, 1, math.nan) for value in (*values, 1000)])
@@ -306,6 +306,23 @@ def test_the_table_of_known_returns(capsys):
         ["E", "PPO", "no noise", "0.00", "3", "33 ± 15", "0.8 ± 3.1"],
         ["E", "PPO", "A(1)", "0.50", "1", "5.000", "7.500"],
     ]
+
+
+def test_releases_and_unfinished_runs_are_rows_of_their_own(tmp_path):
+    """Releases are never pooled, and a policy of step 10 is not one of the end."""
+    (tmp_path / "eval.csv").write_text("step\n10,0,1.0,1,\n")
+    names = "PPO", "ppo_continuous_noisy.py", "E", "ppo_continuous_noisy", BASELINE, BASELINE, 1, 99
+    runs = [("0.4", {}), ("0.3", {}), ("0.4", None)]
+    players = []
+    for version, result in runs:
+        config = {"args": {}, "versions": {"noisy_wrappers": version}}
+        players.append(evaluate.Player(Run(tmp_path, "", config, *names, version, result=result)))
+    assert list(evaluate.names_of(players)) == [
+        "PPO, release 0.4",
+        "PPO, release 0.3",
+        "PPO, release 0.4, step 10, not finished",
+    ]
+    assert list(evaluate.names_of(players[:1])) == ["PPO"]
 
 
 def test_masses_by_delays_are_a_matrix(runs, capsys):

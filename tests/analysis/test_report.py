@@ -10,7 +10,7 @@ from html import escape, unescape
 
 import pandas as pd
 import pytest
-from sweeps import NAN, run, small_sweep, write_pairs
+from sweeps import NAN, run, small_sweep, write_pairs, write_run
 
 import analysis.verdicts
 
@@ -103,6 +103,9 @@ def test_a_section_that_is_empty_or_says_nothing_new_is_left_out(tmp_path):
     assert once == ["verdict", "noises", "early_performance", "summary", "how"]
     write_pairs(tmp_path / "runs", [], [21, 22, 23], rate=0.2)
     assert set(sections()) - set(once) == {"best", "statistics"}
+    for seed in range(4, 10):  # rates have no verdict now, and still intervals
+        write_run(tmp_path / "runs", [10 + seed], seed=seed)
+    assert "statistics" in sections()
 
 
 def test_the_counts_at_the_top_are_those_of_the_list(tmp_path):

@@ -108,6 +108,29 @@ def test_score_and_conditions_by_hand(tmp_path, capsys):
     assert f"p = 0.029 {few}, Holm 0.057; clean return -10 %" in text
 
 
+def test_lopsided_numbers_of_seeds_have_no_verdict(tmp_path, capsys):
+    """As for returns: of a noise with several rates from 1.6 times the seeds on, else from 2.6."""
+    returns = {CLEAN: [100 + i for i in range(9)], (PUSH, "1.0"): [50 + i for i in range(9)]}
+    noisy = {CLEAN: [100 + i for i in range(5)], (PUSH, "1.0"): [80 + i for i in range(5)]}
+    write_tests(tmp_path / "runs", {("", 0.0): returns}, "Hopper-v5", range(1, 10))
+    write_tests(tmp_path / "runs", {(SENSOR, 0.2): noisy}, "Hopper-v5", range(1, 6))
+    alone = row(run(tmp_path)["robustness_score"], noise=SENSOR)
+    assert alone["p"] < 0.01 and "returns more under noise over" in capsys.readouterr().out
+    write_tests(tmp_path / "runs", {(SENSOR, 0.1): noisy}, "Hopper-v5", range(1, 6))
+    scores = run(tmp_path)["robustness_score"]
+    assert scores[["p", "p_holm"]].isna().all(axis=None) and scores["difference_low"].notna().all()
+    said = "no verdict with 5/9 seeds, which would be wrong too often, over 1 of 1 test condition"
+    assert capsys.readouterr().out.count(said) == 2
+
+
+def test_the_search_of_a_choice_has_no_baseline_to_play(tmp_path, capsys):
+    noisy = {(SENSOR, 0.2): {CLEAN: [9], (PUSH, "1.0"): [8]}}
+    write_tests(tmp_path / "runs/search", noisy, "Hopper-v5", [1])
+    write_tests(tmp_path / "runs/confirmation", {("", 0.0): {CLEAN: [9]}}, "Hopper-v5", [1001])
+    run(tmp_path)
+    assert "plays what is missing" not in capsys.readouterr().out
+
+
 def test_tests_elsewhere_never_mix_with_those_at_home(tmp_path):
     """They are rows of their own, and change nothing of the others."""
     write_tests(tmp_path / "runs", HOPPER, "Hopper-v5")

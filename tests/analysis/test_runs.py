@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from sweeps import ENDING, SCALE, row, run, write_pairs, write_run
 
-from analysis.runs import in_short, left_out, missing_runs, read_runs
+from analysis.runs import folder_of, in_short, left_out, missing_runs, read_runs
 from analysis.studies import make_studies, version_notes
 from noisy_wrappers import BASELINE, run_name
 
@@ -103,6 +103,16 @@ def test_more_seeds_for_the_baseline_or_for_one_noise_are_nothing_missing(tmp_pa
     hopper = [run for run in missing if run.environment == "Hopper-v5"]
     assert [(run.configuration.noise_rate, run.seed) for run in hopper] == [("0.50", 4)]
     assert {run.configuration.noise for run in missing if run not in hopper} == {"", ENDING}
+
+
+def test_a_run_with_other_arguments_is_not_missing_besides(tmp_path):
+    for noise, rate in (((), ()), (SCALE, 0.5), (ENDING, 0.5)):
+        for seed in (1, 2, 3):
+            gamma = 0.9 if (noise, seed) == (SCALE, 2) else 0.99
+            write_run(tmp_path, [10], seed=seed, noise=noise, rate=rate, gamma=gamma)
+    for entry in read_runs(tmp_path):  # as scripts name their folders
+        entry.run.folder.rename(tmp_path / folder_of(entry.run))
+    assert left_out(read_runs(tmp_path))["status"].tolist() == ["different"]
 
 
 # ------------------------------------------------------------------------------- what is one study

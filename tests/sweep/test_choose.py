@@ -125,6 +125,8 @@ def test_bounds_of_obrien_and_fleming():
     assert bounds((25,), 0.0125) == pytest.approx([2.49771], abs=1e-5)
     assert nominal_levels(FIVE_LOOKS)[-1] == pytest.approx(0.0423, abs=1e-4)
     assert looks_after(25) == FIVE_LOOKS.looks and looks_after(50, 3) == (17, 34, 50)
+    args = arguments("--looks | 5", "/nowhere")  # of four seeds, two looks would be one
+    assert choose.plan_for(args, "ppo", "Hopper-v5", 1).looks == FIVE_LOOKS.looks
     assert bounds((20, 40), 0.05) == pytest.approx([2.963, 1.969], abs=1e-3)
 
 
@@ -434,7 +436,7 @@ def test_a_status_finds_the_options_of_the_choice(tmp_path):
 
 def test_another_choice_keeps_the_lines_of_the_first(tmp_path):
     path = tmp_path / "choice.csv"
-    first, second = ((algorithm, "Hopper-v5", *7 * "x") for algorithm in ("PPO", "SAC"))
+    first, second = (("PPO", "Hopper-v5", name, *8 * "x") for name in ("one", "other"))
     telling.write_choice(path, [first, first])
     for _ in range(2):
         telling.write_choice(path, [second])
