@@ -7,7 +7,7 @@ usage() {
   cat <<'END'
 Usage: ./benchmark.sh PRESET [grid options] [executor options] [-- script options]
        ./benchmark.sh choose --algos ... --envs ... [options as above]
-       ./benchmark.sh status [PRESET] [grid options]
+       ./benchmark.sh status [PRESET [grid options]] [--runs-dir ...]
 
 Presets
   choose     finds a noise that helps: for each algorithm and environment, tries the noises, gives
@@ -210,6 +210,8 @@ stop() { # EXIT_STATUS
     [ -z "$group${ids[*]}" ] || "stop_$executor" &
   elif [ "$executor" = slurm ]; then
     stop_slurm || true
+  elif [ -n "$group" ] && [ "$executor" = local ]; then
+    kill -KILL -- "-$group" || true # TERM would let each run end its episode
   elif [ -n "$group" ]; then
     kill -TERM -- "-$group" || true
   fi

@@ -121,6 +121,8 @@ def parse_args(view, caller, argv):
     args.default_noises = "--noises" not in given
     if args.noises == [[("paper", None)]]:
         args.pairs, args.noises = PRESETS["paper"]["pairs"], []
+    if preset is None and (given - {"--runs-dir"} or extra):
+        fail("what a sweep still has to do depends on its preset: ./benchmark.sh status PRESET ...")
     # a status that names no grid is one of whatever the folder holds
     whole_folder = preset in (None, "custom") and given <= {"--runs-dir"}
     args.names_grid = view != "status" or not whole_folder
@@ -154,6 +156,8 @@ def check(args):
     for name in ("--exclude", "--budget", "--confirm", "--looks", "--metric"):
         if name in args.given and args.preset != "choose":
             fail(f"{name} is an option of choose")
+    if args.preset == "demo" and args.algos != ["ppo"]:
+        fail("demo has options of PPO: for another algorithm use custom")
     if args.preset == "choose" and not {"--algos", "--envs"} <= args.given:
         fail("choose needs --algos and --envs: it chooses a noise for each of them")
     for name in args.given & {"--seeds", "--baseline-seeds"}:

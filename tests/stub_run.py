@@ -5,7 +5,8 @@
 It makes 100,000 steps a second, and a checkpoint after each tenth of them and when SIGTERM or
 SIGINT stops it; started again, it goes on from there. STUB_FAILS is a pattern of folders whose runs
 fail, STUB_LEAVES what a process runs that a run leaves behind, STUB_HIDES the seconds until a
-result is seen. A file "refuse" in the folder of the runs has a pattern of runs that are refused.
+result is seen, STUB_EPISODE the seconds until a run that is stopped ends. A file "refuse" in the
+folder of the runs has a pattern of runs that are refused.
 """
 
 import argparse
@@ -60,7 +61,7 @@ def pretend_to_train(total_timesteps, checkpoint):
         time.sleep(SECONDS)
         print(f"step={step}/{total_timesteps} sps=100", flush=True)
         if stop():
-            time.sleep(0.2)  # for a second signal, which should not come
+            time.sleep(float(os.environ.get("STUB_EPISODE", 0.2)))  # a second signal may come
         if stop() or step - saved >= total_timesteps / 10:
             checkpoint.with_suffix(".tmp").write_text(str(step))
             checkpoint.with_suffix(".tmp").rename(checkpoint)

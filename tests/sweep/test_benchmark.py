@@ -293,6 +293,17 @@ def test_ctrl_c(engine, tmp_path):
     assert check_stopped(runs, out) == 2
 
 
+@pytest.mark.slow
+def test_a_second_ctrl_c_does_not_wait_for_the_end_of_episodes(stub, tmp_path):
+    sweep, runs = training(tmp_path, "--jobs", "2", env=stub | {"STUB_EPISODE": "600"})
+    sweep.send_signal(signal.SIGINT)
+    time.sleep(2)
+    assert sweep.poll() is None and processes(runs[0].parent)
+    sweep.send_signal(signal.SIGINT)
+    sweep.communicate(timeout=60)
+    assert sweep.returncode == 130 and not processes(runs[0].parent)
+
+
 def training(tmp_path, *executor, env, number=2):
     """Start a sweep of three runs that do not end by themselves; return when some are training."""
     grid = [*GRID, *FOREVER, "--runs-dir", tmp_path]

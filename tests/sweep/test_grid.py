@@ -410,6 +410,7 @@ def test_baselines_that_pay(noises, more, baselines):
         (f"{C} --exclude {A}", '--exclude needs a rate with each noise, as in "NOISE@0.1"'),
         ("demo --envs nope:Env-v0", "--envs: there is no environment 'nope:Env-v0': No module"),
         ("demo --seeds 1 2-1", "--seeds: takes numbers and ranges"),
+        ("demo --algos sac", "demo has options of PPO: for another algorithm use custom"),
         ("demo -- --exp-name a\tb", "'a\\tb': a command is one line, so its words have no tabs"),
         ("demo --seeds 1-99999999999", "'1-99999999999' is more than 100,000 seeds"),
         (f"{C} --looks 13", "--looks must be from 1 to half of --confirm, not 13"),
@@ -436,6 +437,12 @@ def test_bad_input(args, message, tmp_path):
     assert lines[0].startswith("error: ") and message in lines[0]
     assert len(lines) == (1 + len(noisy_wrappers.WRAPPERS) if "bad noise" in message else 1)
     assert not result.out and not list(tmp_path.iterdir())
+
+
+def test_a_status_with_grid_options_needs_the_preset():
+    """Without one it would count a grid that nobody ran."""
+    for words in (["--envs", "Hopper-v5"], ["--", "--gamma", "0.9"]):
+        assert "./benchmark.sh status PRESET ..." in view("status", *words).err
 
 
 def test_a_list_of_runs_waits_for_no_heavy_import(monkeypatch):
