@@ -125,7 +125,8 @@ def test_bounds_of_obrien_and_fleming():
     assert bounds((25,), 0.0125) == pytest.approx([2.49771], abs=1e-5)
     assert nominal_levels(FIVE_LOOKS)[-1] == pytest.approx(0.0423, abs=1e-4)
     assert looks_after(25) == FIVE_LOOKS.looks and looks_after(50, 3) == (17, 34, 50)
-    args = arguments("--looks | 5", "/nowhere")  # of four seeds, two looks would be one
+    words = "--algos | ppo | --envs | Hopper-v5 | --looks | 5"
+    args = arguments(words, "/nowhere")  # of four seeds, two looks would be one
     assert choose.plan_for(args, "ppo", "Hopper-v5", 1).looks == FIVE_LOOKS.looks
     assert bounds((20, 40), 0.05) == pytest.approx([2.963, 1.969], abs=1e-3)
 
