@@ -248,6 +248,7 @@ def learn(args, env, test_env, stop):
     observation_stats, reward_scaler = Normalizer(observation.shape), RewardScaler()
     agent = Agent(env).to(device)
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
+    learning_rates = [group["lr"] for group in optimizer.param_groups]
     update = updater(ppo_loss, agent, optimizer, args)
 
     # RESUME: all that training changes belongs in `state`. What is missing there starts anew when a
@@ -291,7 +292,7 @@ def learn(args, env, test_env, stop):
             observations = torch.from_numpy(rollout.observations).to(device)
             actions = torch.from_numpy(rollout.actions).to(device)
             log_probs, _, values = agent(observations[:-1], actions)
-            check_acting(log_probs, rollout, std)  # for you who change the agent
+            check_agent(agent, observations, log_probs, values, rollout, std)
             all_values = torch.cat([values, agent.critic(observations[-1])])
             advantages = compute_gae(rollout.rewards, all_values, rollout.dones, args).to(device)
             returns = advantages + values
@@ -299,7 +300,8 @@ def learn(args, env, test_env, stop):
             # LEARN: policy and value function
             if args.anneal_lr:
                 left = 1 - (global_step - args.num_steps) / total_steps
-                optimizer.param_groups[0]["lr"] = left * args.learning_rate
+                for group, rate in zip(optimizer.param_groups, learning_rates, strict=True):
+                    group["lr"] = left * rate
             batch = (observations[:-1], actions, log_probs, advantages, returns, values)
             clipfracs = []
             for _ in range(args.update_epochs):
@@ -346,8 +348,11 @@ def learn(args, env, test_env, stop):
     return True
 
 
-def check_acting(log_probs, rollout, std):
-    """Exit if acting(), in NumPy, and forward(), in PyTorch, are not the same policy."""
+def check_agent(agent, observations, log_probs, values, rollout, std):
+    """Exit where forward() is not what acts, by acting(), or what bootstraps, by critic()."""
+    value = agent.critic(observations[0])
+    if value.shape != (1,) or (value - values[0]).abs() > 1e-3 * (1 + value.abs()):
+        fail("the agent learns other values than those of critic(), which bootstraps", 1)
     # the density of the normal, where (x - mean) / std is eps
     expected = (-0.5 * rollout.eps**2 - np.log(std) - 0.5 * math.log(2 * math.pi)).sum(1)
     rounding = 1e-3 * (1 + np.abs(rollout.actions / std).sum(1))
@@ -465,14 +470,14 @@ def say(text):
 
 def compiled(function):
     """Compile a function as one graph; where that fails, say why and go on without."""
-    graph = torch.compile(function, fullgraph=True, dynamic=False)
+    graph = torch.compile(function, fullgraph=True, dynamic=False, isolate_recompiles=True)
 
     def call(*inputs):
         nonlocal graph
         try:
             return graph(*inputs)
         except torch._dynamo.exc.FailOnRecompileLimitHit:
-            fail("a number that a loss reads from args changes too often: pass it to the update", 1)
+            fail("a size, or a number read from args, changes too often: pass it to the update", 1)
         except torch._dynamo.exc.TorchDynamoException as error:
             cache = torch._inductor.runtime.cache_dir_utils.cache_dir()
             reason = " ".join(str(error).split())[:200]

@@ -379,14 +379,14 @@ def say(text):
 
 def compiled(function):
     """Compile a function as one graph; where that fails, say why and go on without."""
-    graph = torch.compile(function, fullgraph=True, dynamic=False)
+    graph = torch.compile(function, fullgraph=True, dynamic=False, isolate_recompiles=True)
 
     def call(*inputs):
         nonlocal graph
         try:
             return graph(*inputs)
         except torch._dynamo.exc.FailOnRecompileLimitHit:
-            fail("a number that a loss reads from args changes too often: pass it to the update", 1)
+            fail("a size, or a number read from args, changes too often: pass it to the update", 1)
         except torch._dynamo.exc.TorchDynamoException as error:
             cache = torch._inductor.runtime.cache_dir_utils.cache_dir()
             reason = " ".join(str(error).split())[:200]

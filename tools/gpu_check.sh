@@ -43,7 +43,7 @@ env = SimpleNamespace(observation_space=Box(-9, 9, (17,)), action_space=Box(-1, 
 
 def cases(algorithm, script, device):
     """Return the losses of a script: (loss, the network that it learns, its other inputs)."""
-    torch.manual_seed(0)
+    torch.manual_seed(21)  # no ReLU's input is so close to 0 that rounding decides its gradient
     batch = [torch.randn(256, 17), torch.rand(256, 6) * 2 - 1, torch.randn(256)]
     batch += [torch.randn(256, 17), (torch.rand(256) < 0.1).float()]
     eps, values = torch.randn(256, 6).to(device), torch.randn(3, 256).to(device)
@@ -182,7 +182,9 @@ options = SimpleNamespace(seconds=float(os.environ["SECONDS_OF_BLOCK"]), clock="
 runs = [f"{number} at a time" if number > 1 else "1 run" for number in jobs]
 print(f"| | {' | '.join(runs)} |\n|---|{'---|' * len(jobs)}", flush=True)
 for algorithm in algorithms:
-    precisions = ["highest", "medium"] if algorithm == "ppo" else ["highest", "medium", "bf16"]
+    # on a GPU "medium" is computed as "highest", which is the default there
+    precisions = [] if algorithm == "ppo" else ["bf16"]
+    precisions += ["highest", "medium"] if device != "GPU" else []
     cases = {}  # the flags and the largest number of runs
     for environment in environments:
         most = max(jobs) if environment == environments[0] else 1
@@ -192,8 +194,8 @@ for algorithm in algorithms:
         cases[f"{environments[0]}, {device}, {' '.join(flags)}"] = environments[0], cuda + flags, 1
     with contextlib.ExitStack() as stack:
         programs = {}
-        for name, (environment, flags, most) in cases.items():
-            given = SimpleNamespace(cores=cores, flags=flags)
+        for i, (name, (environment, flags, most)) in enumerate(cases.items()):
+            given = SimpleNamespace(cores=cores[i:] + cores[:i], flags=flags)  # to compile at once
             programs[name] = [
                 stack.enter_context(bench.ours(algorithm, environment, given, name, job=job))
                 for job in range(most)

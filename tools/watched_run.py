@@ -211,6 +211,9 @@ def watch_updates(updater, seen):
         seen.idle[own.name] = (network, optimizer)
 
         def watched(*inputs):
+            inputs = as_given(inputs)
+            kept = known == set(map(id, network.parameters()))
+            check(kept, f"{own.name}() learns a layer that was replaced: change it in place")
             if not hasattr(own, "first"):
                 with noisy.kept_generators(), Broadcasts(own.name):
                     _, curves = loss(network, *inputs)
@@ -226,7 +229,8 @@ def watch_updates(updater, seen):
                 seen.updates.append(own)
                 seen.idle.pop(own.name, None)
                 own.before = before
-                own.first = curves | {name: p.grad.clone() for name, p in parameters.items()}
+                learned = {name: p for name, p in parameters.items() if p.grad is not None}
+                own.first = curves | {name: p.grad.clone() for name, p in learned.items()}
             return curves
 
         return watched
@@ -247,10 +251,17 @@ class Broadcasts(TorchFunctionMode):
         shapes = {tuple(x.shape) for x in args if torch.is_tensor(x)}
         for n in {shape[0] for shape in shapes if len(shape) == 1 and shape[0] > 1}:
             is_loss = function.__name__.endswith("_loss")  # returns the mean of them
-            if shapes == {(n,), (n, 1)} and (is_loss or result.shape == (n, n)):
+            ends = {shape[-2:] for shape in shapes}  # (N, B, 1) of N networks at once
+            if ends == {(n,), (n, 1)} and (is_loss or result.shape[-2:] == (n, n)):
                 text = f"{self.name}() makes ({n}, {n}) of ({n}, 1) and ({n},)"
                 raise BrokenError(f"{text}: give both the same shape, as squeeze(1) does")
         return result
+
+
+def as_given(inputs):
+    """Return the inputs of an update as updater() gives them to a loss: numbers are tensors."""
+    numbers = (int, float, np.float32, np.float64, np.int32, np.int64)
+    return tuple(torch.tensor(float(x)) if type(x) in numbers else x for x in inputs)
 
 
 def tensors_among(inputs):

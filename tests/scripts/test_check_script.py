@@ -47,6 +47,9 @@ IMPORT = before("import contextlib\n", "import copy")
 MISTAKES = {  # the promise, the script and what is said: the texts that are replaced
     ("trains", "td3", "nothing was updated"): [("if global_step > args.learning_starts:", "if 0:")],
     ("trains", "ppo", "acts with one policy"): [(LEARNING, f"{LEARNING}.relu()")],
+    ("trains", "ppo", "learns other values"): [
+        ("self.critic(observations).squeeze(1)", "2 * self.critic(observations).squeeze(1)")
+    ],
     ("trains", "ppo", "and learns another"): [  # acts with a copy that was right at the start
         IMPORT,
         before("        self.actor_logstd = nn.", "self.first = copy.deepcopy(self.actor_mean)"),
@@ -67,6 +70,9 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
         before("            action = actor.policy(observation, eps)", "observation += 0.1")
     ],
     ("trains", "td3", "makes (16, 16) of (16, 1) and (16,)"): [(".squeeze(1) for", " for")],
+    ("trains", "td3", "critic_loss() learns a layer that was replaced"): [
+        before("            curves = update_critic(", "critic.networks[0][4] = nn.Linear(256, 1)")
+    ],
     ("trains", "sac", "the curve 'alpha' of actor_loss() is no number"): [
         ('"alpha": alpha}', '"alpha": log_prob}')
     ],
@@ -225,6 +231,22 @@ def test_an_environment_may_be_named_without_its_version(tmp_path):
 def test_a_part_that_two_optimizers_hold_is_told(tmp_path):
     layer = before("    actor_optimizer = torch", "actor.network[2] = critic.networks[0][2]")
     assert "and actor_loss() share 2 tensors" in check_script.trains(broken(tmp_path, "sac", layer))
+
+
+def test_what_is_right_is_told_by_no_word(tmp_path):
+    """A layer that is frozen at first, and a number that a loss knows to be a tensor."""
+    frozen = "actor.network[0].requires_grad_(global_step > 60)"
+    right = [before("            curves = update_critic(", frozen)]
+    right.append((" * gamma * next", " * gamma.square().sqrt() * next"))
+    assert check_script.trains(broken(tmp_path, "td3", *right)) == ""
+
+
+def test_networks_that_are_asked_at_once_broadcast_as_one_does():
+    told = pytest.raises(BrokenError, match=r"loss\(\) makes \(16, 16\) of")
+    with told, watched_run.Broadcasts("loss"):
+        torch.zeros(2, 16, 1) - torch.zeros(16)
+    with watched_run.Broadcasts("loss"):
+        torch.zeros(2, 16) - torch.zeros(16), torch.zeros(2, 16, 1) - torch.zeros(16, 1)
 
 
 REMARKS = {  # what is told: the script, and the texts that are replaced

@@ -423,6 +423,23 @@ def test_ppo_trains_as_a_plain_implementation(case, tmp_path):
     assert stats["count"] == pytest.approx(expected.count)
 
 
+def test_ppo_anneals_every_learning_rate(tmp_path, monkeypatch):
+    """Also one that a changed script gives to a part of the agent."""
+    made, adam = [], torch.optim.Adam
+
+    def with_two_rates(parameters, **options):
+        first, *others = parameters
+        made.append(adam([{"params": first}, {"params": others, "lr": 1e-3}], **options))
+        return made[-1]
+
+    monkeypatch.setattr(torch.optim, "Adam", with_two_rates)
+    args = ppo.Args(**ON_POLICY, runs_dir=str(tmp_path))
+    assert ppo.train(args)
+    rollouts = args.total_timesteps // args.num_steps
+    rates = [group["lr"] for group in made[0].param_groups]
+    assert rates == pytest.approx([args.learning_rate / rollouts, 1e-3 / rollouts])
+
+
 # LOSSES: Adam hides a factor of a whole loss, and nobody else reads the curves.
 
 
@@ -555,6 +572,20 @@ def test_numbers_given_to_an_update_do_not_recompile(algorithm, graphs):
 
 
 @pytest.mark.slow
+def test_a_script_may_have_many_updates(graphs):
+    """PyTorch compiles one function eight times at most; here each update has this for itself."""
+    args = sac.Args()
+
+    def loss(network, x):
+        return network(x).sum(), {}
+
+    for _ in range(10):
+        network, _, x = two_networks()
+        sac.updater(loss, network, torch.optim.SGD(network.parameters()), args)(x)
+    assert len(graphs) == 10
+
+
+@pytest.mark.slow
 def test_a_number_of_args_that_changes_too_often_says_what_to_do(graphs, capsys):
     args, (network, _, x) = ppo.Args(), two_networks()
 
@@ -568,7 +599,7 @@ def test_a_number_of_args_that_changes_too_often_says_what_to_do(graphs, capsys)
             args.ent_coef = step / 20
             update(x, args)
 
-    assert "args changes too often: pass it to the update" in refused(capsys, anneal, code=1)
+    assert "changes too often: pass it to the update" in refused(capsys, anneal, code=1)
     assert 1 < len(graphs) < 20
 
 
