@@ -927,7 +927,10 @@ class RandomDynamics(NoiseWrapper):
         inner = _layers(self.env, RandomDynamics)
         if inner:  # the innermost changes the model for all of them, at once
             inner[-1]._outer.append(self)
-            observation, info = self.env.reset(seed=seed, options=options)
+            try:
+                observation, info = self.env.reset(seed=seed, options=options)
+            finally:
+                inner[-1]._outer.remove(self)
         else:
             observation, info = self._reset_scaled(seed, options)
         if self._factors:
@@ -966,7 +969,7 @@ class RandomDynamics(NoiseWrapper):
 
     def _reset_scaled(self, seed: int | None, options: Info | None) -> tuple[Any, Info]:
         """Scale the model by the factors of this wrapper and the outer ones, and reset."""
-        wrappers, self._outer = [*self._outer, self], []
+        wrappers = [*self._outer, self]
         self._restore()
         model = self._model()
         self._scale(model, wrappers)  # before the environment's own reset, which needs it
@@ -1641,7 +1644,7 @@ def canonical_env_id(env_id: str) -> str:
     ValueError if there is no such environment or module; what a module raises passes through.
     """
     module, colon, name = env_id.rpartition(":")
-    if module:
+    if colon:
         _import_module(module, f"there is no environment {env_id!r}")
     try:
         namespace, base_name, version = registration.parse_env_id(name)
@@ -1690,6 +1693,8 @@ def _import_module(module: str, problem: str) -> None:
 
     ``problem`` is what an error says first, as "there is no environment 'a:b'".
     """
+    if not module or module.startswith("."):
+        raise ValueError(f"{problem}: {module!r} is not the name of a module")
     path, searched = sys.path[:], module_path()
     sys.path[:] = searched
     try:
@@ -1826,6 +1831,9 @@ def _generators(env: Env) -> dict[str, Any]:
             # type(): isinstance() would ask a weak reference, perhaps a dead one, for its class
             if issubclass(type(value), kinds) and not issubclass(type(value), random.SystemRandom):
                 found[f"{place}.{name}"] = value
+    if type(env.unwrapped).np_random is not gym.Env.np_random:  # as shimmy's, which is dm_control's
+        own = env.unwrapped.np_random
+        found |= {"np_random": own} if issubclass(type(own), kinds) else {}
     return found
 
 
@@ -2109,7 +2117,8 @@ class Spaces:
     @staticmethod
     def _read(saved: Mapping[str, Any]) -> gym.spaces.Box:
         shape, dtype = tuple(saved["shape"]), np.dtype(saved["dtype"])
-        low, high = np.array(saved["low"], float), np.array(saved["high"], float)
+        exact = float if dtype.kind == "f" else dtype  # the largest integers are no doubles
+        low, high = np.array(saved["low"], exact), np.array(saved["high"], exact)
         low, high = np.broadcast_to(low, shape), np.broadcast_to(high, shape)
         return gym.spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype.type)
 

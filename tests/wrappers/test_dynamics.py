@@ -255,6 +255,23 @@ def test_several_at_once_with_other_fields():
     assert len(seen) == 4
 
 
+def test_a_wrapper_between_two_may_reset_twice():
+    """As one does that begins anew until a start is good."""
+
+    class Twice(gym.Wrapper):
+        def reset(self, **given):
+            self.env.reset(**given)
+            return self.env.reset()
+
+    inner = RandomDynamics(Cart(), 1, 0.5, 0.5, fields=("dof_damping",))
+    env = RandomDynamics(Twice(inner), 1, 2, 2, fields=("body_mass",))
+    model, nominal = env.unwrapped.model, values(env.unwrapped.model)
+    for _ in range(2):
+        env.reset(seed=0)
+        np.testing.assert_array_equal(model.body_mass, 2 * nominal["body_mass"])
+        np.testing.assert_array_equal(model.dof_damping, 0.5 * nominal["dof_damping"])
+
+
 def test_fields_that_reset_sets_itself_are_refused():
     """At the first reset, whether the episode is chosen or not."""
     noisy = RandomDynamics(Randomizing("body_mass"), 0.01, 1.5, 1.5)

@@ -76,6 +76,7 @@ def test_env_kwargs():
 def test_unknown_environments():
     module = "No module named 'no_such_module'"
     reasons = {"Hoper-v5": "Did you mean: `Hopper`", "no_such_module:Env-v0": module}
+    reasons |= dict.fromkeys(("./toy_envs:Nothing-v0", ":Pendulum-v1"), "is not the name of a mod")
     for env_id, reason in (reasons | {"": "Malformed", "toy_envs:Nothing-v0": "Nothing"}).items():
         with pytest.raises(ValueError) as error:
             canonical_env_id(env_id)

@@ -3,6 +3,7 @@
 import json
 import random
 import weakref
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -16,6 +17,7 @@ from noisy_wrappers import (
     FiniteNumbers,
     NotFiniteError,
     SpaceError,
+    Spaces,
     kept_generators,
     make_flat,
     make_noisy,
@@ -123,7 +125,7 @@ def test_finite_numbers_stop_at_what_is_not_finite(bad):
 class Drawing(gym.Env):
     """Draws from all kinds of generators that are its attributes, and spawns at every reset.
 
-    dm_control's environments have a RandomState, whose state holds an array.
+    The state of a RandomState holds an array.
     """
 
     observation_space = gym.spaces.Box(-9, 9, (6,), np.float64)
@@ -163,6 +165,38 @@ def test_an_env_state_has_the_generators_among_the_attributes():
     with kept_generators(other):
         assert draw(other) == third
     assert draw(other) == third
+
+
+class Around(gym.Env):
+    """Draws from a generator of something inside, as shimmy's environments of dm_control do."""
+
+    observation_space, action_space = gym.spaces.Box(-9, 9, (1,)), gym.spaces.Box(-1, 1, (1,))
+
+    @property
+    def np_random(self):
+        return self.inside.random
+
+    def reset(self, *, seed=None, options=None):
+        if seed is not None:
+            self.inside = SimpleNamespace(random=np.random.RandomState(seed))
+        return np.array([self.np_random.normal()]), {}
+
+
+def test_an_env_state_has_the_generator_that_the_environment_calls_its_own():
+    env, other = Around(), Around()
+    for one in (env, other):
+        one.reset(seed=1)
+    env.reset()
+    saved = json.loads(json.dumps(EnvState(env).state_dict()))
+    EnvState(other).load_state_dict(saved)
+    assert env.reset() == other.reset()
+
+
+def test_bounds_that_are_no_doubles_are_read_back():
+    for bounds in ((-(2**63), 2**63 - 1), (0, 2**53 + 1)):
+        space = gym.spaces.Box(*bounds, (2,), np.int64)
+        saved = {"shape": [2], "low": bounds[0], "high": bounds[1], "dtype": "int64"}
+        assert Spaces({"observation_space": saved, "action_space": saved}).action_space == space
 
 
 def test_a_policy_with_memory_is_told_where_a_test_episode_begins():

@@ -73,6 +73,7 @@ class Degrees(StickyAction):
     ("text", "message"),
     [
         ("no_such:A(1)", "No module named 'no_such'"),
+        ("./my_noises:StickyAction(3)", "'./my_noises' is not the name of a module"),
         ("my_noises:Other(1)", "my_noises has no subclass Other of noisy_wrappers.NoiseWrapper"),
         ("my_noises:StickyAction()", "missing a required argument: 'longest'"),
         ("my_noises:Strict(1)", "x is bad"),
