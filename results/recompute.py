@@ -185,6 +185,8 @@ def check(table, row, column, *values, drawn=False):
     """Compare the numbers in a cell with values, of which NaN stand for none."""
     texts = re.findall(r"[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]\d+)?", row[column])
     values = [value for value in values if not np.isnan(value)]
+    if texts and not values:
+        wrong.append(f"{table}.csv, {column}: nothing to compute in {list(row.values())}")
     if len(texts) < len(values):
         wrong.append(f"{table}.csv, {column}: {values} are missing in {list(row.values())}")
     for text, value in zip(texts, values, strict=False):
@@ -199,7 +201,8 @@ def check(table, row, column, *values, drawn=False):
 def compare(table, pairs, test=mann_whitney):
     """Check a table whose rows have two sides, their difference and p."""
     rows, ps = rows_of(f"tables/{table}.csv"), [test(x, y) for x, y in pairs]
-    for row, (x, y), p, corrected in zip(rows, pairs, ps, holm(ps), strict=False):
+    alone = [row for row in rows if row.get("environment") != "together"]
+    for row, (x, y), p, corrected in zip(alone, pairs, ps, holm(ps), strict=True):
         first, second = ((z.mean(), z.std(ddof=1), len(z)) for z in (x, y))
         difference, *limits, _ = welch(*first, *second)
         change, *ends = fieller(x, y)
@@ -212,6 +215,7 @@ def compare(table, pairs, test=mann_whitney):
         cells |= {"difference [95 %]": (difference, *limits), "change": (change,)}
         cells |= {"ours": (*first[:2], change), "p": (p,), "holm": (corrected,)}
         cells["Holm"] = cells["holm"]
+        cells["t"] = (difference / (first[1] ** 2 / first[2] + second[1] ** 2 / second[2]) ** 0.5,)
         for column in cells.keys() & row.keys():
             check(table, row, column, *cells[column], drawn=test is one and column in ("p", "holm"))
     if rows[-1].get("environment") == "together":
@@ -311,6 +315,17 @@ def new_set(name, algorithm):
         check(name, row, "holm", corrected[row["noise"]], drawn=True)
 
 
+def ended_by_its_rule():
+    """Check that set E ended at the first look that decides, or sees too little hope: plans.md."""
+    rows = rows_of("tables/ppo_walker2d.csv")
+    rule = {10: (0.0000011, 0.0), 20: (0.00079, 0.3), 30: (0.0074, 0.75), 40: (0.0220, 1.3)}
+    for row in rows:
+        level, least = rule[int(row["n"])]
+        check("ppo_walker2d", row, "level", level)
+        if (float(row["p"]) <= level or abs(float(row["t"])) < least) != (row is rows[-1]):
+            wrong.append(f"ppo_walker2d.csv: not the end by the rule: {list(row.values())}")
+
+
 def percent(x, y):
     """Return the change in percent, or NaN where the mean without noise may be zero."""
     margin = quantile(len(y) - 1) * y.std(ddof=1) / len(y) ** 0.5
@@ -358,13 +373,14 @@ def main():
     sac, td3 = {"algorithm": "SAC"}, {"algorithm": "TD3"}
     compare("all_runs_best_noises", sides("all_runs_best_noises", ALL))
     compare("all_runs_sac_early", sides("all_runs_sac_early", "runs long", step=200_000, **sac))
-    compare("all_runs_hopper", sides("all_runs_hopper", f"{ALL} ppo_hopper"))
+    compare("all_runs_fresh", sides("all_runs_fresh", f"{ALL} ppo_hopper ppo_walker2d"))
     compare("ppo_hopper", sides("ppo_hopper", "ppo_hopper"), one)
     compare("sac_200k", sides("sac_200k", "sac_200k", **sac), one)
     compare("td3_200k", sides("td3_200k", "td3_200k", **td3), one)
     looks = [int(row["n"]) for row in rows_of("tables/ppo_walker2d.csv")]
     pairs = [sides("ppo_walker2d", "ppo_walker2d", last=100 + n)[0] for n in looks]
     compare("ppo_walker2d", pairs, one)
+    ended_by_its_rule()
     compare("ppo_paper_best", sides("ppo_best_noises", "runs", last=10))
     clean, cut, first = (ends("runs", "Pusher", noise, last=20) for noise in ("", CUT, END))
     pairs = [

@@ -20,7 +20,7 @@ def tables():
     found |= {name: in_looks(read_returns(name)) for name in IN_LOOKS}
     found |= {name: by_the_tool(name, *planned) for name, planned in TOGETHER.items()}
     found |= {
-        "all_runs_hopper": pooled.hopper(),
+        "all_runs_fresh": pooled.with_fresh(),
         "all_runs_best_noises": pooled.best_noises(),
         "all_runs_sac_early": pooled.sac_early(),
         "consistent_rows": pooled.consistent_rows(),

@@ -19,6 +19,10 @@ from results.study.returns import (
 )
 
 BATCHES = ("runs", "paper_tests", "robustness", "ablation", "choice", "schedules")
+FRESH = [  # of sets A and E
+    ("Hopper", "RandomNormalNoisyReward(1.0)", "1.0", "ppo_hopper"),
+    ("Walker2d", "RandomUniformScaleReward(0.8, 1.2)", "0.05", "ppo_walker2d"),
+]
 PAPER_FINAL = 9515  # of SAC on HalfCheetah without noise, in the paper's early_performance table
 SCALE = "RandomUniformScaleReward(0.5, 1.5)"
 EARLY_STEPS = 200_000
@@ -38,12 +42,15 @@ def best_noises():
     return pd.DataFrame(rows).assign(holm=holm([row["p"] for row in rows]))
 
 
-def hopper():
-    """Compare PPO's best noise on Hopper with no noise: all runs, and the fresh ones of set A."""
-    runs = each_run_once(read_returns(*BATCHES, "ppo_hopper"))
-    case = {"environment": "Hopper", "noise": "RandomNormalNoisyReward(1.0)", "rate": "1.0"}
-    samples = (select(runs, "PPO", *c) for c in (case.values(), ["Hopper"]))
-    return pd.DataFrame([case | compare(*samples, mann_whitney_p)])
+def with_fresh():
+    """Compare PPO's best noise with no noise where a set has fresh seeds: they and all earlier."""
+    rows = []
+    for environment, noise, rate, folder in FRESH:
+        runs = each_run_once(read_returns(*BATCHES, folder))
+        case = {"environment": environment, "noise": noise, "rate": rate}
+        samples = (select(runs, "PPO", *c) for c in (case.values(), [environment]))
+        rows.append(case | compare(*samples, mann_whitney_p))
+    return pd.DataFrame(rows)
 
 
 def sac_early():
