@@ -92,7 +92,9 @@ def best_noises_of_ppo(runs):
         rows.append(row(claim, "best", gain, percents(f), [effect], f"runs: {sizes(f)}"))
         f = everything.loc[name]
         effect, n = (f["difference"], f["holm"]), f"all: {sizes(f)}"
-        rows.append(row(f"{claim}, earlier runs", "all", gain, percents(f), [effect], n, after=True))
+        rows.append(
+            row(f"{claim}, earlier runs", "all", gain, percents(f), [effect], n, after=True)
+        )
         if name == "Hopper":  # where earlier runs together suggest a harm: plans.md, set A
             fresh = comparisons(read_returns("ppo_hopper"))
             rows += fresh_seeds(name, "A", "ppo_hopper", gain, fresh.iloc[0])

@@ -488,6 +488,20 @@ def test_no_module_is_imported_from_a_folder_of_runs(place, trained, tmp_path, m
     assert "in a folder of runs; if you trust that module, move it" in capsys.readouterr().err
 
 
+def test_no_script_is_run_from_a_folder_of_runs(trained, tmp_path, monkeypatch, capsys):
+    """Neither the one beside the runs, nor one that config.json names there."""
+    run_dir = shutil.copytree(one(trained, "PPO"), tmp_path / "runs/dl/run")
+    script = json.loads((run_dir / "config.json").read_text())["script"]
+    for name in (script, "evil.py"):
+        (tmp_path / "runs/dl" / name).write_text("raise SystemExit('imported')")
+    monkeypatch.chdir(tmp_path / "runs/dl")
+    assert main(Args((run_dir,), episodes=1)) == 0
+    monkeypatch.chdir(tmp_path)
+    edit_config(run_dir, script="runs/dl/evil.py")
+    assert main(Args((run_dir,), episodes=1)) == 2
+    assert "its script runs/dl/evil.py is neither in the current" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("options", [{"noises": ("evil:Sticky(0.1)",)}, {"env_id": "evil:Mine-v0"}])
 def test_no_noise_is_imported_from_a_folder_of_runs(options, runs, monkeypatch, capsys):
     """Nor another environment; a noise in config.json is not imported at all."""
@@ -613,6 +627,9 @@ def test_another_environment(runs, capsys):
     table = capsys.readouterr().out.splitlines()[-1]
     assert f"{home}, tested in Heavy-v0" in table
     refused(Args((run_dir,), env_id="Pendulum-v1"), "its observation space is Box", runs, capsys)
+    scaled = lambda **options: gym.wrappers.RescaleAction(gym.make(home, **options), -1, 1)  # noqa: E731
+    gym.register("Scaled-v0", scaled)
+    refused(Args((run_dir,), env_id="Scaled-v0"), "its action space is Box", runs, capsys)
 
 
 def refused(args, message, runs, capsys):

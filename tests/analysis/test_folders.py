@@ -41,6 +41,9 @@ DAMAGED = {
     "a short line": lambda text: text.replace(",1000\n", "\n", 1),
     "nan": lambda text: re.sub(r"(?m)^(10000,0,)[^,]*", r"\1nan", text),
     "a missing episode": lambda text: re.sub(r"(?m)^20000,1,.*\n", "", text),
+    "an episode of each of two tests": lambda text: re.sub(
+        r"(?m)^(20000,1|30000,0),.*\n", "", text
+    ),
     "a missing evaluation at the end": lambda text: re.sub(r"(?m)^50000,.*\n", "", text),
     "steps out of order": lambda text: text.replace("\n30000,", "\n10000,"),
     "no header": lambda text: text.split("\n", 1)[1],
@@ -54,5 +57,7 @@ def test_damaged_evaluations_are_told(name, tmp_path):
     text = path.read_text()
     path.write_text(DAMAGED[name](text))
     assert path.read_text() != text
-    with pytest.raises(DamageError, match="^eval.csv"):
+    with pytest.raises(DamageError, match="^eval.csv") as told:
         read_run(path.parent)
+    is_mixed = "an evaluation is incomplete" in str(told.value)
+    assert is_mixed == (name == "an episode of each of two tests")

@@ -6,13 +6,17 @@ import re
 import shutil
 import subprocess
 import tempfile
+from dataclasses import replace
 from html import escape, unescape
+from unittest import mock
 
 import pandas as pd
 import pytest
-from sweeps import NAN, run, small_sweep, write_pairs, write_run
+from sweeps import NAN, SCALE, run, small_sweep, write_pairs, write_run
 
 import analysis.verdicts
+import analyze
+from analysis.folders import SUCCESS
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +110,33 @@ def test_a_section_that_is_empty_or_says_nothing_new_is_left_out(tmp_path):
     for seed in range(4, 10):  # rates have no verdict now, and still intervals
         write_run(tmp_path / "runs", [10 + seed], seed=seed)
     assert "statistics" in sections()
+
+
+def test_names_are_text_and_never_html(tmp_path):
+    write_pairs(tmp_path / "runs", range(5), range(5), exp_name="<b>x")
+    run(tmp_path)
+    page = (tmp_path / "results/report.html").read_text("utf-8")
+    assert "<b>x" not in page and "&lt;b&gt;x" in page
+
+
+def test_options_reach_what_they_are_of(tmp_path, capsys):
+    """And what is not complete, or made by several versions, is said."""
+    write_pairs(tmp_path / "runs", range(100, 106), range(100, 105))
+    write_run(tmp_path / "runs", [1.0], seed=6, noise=SCALE, rate=0.1, finished=False)
+    write_run(tmp_path / "runs", [106.0], seed=7, config={"versions": {"torch": "2.12.0"}})
+    verdict = run(tmp_path, smallest_gain=100.0)["noises"]["verdict"]
+    assert verdict.tolist() == ["no such gain"]
+    said = capsys.readouterr().out
+    assert "this sweep is not complete (1 unfinished)" in said
+    assert "some rows average runs with different" in said
+    args = analyze.Args(tmp_path / "runs", metric="success_rate", band="std")
+    with mock.patch.object(analyze, "figures", return_value=[]) as drawn:
+        analyze.main(replace(args, metric="return"))
+    assert drawn.call_args.args[2] == "std"
+    reads = mock.patch.object(analyze, "read_choice", side_effect=ValueError)
+    with reads as read, pytest.raises(SystemExit):
+        analyze.main(args)
+    assert read.call_args.args == (tmp_path / "runs", SUCCESS)
 
 
 def test_the_counts_at_the_top_are_those_of_the_list(tmp_path):

@@ -87,6 +87,10 @@ def test_a_note_on_lopsided_seeds_needs_a_verdict(tmp_path, capsys):
     tables = run(tmp_path)
     assert set(tables["noises"]["verdict"]) == {"too few seeds", "all equal"}
     assert "more often than in 5 %" not in capsys.readouterr().out
+    write_pairs(tmp_path / "runs", range(14), range(5), env="Pusher-v5")
+    run(tmp_path)
+    said = "with 5/14 runs with and without noise a verdict may be wrong more often than in 5 %"
+    assert said in capsys.readouterr().out
     page = (tmp_path / "results/report.html").read_text()
     assert "No percentage" not in page  # on Maze-v0 there is none for another reason
 

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 
 import numpy as np
 import pandas as pd
@@ -82,11 +83,6 @@ def test_separated_samples_have_the_smallest_p_possible():
     assert compare.joint_p([(x, y)]) == pytest.approx(2 / 70, abs=0.002)
     assert compare.joint_p([(x[:3], y[:3]), (x[1:], y[1:])]) == pytest.approx(2 / 400, abs=0.001)
     assert compare.joint_p([(x, y), (y, x)]) == pytest.approx(1)
-
-
-def test_holm_by_hand():
-    assert compare.holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
-    assert compare.holm([0.5, 0.9]) == pytest.approx([1, 1])
 
 
 def test_a_comparison_by_hand():
@@ -306,7 +302,8 @@ def test_a_number_that_differs_is_found(monkeypatch):
 
 @pytest.mark.slow
 def test_the_tables_are_right_by_the_second_computation(capsys):
-    assert recompute.main() == 0, capsys.readouterr().out
+    status, out = recompute.main(), capsys.readouterr().out
+    assert status == 0 and re.search(r"^0 of 1\d{3} numbers in 22 tables differ$", out, re.M), out
 
 
 def test_the_picture_of_the_first_page():

@@ -14,8 +14,12 @@ import simulate_choose
 import stub_run
 from views import batches, view
 
+from analysis.choice import read_choice
+from analysis.comparisons import as_chosen, compare_all
 from analysis.formatting import rounded
+from analysis.runs import read_runs
 from analysis.statistics import compare, contrast
+from analysis.studies import make_studies
 from noisy_wrappers import BASELINE, Configuration
 from sweep import choose, halving, telling
 from sweep.environment import Environment, remember
@@ -224,7 +228,16 @@ def test_verdicts_in_words():
     assert "Borderline: the interval includes zero" in said(unclear._replace(p=0.03))
     bad = GOOD._replace(t=-2.7, difference=-11.8, difference_low=-15.3, difference_high=-8.4)
     assert "is worse than no noise: 10 fresh seeds, -11.8" in said(bad, noises=1)
-    assert not Verdict(bad, 10, 10, 0.05).helps and not Verdict(GOOD, 10, 10, 0.01).helps
+    assert "Borderline" not in said(unclear._replace(p=0.03), planned=25, needed=0.0126)
+    returns = {(one, seed): 1.0 for one in (noise, BASELINE) for seed in state.seeds}
+    kind = "PPO", "Pusher-v5", "ppo_continuous_noisy", ""
+    for comparison, needed, survives in (
+        (GOOD, 0.05, "yes"),
+        (bad, 0.05, "worse"),
+        (GOOD, 0.01, "no"),
+    ):
+        *_, last = halving.records(kind, state, returns, Verdict(comparison, 10, 10, needed))
+        assert last == (*kind, "confirmation", "", *noise.columns, 10, 1.0, survives)
 
 
 # THE RUN FOLDERS
@@ -467,3 +480,12 @@ def test_status_says_who_survives(tmp_path):
     assert verdict.startswith("PPO on Pendulum-v1: ") and "4 fresh seeds" in verdict
     assert not (tmp_path / "choice.csv").exists()  # the status only looks
     assert [verdict] == conclude(args)
+    studies, _ = make_studies(read_runs(tmp_path))
+    analysed = as_chosen(compare_all(studies), read_choice(tmp_path)).noises["verdict"].tolist()
+    words = {
+        "beats no noise": "better",
+        "is worse than": "worse",
+        "shown to help:": "no clear diff",
+    }
+    [expected] = [word for text, word in words.items() if text in verdict]
+    assert len(analysed) == 1 and analysed[0].startswith(expected)
