@@ -194,6 +194,8 @@ def test_a_line_for_each_promise(tmp_path, capsys, monkeypatch):
         """A promise holds."""
 
     path = broken(tmp_path, "ppo").path
+    names = {promise.__name__ for promise in check_script.PROMISES}
+    assert names == {"sweeps", *(promise for promise, *_ in MISTAKES)}
     monkeypatch.setattr(check_script, "PROMISES", [holds, fails, crashes])
     assert check_script.main(path) == 1
     out, err = capsys.readouterr()

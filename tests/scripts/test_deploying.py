@@ -13,6 +13,7 @@ from unittest import mock
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from gymnasium.spaces import Box, Dict, Discrete
 
 ROOT = Path(__file__).parents[2]
@@ -85,7 +86,7 @@ def follow_page(algorithm, env_id, folder):
     page = PAGE.read_text().replace("sac_continuous_noisy", f"{algorithm}_continuous_noisy")
     load, save, play, *onnx = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     assert len(onnx) == 2
-    names = {}
+    names = {"onnx": onnx[algorithm == "ppo"]}
     shutil.copy(run_dir / "config.json", folder)
     for block in (load, save, play):
         exec(block.replace("Pendulum-v1", env_id), names)
@@ -110,6 +111,18 @@ def test_numpy_alone_plays_a_policy(algorithm, env_id, tmp_path, monkeypatch):
     np.testing.assert_allclose(played, actions, rtol=0, atol=1e-5)
     assert played.dtype == actions.dtype
     assert (np.ptp(actions, 0) > 1e-3).all()  # or this shows less than it seems to
+    with mock.patch("torch.onnx.export") as export:
+        exec(names["onnx"], names)
+    network, inputs = export.call_args.args[:2]
+    with torch.no_grad():
+        result = network(*inputs)
+    if algorithm == "ppo":
+        mean = result[0].numpy().clip(names["low"], names["high"])  # of normalized observations
+        at_zero = names["saved"]["observation_stats"]["mean"]
+    else:
+        actions = result[0] if isinstance(result, tuple) else result  # SAC's first output
+        mean, at_zero = actions[0].numpy(), np.zeros(len(observations[0]))
+    np.testing.assert_allclose(names["policy"](at_zero), mean, rtol=0, atol=1e-5)
     if env_id == "HalfBounded-v0":
         assert names["low"].tolist() == [-np.inf, np.float32(-0.01)]
         assert (actions[:, 0] == np.float32(0.01)).any()  # and it is clipped there

@@ -32,6 +32,7 @@ from small_runs import (
 
 import noisy_wrappers
 import ppo_continuous_noisy as ppo
+import sac_continuous_noisy as sac
 
 HOSTILE = {"env_id": "hostile_envs:Hostile-v0"}
 ALONE = {"env_id": "hostile_envs:HostileAlone-v0"}
@@ -248,6 +249,34 @@ def test_what_a_constructor_draws_is_the_same_in_the_tests_of_all_runs(tmp_path,
         ppo.train(arguments("PPO", tmp_path, seed=seed, **ALONE))
     (first, test), (second, same), again = drawn
     assert test == same and again == (first, test) and len({first, second, test}) == 3
+
+
+@pytest.mark.parametrize(
+    ("asked", "processor", "used"),
+    [("medium", {}, "medium"), ("medium", {"amx_tile": True}, "highest"), ("bf16", {}, None)]
+    + [("bf16", {"avx512_bf16": True}, "highest"), ("highest", {}, "highest")],
+)
+def test_which_precision_and_threads_are_used(
+    asked, processor, used, tmp_path, monkeypatch, capsys
+):
+    """Where "medium" would round, it is "highest"; bf16 is cast explicitly."""
+    found = []
+
+    def learn(*_):
+        found.append((torch.get_float32_matmul_precision(), torch.get_num_threads()))
+
+    monkeypatch.setattr(sac, "learn", learn)
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: processor)
+    args = arguments("SAC", tmp_path, matmul_precision=asked, torch_threads=2)
+    try:
+        if used is None:
+            assert "this processor has no bfloat16" in refused(capsys, sac.train, args)
+        else:
+            sac.train(args)
+        assert found == ([] if used is None else [(used, 2)])
+    finally:
+        torch.set_num_threads(1)
+        torch.set_float32_matmul_precision("highest")
 
 
 @two_scripts

@@ -108,6 +108,7 @@ def test_run_folder(tmp_path, capsys):
     assert config["action_space"]["low"] == [-1.0, -0.5]
     versions = {"noisy_wrappers": __version__, "torch": torch.__version__}
     assert versions.items() <= config["versions"].items()
+    assert config["matmul_precision"] == "highest" and "git_commit" in config
 
     rows = evaluations(run_dir)
     assert [row[:2] for row in rows] == [(s, i) for s in (20, 40, 60) for i in range(3)]
@@ -186,13 +187,20 @@ def test_success_is_an_outcome(tmp_path):
     run_dir = run("PPO", tmp_path / "only", env_id="toy_envs:SuccessOnly-v0")
     table = [line.split(",") for line in (run_dir / "eval.csv").read_text().splitlines()]
     assert [row[4] for row in table] == ["success", "", "", "", "", "1", "1", "", "", ""]
+    rates = [float(value) for _, value in curves(run_dir)["eval/success_rate"]]
+    assert rates == pytest.approx([2 / 3])  # an episode that says nothing is not solved
 
 
 def test_overwrite_of_nothing_and_a_short_run(tmp_path):
     short = {"total_timesteps": 5, "eval_frequency": None, "eval_episodes": 1}
     short |= {"env_id": "toy_envs:Count-v0", "learning_starts": 4}
-    run_dir = run("SAC", tmp_path, overwrite=True, **short)
+    run_dir = run("SAC", tmp_path / "short", overwrite=True, **short)
     assert [row[0] for row in evaluations(run_dir)] == [1, 2, 3, 4, 5]  # at most ten tests
+    tested = run(
+        "TD3", tmp_path / "longer", **short | {"total_timesteps": 30, "learning_starts": 29}
+    )
+    assert [row[0] for row in evaluations(tested)] == list(range(3, 31, 3))
+    assert [s.EVAL_FREQUENCY for s in (sac, td3, ppo)] == [10_000, 10_000, 50_000]
     result = read_json(run_dir / "result.json")
     assert result["train_return_mean_last_100"] is None  # no episode ended
     assert result["final_return_std"] == 0

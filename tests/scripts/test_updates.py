@@ -17,7 +17,7 @@ import torch._inductor.config
 import torch.nn as nn
 import torch.nn.functional as F
 from gymnasium import wrappers
-from small_runs import SCRIPTS, refused, two_scripts
+from small_runs import SCRIPTS, curves, refused, two_scripts
 from torch.distributions import Normal
 
 import noisy_wrappers as noisy
@@ -438,6 +438,11 @@ def test_ppo_anneals_every_learning_rate(tmp_path, monkeypatch):
     rollouts = args.total_timesteps // args.num_steps
     rates = [group["lr"] for group in made[0].param_groups]
     assert rates == pytest.approx([args.learning_rate / rollouts, 1e-3 / rollouts])
+    [folder] = tmp_path.iterdir()
+    shown = [float(value) for _, value in curves(folder)["charts/learning_rate"]]
+    assert shown == pytest.approx(
+        [args.learning_rate * left / rollouts for left in range(rollouts, 0, -1)]
+    )
 
 
 # LOSSES: Adam hides a factor of a whole loss, and nobody else reads the curves.
@@ -479,6 +484,24 @@ def test_losses_of_sac_and_their_curves():
     assert_curves(curves, alpha_loss=expected(plain.alpha_loss, batch[0]))
 
 
+def test_losses_of_td3_and_their_curves():
+    torch.manual_seed(0)
+    env, batch, eps = gym.make(ENV), random_batch(64), 0.1 * torch.randn(64, 2)
+    actor, critic, target = td3.Actor(env), td3.Critic(env), td3.Critic(env)
+    y = batch[2] + 0.9 * (1 - batch[4]) * torch.stack(target(batch[3], actor(batch[3], eps))).amin(
+        0
+    )
+    q1, q2 = critic(*batch[:2])
+    losses = [nn.functional.mse_loss(q, y) for q in (q1, q2)]
+    loss, curves = td3.critic_loss(critic, target, actor, batch, eps, 0.9)
+    torch.testing.assert_close(loss, sum(losses))
+    assert_curves(curves, qf1_values=q1.mean(), qf2_values=q2.mean(), qf_loss=sum(losses) / 2)
+    assert_curves(curves, qf1_loss=losses[0], qf2_loss=losses[1])
+    loss, curves = td3.actor_loss(actor, critic, batch[0])
+    assert_curves(curves, actor_loss=-critic(batch[0], actor(batch[0]))[0].mean())
+    torch.testing.assert_close(loss, curves["actor_loss"])
+
+
 def test_the_loss_of_ppo_and_its_curves():
     torch.manual_seed(0)
     args, agent = ppo.Args(ent_coef=0.01), ppo.Agent(gym.make(ENV))
@@ -495,6 +518,11 @@ def test_the_loss_of_ppo_and_its_curves():
     clipped = ((ratio - 1).abs() > 0.2).float()
     assert_curves(curves, clipfrac=clipped.mean(), old_approx_kl=-ratio.log().mean())
     assert_curves(curves, approx_kl=torch.tensor(plain.approx_kl), entropy=entropy.mean())
+    parts = curves["policy_loss"] - 0.01 * curves["entropy"] + 0.5 * curves["value_loss"]
+    torch.testing.assert_close(parts, loss)
+    scaled = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+    policy_loss = -torch.minimum(scaled * ratio, scaled * ratio.clamp(0.8, 1.2)).mean()
+    assert_curves(curves, policy_loss=policy_loss)
 
 
 # UPDATES
@@ -673,6 +701,11 @@ class Derived(nn.Linear):
         return 2 * super().forward(x)
 
 
+def hooked(layer):
+    layer.register_forward_hook(lambda module, given, result: 3 * result)
+    return layer
+
+
 @pytest.mark.parametrize(
     ("layers", "translated"),
     [
@@ -681,6 +714,8 @@ class Derived(nn.Linear):
         ([Derived(3, 2)], False),
         ([nn.Linear(3, 2, bias=False)], False),
         ([nn.utils.parametrizations.spectral_norm(nn.Linear(3, 2))], False),
+        ([nn.utils.spectral_norm(nn.Linear(3, 2))], False),  # the old one, by a hook
+        ([nn.Linear(3, 2), hooked(nn.Tanh())], False),
     ],
 )
 def test_a_network_acts_in_numpy_as_in_pytorch(layers, translated):

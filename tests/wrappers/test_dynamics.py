@@ -53,18 +53,18 @@ def test_factors_golden():
 
 
 def test_derived_constants_are_those_of_a_model_with_the_changed_mass():
+    env = Cart()
+    info = RandomDynamics(env, 1.0, 0.5, 1.5, fields=("body_mass",)).reset(seed=0)[1]
     spec = mujoco.MjSpec.from_string(MODEL)
     for geom in spec.geoms:
-        geom.density = 1000 * 0.5
-    wanted, nominal = values(spec.compile()), values(Cart().model)
-    env = Cart()
-    RandomDynamics(env, 1.0, 0.5, 0.5, fields=("body_mass",)).reset(seed=0)
-    got = values(env.model)
+        body = env.model.body(geom.parent.name).id
+        geom.density = 1000 * info["dynamics"]["body_mass"][body]
+    wanted, nominal, got = values(spec.compile()), values(Cart().model), values(env.model)
     # A damping ratio becomes a damping when a model is compiled, and is one from then on.
     for name in wanted.keys() - {"actuator_biasprm"}:
         np.testing.assert_allclose(got[name], wanted[name], rtol=1e-9, atol=1e-12, err_msg=name)
     derived = "body_subtreemass body_invweight0 dof_invweight0 dof_M0 actuator_acc0 meaninertia "
-    derived += "tendon_invweight0 meanmass"
+    derived += "tendon_invweight0 meanmass cam_poscom0 light_poscom0"
     assert all((wanted[name] != nominal[name]).any() for name in derived.split())
 
 

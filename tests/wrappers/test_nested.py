@@ -11,6 +11,7 @@ from noisy_wrappers import (
     RandomDropoutObservation,
     RandomNormalNoisyObservation,
     RandomUniformNoisyObservation,
+    parse_noise,
 )
 
 GOALS = Dict(  # as Gymnasium-Robotics' Fetch has it; in this order
@@ -81,6 +82,24 @@ def test_keys_restrict_the_noise():
         RandomNormalNoisyObservation(env, 1.0, 0.3, keys=("goal",))
     with pytest.raises(ValueError, match="cannot perturb categories"):
         RandomNormalNoisyObservation(sampled(MIXED)[0], 1.0, 0.3, keys=("flag",))
+
+
+KEYED = ["RandomUniformNoisyObservation(1.0, 2.0", "RandomUniformScaleObservation(2.0, 3.0"]
+KEYED += ["RandomMixupObservation(0.5", "RandomDropoutObservation(0.0"]
+KEYED += ["RandomObservationBias(0.3", "RandomObservationDelay(1"]
+
+
+@pytest.mark.parametrize("start", KEYED)
+def test_keys_are_those_of_every_wrapper(start):
+    text = f"{start}, keys=('observation',))"
+    assert str(parse_noise(text)) == text
+    env, samples = sampled(GOALS)
+    env = build(text, env, 1.0)
+    env.reset(seed=0)
+    got = env.step(None)[0]
+    assert got["achieved_goal"] is samples[1]["achieved_goal"]
+    assert got["desired_goal"] is samples[1]["desired_goal"]
+    assert (got["observation"] != samples[1]["observation"]).all()
 
 
 def test_keys_of_a_tuple_are_indices():

@@ -37,7 +37,7 @@ class Given(gym.Env):
         return self.observation, {}
 
     def step(self, action):
-        return self.observation, self.reward, True, False, {"some": "info"}
+        return self.observation, self.reward, np.array([True]), np.bool_(False), {"some": "info"}
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,17 @@ def test_rewards_are_floats(reward):
     assert (number, type(number)) == (2, float)
     np.testing.assert_array_equal(observation, env.env.observation)
     assert observation.dtype == np.float32
-    assert (terminated, truncated, info) == (True, False, {"some": "info"})
+    assert terminated is True and truncated is False and info == {"some": "info"}
+
+
+def test_an_environment_may_record_itself():
+    """Its record is dropped, because Gymnasium would refuse a second one."""
+    env = gym.wrappers.RecordEpisodeStatistics(gym.make("Pendulum-v1", max_episode_steps=2))
+    env = make_noisy(make_flat(env), [A], [1.0])
+    env.reset(seed=0)
+    env.step(np.zeros(1, np.float32))
+    *_, info = env.step(np.zeros(1, np.float32))
+    assert info["episode"]["l"] == 2
 
 
 @pytest.mark.parametrize("bad", [np.nan, -np.inf])

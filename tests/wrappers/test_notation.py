@@ -26,7 +26,10 @@ def test_notation_round_trips(text):
     assert str(noise) == text
     assert len({noise, parse_noise(text)}) == 1
     wrapper = noise(constant_env(), 0.5)
-    assert rollout(wrapper, 0)[-1][1:] == rollout(build(text, constant_env(), 0.5), 0)[-1][1:]
+    both = rollout(wrapper, 0), rollout(build(text, constant_env(), 0.5), 0)
+    for step, same in zip(*both, strict=True):
+        np.testing.assert_array_equal(step[0], same[0])
+        assert step[1:] == same[1:]
 
 
 SPELLINGS = """
@@ -79,6 +82,13 @@ def test_canonical_notation():
     assert canonical([A, C], ["1:0", "0:.5"]) == (names, ["0.0:0.5", "1.0:0.0"])
     assert canonical([A], ["0.50:.5"]) == (names[1:], [0.5])
     assert canonical(np.array([A, B]), np.array([0.5, 0.0])) == canonical([A, B], [0.5, 0.0])
+    inner = ["RandomDynamics(1.0, 2.0)", "RandomEarlyTermination(9)"]  # from the environment on
+    inner += [
+        "RandomActionDelay(1)",
+        "RandomNormalNoisyAction(1.0)",
+        "RandomNormalNoisyReward(1.0)",
+    ]
+    assert canonical(inner[::-1], [0.5])[0] == inner
 
 
 @pytest.mark.parametrize(

@@ -50,6 +50,10 @@ def test_relative_golden(text, rate):
         noisy += changed
         assert ("noise" in got[4]) == changed
     assert env.times_applied == noisy > 0 and env.opportunities == len(received)
+    env.reset(seed=8)  # the estimates go on
+    assert env._spread.count == len(received) + (kind == 0)
+    env._spread.add(np.full(3, np.nan) if kind == 0 else np.nan)  # does not count
+    assert np.isfinite(env._spread.deviation).all()
 
 
 def test_actions_are_perturbed_in_halves_of_their_range():
