@@ -16,11 +16,9 @@ from analysis.studies import make_studies
 from analysis.tables import make_tables
 
 ROOT = Path(analyze.__file__).parent
-RESULTS = ROOT / "results"
 NAN = float("nan")
 SCALE = "RandomUniformScaleReward(0.5, 1.5)"
 ENDING = "RandomEarlyTermination(50)"
-PUSH = "RandomNormalNoisyAction(0.3)"
 
 
 def write_run(

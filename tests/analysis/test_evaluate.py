@@ -589,18 +589,6 @@ def test_a_process_that_is_killed_is_told_in_one_line(runs, tmp_path):
     assert re.search(line, result.stderr, re.MULTILINE) and "evaluate.py" not in result.stderr
 
 
-def test_runs_without_a_policy_are_told_before_any_environment_is_made(runs, monkeypatch, capsys):
-    folders = sorted(runs.glob("*ppo_continuous_noisy*"))
-    for folder in folders:
-        (folder / "policy.pt").unlink()
-    monkeypatch.setattr(gym, "make", None)
-    refused(Args(tuple(folders)), r"_s1\S+ and 1 more: there is no policy\.pt$", runs, capsys)
-    (folders[0] / "result.json").unlink()
-    with pytest.raises(SystemExit, match="2"):  # of a run that has not been tested yet
-        main(Args((folders[0],)))
-    assert f"there is nothing to test in {folders[0]}\n" in capsys.readouterr().err
-
-
 def test_a_copied_run_is_no_seed(runs, capsys):
     run_dir = one(runs, "PPO")
     shutil.copytree(run_dir, runs / "copy")

@@ -24,6 +24,7 @@ def test_iqm_is_rliables():
     for scores, value in [*recorded, (Z[:, :1], 64.08)]:
         assert iqm(scores.ravel()) == pytest.approx(value, rel=1e-12)
         assert bootstrap_iqm(scores)[0] == pytest.approx(value, rel=1e-12)
+    assert bootstrap_iqm(X, X)[0] == pytest.approx(0, abs=1e-9)  # less the baseline's own changes
     assert np.isnan(iqm([[1.0, NAN, 2.0, 3.0], [1.0, 2.0, 3.0, 4.0]])).tolist() == [True, False]
 
 
@@ -97,20 +98,6 @@ def test_coverage_of_the_iqm_is_what_the_page_says(n, usual, mixtures):
     assert int(covered(n, ours, MIXTURES)) == mixtures
     page = " ".join(DOCS.read_text().split())
     assert f"| {n} | {usual} % | {mixtures} % |" in page
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [*DISTRIBUTIONS, *MIXTURES])
-def test_noise_that_does_nothing_improves_nothing(name):
-    """The IQM of skewed returns is not their mean; no improvement must come of that."""
-    rng, draw, found = np.random.default_rng(0), (DISTRIBUTIONS | MIXTURES)[name], []
-    for _ in range(200):
-        found.append(bootstrap_iqm(draw(rng, (10, 5)), draw(rng, (10, 5)), resamples=200))
-    known = np.isfinite(found).all(axis=1)  # a baseline that may be zero has no percent
-    estimate, low, high = np.array(found)[known].T
-    assert known.mean() > 0.98
-    assert abs(estimate.mean()) < 3 * estimate.std() / np.sqrt(len(estimate))
-    assert ((low > 0) | (high < 0)).mean() <= 0.08
 
 
 def test_satterthwaites_interval_of_three_seeds_is_welchs():

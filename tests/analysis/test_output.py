@@ -44,10 +44,6 @@ def test_an_error_is_placed_in_the_code_of_a_user(caller, place):
     with pytest.raises(np.linalg.LinAlgError) as raised:
         exec(compile("import numpy\nnumpy.linalg.inv(numpy.zeros((2, 2)))", caller, "exec"))
     assert re.match(f"LinAlgError: Singular matrix .*{place}", with_place(raised.value))
-    assert with_place(raised.value, ValueError) == "Singular matrix"
-    with pytest.raises(ValueError) as raised:
-        exec(compile("import json\n\njson.loads('{')", "/my/env.py", "exec"))
-    assert with_place(raised.value).endswith("(/my/env.py, line 3)")
 
 
 @pytest.mark.slow

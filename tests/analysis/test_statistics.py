@@ -115,16 +115,6 @@ def test_infinite_ts_of_two_environments_cancel():
     assert found.t == pytest.approx(0) and found.p == 1 and np.isnan(found.effect_size)
 
 
-def test_an_environment_where_runs_hardly_differ_decides_no_more_than_others():
-    rng = np.random.default_rng(1)
-    worse = [(rng.normal(60, 10, 5), rng.normal(100, 10, 5)) for _ in range(4)]
-    for spread in (0, 1e-6, 0.01):
-        better = 201 + spread * rng.normal(size=5), 200 + spread * rng.normal(size=5)
-        x, y = (stacked(*side) for side in zip(*worse, better, strict=True))
-        found = statistics.compare(x, y)
-        assert found.t < 0 and found.effect_size < -1 and found.p < 0.01
-
-
 # ------------------------------------------------------------------------------------- comparisons
 
 
@@ -234,17 +224,6 @@ def test_fiellers_interval_is_cut_or_does_not_exist():
     assert np.isnan(statistics.fieller(x, np.array([-1.0, 1.0]))).all()
 
 
-@pytest.mark.parametrize("change", [-56, 90])
-def test_fiellers_coverage(change):
-    """Welch's limits in percent of a mean that is taken as known: 99.8 % and 88.5 %."""
-    rng, inside, trials = np.random.default_rng(0), 0, 1000
-    for _ in range(trials):
-        y, x = rng.normal(1, 0.3, 10), (1 + change / 100) * rng.normal(1, 0.3, 10)
-        low, high = statistics.fieller(x, y)
-        inside += low <= change <= high
-    assert 0.93 < inside / trials < 0.97
-
-
 # ------------------------------------------------------------------------------- rates of success
 
 
@@ -335,15 +314,9 @@ def test_what_no_number_of_seeds_can_show():
     assert np.isnan(detectable_shift(4, 4, 0.02))
 
 
-def test_holm_and_contrast_by_hand():
+def test_holm_by_hand():
     np.testing.assert_allclose(statistics.holm([0.04, 0.01, 0.03]), [0.06, 0.03, 0.06])
     np.testing.assert_allclose(statistics.holm([0.6, 0.7]), [1, 1])
-    x, y = np.array([1.0, 2, 3, 4]), np.array([5.0, 9, 7])
-    found = statistics.contrast([x, y], [1, -1])
-    welch = stats.ttest_ind(x, y, equal_var=False)
-    assert found[:2] == pytest.approx((-4.5, np.sqrt(5 / 3 / 4 + 4 / 3)))
-    assert found[2:] == pytest.approx(tuple(welch.confidence_interval(0.95)))
-    assert np.isnan(statistics.contrast([x, y[:1]], [1, -1])[1:]).all()
 
 
 # -------------------------------------------------------------------- simulations of the comparison
