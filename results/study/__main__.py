@@ -4,14 +4,13 @@ The other tables are of finished studies, see results/tables/README.md.
 """
 
 from results.study import claims, pooled
-from results.study.compare import by_the_tool, comparisons, in_looks
+from results.study.compare import TOGETHER, by_the_tool, comparisons, in_looks
 from results.study.returns import RESULTS, read_returns
 
 # The sets of plans.md by what their plans compare: each environment, looks at one comparison, or
-# environments together, of which there are so many, with so many seeds with noise and without
+# environments together (compare.TOGETHER)
 BY_ENVIRONMENT = ("ppo_hopper", "sac_200k", "td3_200k")
 IN_LOOKS = ("ppo_walker2d",)
-TOGETHER = {"td3_fresh": (3, 8, 8), "ppo_relative": (4, 6, 9)}
 
 
 def tables():

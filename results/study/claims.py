@@ -8,7 +8,9 @@ import pandas as pd
 from results.study import pooled
 from results.study.compare import (
     LEVEL,
+    TOGETHER,
     average_change,
+    by_the_tool,
     compare,
     comparisons,
     holm,
@@ -154,7 +156,20 @@ def harmful_noises(runs):
             effect, claim = (f["difference_percent"], f["p"]), "The same, Hopper, Walker2d, Pusher"
             n = "td3_200k: 12 + 12"
             rows.append(row(claim, "C", paper, percents(f), [effect], n, claimed=-1))
+            rows += fresh_seeds_of_td3(paper)
     return rows
+
+
+def fresh_seeds_of_td3(paper):
+    """Return the row of strong observation noise on set F's fresh seeds, once all are there."""
+    folder = "td3_fresh"
+    found = by_the_tool(folder, *TOGETHER[folder]).set_index("environment").loc["together"]
+    if found["verdict"] == "under way":
+        return []
+    effect = found["difference_percent"], found["holm"]
+    change = found["difference_percent"], np.nan, np.nan
+    claim, n = "The same, fresh seeds", f"{folder}: 24 + 24"
+    return [row(claim, "F", paper, change, [effect], n, claimed=-1)]
 
 
 def robustness():

@@ -162,6 +162,8 @@ def in_looks(runs):
     return pd.DataFrame(rows)
 
 
+# Sets that compare environments together: so many, with so many seeds with noise and without
+TOGETHER = {"td3_fresh": (3, 8, 8), "ppo_relative": (4, 6, 9)}
 NAMES = {"std": "sd", "baseline_mean": "mean_without", "baseline_std": "sd_without"}
 NAMES |= {"percent_low": "low_percent", "percent_high": "high_percent"}
 NAMES |= {"n_baseline": "n_without", "noise_rate": "rate"}

@@ -6,7 +6,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from analysis import style
-from results.study.__main__ import IN_LOOKS, TOGETHER
+from results.study.__main__ import IN_LOOKS
+from results.study.compare import TOGETHER
 from results.study.returns import RESULTS
 
 COLORS = {"confirmed": style.BETTER, "contradicted": style.WORSE}
