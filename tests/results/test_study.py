@@ -3,6 +3,7 @@
 import io
 import json
 import re
+from collections import Counter
 
 import numpy as np
 import pandas as pd
@@ -288,6 +289,7 @@ def test_the_second_computation_has_its_own_statistics():
 
 def test_a_number_that_differs_is_found(monkeypatch):
     monkeypatch.setattr(recompute, "wrong", [])
+    monkeypatch.setattr(recompute, "checked", Counter())
     row = {"a": "-1,259 [-1,769, -748]", "p": "2.8e-11", "b": "", "c": "-0 %"}
     recompute.check("t", row, "a", -1259.4, -1768.6, -748.0)
     recompute.check("t", row, "p", 2.83e-11)
