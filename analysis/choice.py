@@ -8,9 +8,8 @@ from analysis import folders
 from analysis.folders import RETURN, SUCCESS
 from noisy_wrappers import Configuration
 
-# The first four tell one choice from another
-CHOICE_COLUMNS = ["algorithm", "environment", "exp_name", "tested", "phase", "round"]
-CHOICE_COLUMNS += ["noise", "noise_rate", "seeds", "score", "survives"]
+KEYS = ["algorithm", "environment", "exp_name", "tested"]  # they tell one choice from another
+CHOICE_COLUMNS = [*KEYS, "phase", "round", "noise", "noise_rate", "seeds", "score", "survives"]
 
 
 def choice_file(metric=RETURN):

@@ -300,11 +300,11 @@ def robustness_sentences(scores, metric):
         over = f"over {row.conditions} of {counted(row.conditions_tested, 'test condition')}"
         shown, limit = DIRECTIONS[0], ""
         evidence = verdicts.difference_in_words(row, unit)
-        if row.lopsided:
+        if min(row.n, row.n_baseline) < 2:
+            shown = "too few seeds for a test of robustness"
+        elif row.lopsided:
             seeds = seeds_of(row.n, row.n_baseline)
             shown = f"no verdict with {seeds} seeds, which would be wrong too often,"
-        elif pd.isna(row.p):
-            shown = "too few seeds for a test of robustness"
         else:
             corrected = p_value(row.p_holm).removeprefix("= ")
             evidence += f", p {p_value(row.p)}{verdicts.smallest(row)}, Holm {corrected}"

@@ -3,7 +3,7 @@
 import csv
 from pathlib import Path
 
-from analysis.choice import CHOICE_COLUMNS, choice_file
+from analysis.choice import CHOICE_COLUMNS, KEYS, choice_file
 from analysis.errors import fail, in_words
 from analysis.folders import SUCCESS, rewritten
 from analysis.formatting import p_value, rounded, two_digits
@@ -185,12 +185,15 @@ def write_choice(path, new):
 
     new: rows of halving.records.
     """
-    rows, chosen_now = [CHOICE_COLUMNS], {row[:4] for row in new}
+    def key(row):
+        return tuple(row[: len(KEYS)])
+
+    rows, chosen_now = [CHOICE_COLUMNS], set(map(key, new))
     try:
         with rewritten(path) as file:  # other commands may end at the same time
             if path.exists():
                 with open(path, newline="", encoding="utf-8") as old:
-                    rows = [row for row in csv.reader(old) if tuple(row[:4]) not in chosen_now]
+                    rows = [row for row in csv.reader(old) if key(row) not in chosen_now]
             if rows[:1] != [CHOICE_COLUMNS]:
                 raise ValueError(f"its columns are not {','.join(CHOICE_COLUMNS)}")
             csv.writer(file, lineterminator="\n").writerows(rows + new)

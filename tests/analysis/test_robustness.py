@@ -121,6 +121,10 @@ def test_lopsided_numbers_of_seeds_have_no_verdict(tmp_path, capsys):
     assert scores[["p", "p_holm"]].isna().all(axis=None) and scores["difference_low"].notna().all()
     said = "no verdict with 5/9 seeds, which would be wrong too often, over 1 of 1 test condition"
     assert capsys.readouterr().out.count(said) == 2
+    write_tests(tmp_path / "one", {("", 0.0): returns}, "Hopper-v5", range(1, 10))
+    write_tests(tmp_path / "one", {(SENSOR, 0.2): noisy}, "Hopper-v5", [1])
+    run(tmp_path, "one")
+    assert "too few seeds for a test of robustness over 1 of 1" in capsys.readouterr().out
 
 
 def test_the_search_of_a_choice_has_no_baseline_to_play(tmp_path, capsys):
