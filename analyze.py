@@ -30,7 +30,7 @@ from analysis.choice import read_choice
 from analysis.comparisons import are_in, as_chosen, compare_all, runs_in
 from analysis.errors import fail, take_over_terminal
 from analysis.figures import INTERVAL, figures, write_figure
-from analysis.folders import CONFIRMATION, RETURN, SUCCESS, is_phase, is_run
+from analysis.folders import CONFIRMATION, PHASES, RETURN, SUCCESS, is_phase, is_run
 from analysis.formatting import WHOLE_WORDS, in_markdown, listed, shown, text_table
 from analysis.latex import latex_table
 from analysis.report import Results, write_report
@@ -241,19 +241,20 @@ def analyse(args, entries, choice):
         robustness=robustness,
         overview=overview_of(studies),
         problems=f"Runs left out: {number.sum():,} ({counts})." if len(number) else "",
-        notes=[*incomplete_note(number, compared), *lopsided_notes(compared), *notes, *unreadable],
+        notes=[*incomplete_note(left, compared), *lopsided_notes(compared), *notes, *unreadable],
         versions=version_notes(entries),
     )
 
 
-def incomplete_note(number, compared):
+def incomplete_note(left, compared):
     """Yield a note where a sweep with noise is not complete.
 
-    number: of the runs left out, by status.
+    left: the runs left out. Those of a choice, which looks as it has planned, do not matter.
     """
-    due = {status: n for status, n in number.items() if status in MORE_TO_COME}
-    if due and not compared.noises.empty:
-        counts = ", ".join(f"{n:,} {status}" for status, n in due.items())
+    due = left[left["status"].isin(MORE_TO_COME) & ~left["phase"].isin(PHASES)]
+    if len(due) and not compared.noises.empty:
+        number = due["status"].value_counts(sort=False)
+        counts = ", ".join(f"{n:,} {status}" for status, n in number.items())
         yield (
             f"this sweep is not complete ({counts}): more runs are due, and a verdict now is an "
             "extra look at the data, which makes false claims more frequent than 5 %"

@@ -93,17 +93,17 @@ def rows_in_one_environment(studies, by):
 def rows_together(studies, by):
     """Return the comparisons over several environments, without corrections and verdicts.
 
-    Environments count that have two runs of both kinds and results that are not all equal. In a
+    Environments count that have two runs of both kinds, of which not all have the same result. In a
     confirmation each environment has its one comparison.
     """
     rows = []
     for study in studies:
         if study.phase in PHASES:
             continue
-        all_equal = study.all_equal()
-        differing = np.array([environment not in all_equal for environment in study.environments])
         for (noise, rate), configs in groups_of(study.finals, by).items():
             numbers = np.minimum(runs_in(study, configs), runs_in(study, [BASELINE]))
+            finals = finals_of(study, [BASELINE, *configs])
+            differing = np.array([statistics.are_different(values) for values in finals.T])
             places = np.flatnonzero(differing & (numbers >= 2))
             if len(places) > 1:
                 row = row_keys(study, "", noise, rate)
@@ -215,7 +215,8 @@ def results(studies, compared):
             row = row_keys(study, environment, config.noise, config.noise_rate)
             row |= zip(RESULTS[:3], statistics.mean_std(sample), strict=True)
             row |= zip(RESULTS[3:6], statistics.mean_std(baseline), strict=True)
-            row |= zip(IQM, iqm.bootstrap_iqm(sample), strict=True)
+            found = iqm.bootstrap_iqm(sample)
+            row |= zip(IQM, np.clip(found, 0, 100) if study.episodes else found, strict=True)
             curves, target = study.curves[config][..., e], row["baseline_mean"]
             row["steps_to_baseline"] = statistics.steps_to_reach(curves, study.steps, target)
             rows.append(row)

@@ -106,7 +106,7 @@ class Run:
         """Where it was tested, if that is not the clean environment as its id makes it."""
         told = [f"under {self.tested_under}"] if self.tested_under != BASELINE else []
         if kwargs := self.args.get("env_kwargs"):
-            told.append(f"with {', '.join(map(str, kwargs))}")
+            told.append(f"with {', '.join(sorted(kwargs))}")
         return " ".join(["tested", *told]) if told else ""
 
 

@@ -8,7 +8,7 @@ returns. Keeping the baseline fixed would not do: a baseline that was unlucky is
 import numpy as np
 
 from analysis.runs import STUDY
-from analysis.statistics import contrast, pooled_std
+from analysis.statistics import contrast, least_variance, pooled_std
 
 DRAWS = 10_000
 SEEDS_TO_RESAMPLE = 20  # with fewer seeds of the baseline, returns are taken as normal
@@ -56,10 +56,15 @@ def luck_of_studies(studies):
             std, df = pooled_std(
                 [s for s in samples if s is best or not clearly_worse(s, samples[0])]
             )
+            if study.episodes:  # seeds that all succeed are no proof that all would
+                everything = np.concatenate(samples)
+                n = len(everything)
+                least = n * least_variance(everything.mean(), n * study.episodes)
+                std = max(std, np.sqrt(least))
             n_baseline, *n_noisy = map(len, samples)
             tried = [n for n in n_noisy if n]
             best_draws = np.full(DRAWS, np.nan)
-            if len(tried) > 1 and n_baseline and df > 0 and environment not in all_equal:
+            if len(tried) > 1 and n_baseline and df > 0 and std > 0 and environment not in all_equal:
                 draws = draw_differences(std, df, n_baseline, tried, rng, samples[0])
                 best_draws = draws.max(axis=0)
             lucks[*study.key, environment] = best_draws

@@ -55,8 +55,9 @@ TERMS = {
         the median.""",
     "p": """How often chance alone makes a difference as large, in either direction: a permutation
         test with Welch's t.""",
-    "p corrected": """p, corrected for all comparisons of its table with the same baseline
-        (Benjamini and Hochberg). The p of a confirmation needs no correction.""",
+    "p corrected": """p, corrected (Benjamini and Hochberg) for all noises of the study in that
+        environment, or over all; that of a single rate for all rates of noises that have several.
+        The p of a confirmation needs no correction.""",
     "n": """The number of seeds, or with rates together of runs; with / without noise where they
         differ.""",
     "n baseline": "The number of seeds without noise.",

@@ -20,7 +20,7 @@ from analysis.episodes import read_episodes
 from analysis.folders import RETURN, SEARCH, SUCCESS, DamageError
 from analysis.formatting import listed, p_value, percent, seeds_of
 from analysis.runs import KEYS, STUDY, study_name, study_of, where_tested
-from analysis.statistics import compare, holm, mean_std, percent_of
+from analysis.statistics import are_different, compare, holm, mean_std, percent_of
 from analysis.tables import table_of
 from analysis.words import counted
 from noisy_wrappers import BASELINE, WRAPPERS
@@ -154,7 +154,8 @@ def condition_rows(runs):
 def score_rows(runs, metric=RETURN):
     """Yield the score of every configuration with noise: over all environments, then in each.
 
-    `primary` are those over all environments that have two seeds of both kinds, or in the only one.
+    `primary` are those over all environments that have two seeds of both kinds, of which not all have
+    the same result, or in the only one.
     Tests in another environment are apart: they leave those at home as they are.
     """
     for _, group in runs.groupby(STUDY):
@@ -169,7 +170,12 @@ def score_rows(runs, metric=RETURN):
             ]
             scores = [score for score in scores if score]
             at_home = [score for score in scores if not score["elsewhere"]]
-            counting = [score for score in at_home if min(score["n"], score["n_baseline"]) >= 2]
+            counting = [
+                score
+                for score in at_home
+                if min(score["n"], score["n_baseline"]) >= 2
+                and are_different(np.concatenate([score["x"], score["y"]]))
+            ]
             counting = counting or at_home
             if len(counting) > 1:
                 of = f"{len(counting)} of {tested}" if len(counting) < tested else "all"
@@ -252,7 +258,7 @@ def analyse_robustness(runs, metric=RETURN):
     primary = scores[scores["primary"].astype(bool)]
     for _, family in primary[primary["p"].notna()].groupby([*STUDY, "elsewhere"]):
         scores.loc[family.index, "p_holm"] = holm(family["p"].to_numpy(float))
-    note, score_note = "", "Scores: relative to the clean return."
+    note, score_note = "", "Percentages and scores: of the clean return without noise."
     if metric == SUCCESS:  # never percent of a rate
         note = "Rates are in percent of the episodes, differences in percentage points."
         score_note = note
@@ -299,7 +305,7 @@ def robustness_sentences(scores, metric):
         start = f"{study} on {where}, trained with {row.noise} at rate {row.noise_rate}"
         over = f"over {row.conditions} of {counted(row.conditions_tested, 'test condition')}"
         shown, limit = DIRECTIONS[0], ""
-        evidence = verdicts.difference_in_words(row, unit)
+        evidence = verdicts.difference_in_words(row, unit, " of the clean return without noise")
         if min(row.n, row.n_baseline) < 2:
             shown = "too few seeds for a test of robustness"
         elif row.lopsided:

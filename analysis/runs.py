@@ -13,7 +13,7 @@ from pathlib import Path
 import pandas as pd
 
 from analysis import folders
-from analysis.folders import NOT_SETTINGS, SEARCH, DamageError, Run, script_name
+from analysis.folders import NOT_SETTINGS, PHASES, DamageError, Run, script_name
 from analysis.logs import STOPPED, read_log
 from noisy_wrappers import BASELINE, different_arguments, run_name
 
@@ -191,13 +191,14 @@ def missing_runs(entries):
 
     Expected are the seeds that at least half of a study's configurations with noise have, each
     environment counted apart. An environment in which anything was run should have the baseline
-    with these seeds. The search of `./benchmark.sh choose` gives few noises many seeds: nothing is
-    missing there. Nor is a run that has a folder, by its name, which tells nothing or is left out.
+    with these seeds. `./benchmark.sh choose` gives few noises many seeds, and may stop early in one
+    environment: nothing is missing there. Nor is a run that has a folder, by its name, which tells
+    nothing or is left out.
     """
     missing = []
     left_out = {Path(e.folder).name for e in entries if e.run is None or e.status == "different"}
     runs = [e.run for e in entries if e.run is not None and e.status != "different"]
-    for study in by_study(run for run in runs if run.phase != SEARCH).values():
+    for study in by_study(run for run in runs if run.phase not in PHASES).values():
         found, example = defaultdict(set), {}
         for run in study:
             found[run.environment, run.configuration].add(run.seed)

@@ -38,6 +38,12 @@ def exact(value, *samples):
     return 0.0 if abs(value) <= 1e-12 * abs(np.concatenate(samples)).max() else value
 
 
+def are_different(values):
+    """Tell whether values, without those that are not finite, differ by more than rounding."""
+    values = values[np.isfinite(values)]
+    return len(values) > 1 and np.ptp(values) > 1e-12 * abs(values).max()
+
+
 def mean_std(values):
     """Mean, sample standard deviation (ddof=1) and number of the values that are not NaN."""
     values = np.asarray(values, float)
@@ -163,6 +169,8 @@ def compare(x, y, level=LEVEL, episodes=None):
             low = high = nan
         elif not isnan(percents[0]):
             percent_low, percent_high = fieller(xs[0], ys[0], level)
+            if (percent_low > 0 or percent_high < 0) != (low > 0 or high < 0):
+                percent_low = percent_high = nan  # two intervals that disagree would say nothing
         std = stds[0]
         detectable = detectable_shift(n, m) * error / sqrt(1 / n + 1 / m)
     t, p, smallest_p = permutation_t(x, y)

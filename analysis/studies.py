@@ -7,7 +7,7 @@ import numpy as np
 
 from analysis.folders import RETURN, SEARCH, SUCCESS
 from analysis.runs import by_study, finished, study_name
-from analysis.statistics import final_value
+from analysis.statistics import are_different, final_value
 from analysis.words import counted
 from noisy_wrappers import BASELINE
 
@@ -45,8 +45,7 @@ class Study:
             runs = sum(np.isfinite(finals[:, e]).sum() for finals in self.finals.values())
             parts = [*self.curves.values(), *self.finals.values()]
             tests = np.concatenate([values[..., e].ravel() for values in parts])
-            tests = tests[np.isfinite(tests)]
-            if runs > 1 and np.ptp(tests) <= 1e-12 * abs(tests).max():
+            if runs > 1 and not are_different(tests):
                 found.append(env)
         return found
 

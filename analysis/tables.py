@@ -11,7 +11,7 @@ from analysis.folders import SEARCH, SUCCESS
 from analysis.formatting import Table, listed, seeds_of, slug
 from analysis.luck import add_luck, luck_of_studies
 from analysis.power import CONFIDENCE
-from analysis.runs import KEYS, STUDY, study_name
+from analysis.runs import KEYS, STUDY, rows_of, study_name
 from analysis.verdicts import ALL_EQUAL
 from noisy_wrappers import BASELINE
 
@@ -123,14 +123,14 @@ def lopsided_notes(compared):
     """Say where verdicts may be wrong too often, because one side has few of all seeds."""
     noises = compared.noises[compared.noises["p"].notna() & (compared.noises["lopsided"] == 1)]
     rates = compared.rates[compared.rates["smallest_p"].isna()]
-    everywhere = compared.rates_together["smallest_p"].isna().any()
-    where = "there and over several environments" if everywhere else "there"
+    together = compared.rates_together[compared.rates_together["smallest_p"].isna()]
     notes = []
-    for rows, said in (
-        (noises, "a verdict may be wrong more often than in 5 %"),
-        (rates, f"single rates have no verdict {where}, which would be wrong too often"),
-    ):
+    for rows in (noises, rates):
         for key, group in rows.groupby(STUDY, sort=False):
+            said = "a verdict may be wrong more often than in 5 %"
+            if rows is rates:
+                also = " and over several environments" if rows_of(together, key).any() else ""
+                said = f"single rates have no verdict there{also}, which would be wrong too often"
             seeds = sorted({seeds_of(*pair) for pair in group[["n", "n_baseline"]].to_numpy()})
             notes.append(
                 f"{study_name(*key)}, {', '.join(group['environment'].unique())}: with "
@@ -180,13 +180,13 @@ seeds, and difference from the policies trained without noise.""",
 CAPTIONS = {name: " ".join(text.split()) for name, text in CAPTIONS.items()}
 
 
-def percent_note(summary, metric):
-    """Say in which environments of a summary percentages would mean nothing, or ""."""
+def percent_note(rows, metric):
+    """Say in which environments of a table percentages would mean nothing, or ""."""
     if metric == SUCCESS:
         return "Success rates are in percent of the episodes, differences in percentage points."
-    without = summary["difference"].notna() & summary["difference_percent"].isna()
-    without &= summary["verdict"] != ALL_EQUAL  # which has no percentages for another reason
-    names = sorted(set(summary.loc[without, "environment"]))
+    without = rows["difference"].notna() & rows["difference_percent"].isna()
+    without &= rows["verdict"] != ALL_EQUAL  # which has no percentages for another reason
+    names = sorted(set(rows.loc[without, "environment"]))
     if not names:
         return ""
     return (
@@ -217,7 +217,9 @@ def make_tables(studies, compared):
     rates = rates[COLUMNS["statistics"]]
     tables = [
         table_of("noises_together", compared.noises_together, section="noises", only_csv=MORE),
-        table_of("noises", compared.noises, only_csv=MORE, note=note),
+        table_of(
+            "noises", compared.noises, only_csv=MORE, note=percent_note(compared.noises, metric)
+        ),
         table_of("best", best, view=in_words(best, "best"), note=note),
         table_of("consistent", good, note=note),
         table_of("consistently_worse", bad, note=note),

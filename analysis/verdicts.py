@@ -84,10 +84,11 @@ def spread_of(row):
     return row.pooled_std if pd.isna(half) else half
 
 
-def difference_in_words(row, unit=""):
+def difference_in_words(row, unit="", of=""):
     """Write what a comparison found: "+11.8 [8.4, 15.3] (+21 % [15, 28])".
 
-    Of several environments in standard deviations. unit: of the difference, such as POINTS.
+    Of several environments in standard deviations. unit: of the difference, such as POINTS; of:
+    what the percentages are of, if that is not the mean without noise.
     """
     if pd.isna(row.difference):
         text = f"{row.effect_size:+z.2f} standard deviations in the median environment"
@@ -103,7 +104,7 @@ def difference_in_words(row, unit=""):
         text += unit
     if pd.notna(row.difference_percent):
         average = " on average" if pd.isna(row.difference) else ""
-        text += f" ({percent(row.difference_percent)}{percent_interval(row)}{average})"
+        text += f" ({percent(row.difference_percent)}{percent_interval(row)}{average}{of})"
     return text
 
 

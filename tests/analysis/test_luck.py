@@ -48,6 +48,19 @@ def test_a_single_configuration_is_students_test():
         assert found == pytest.approx(expected, abs=0.015)
 
 
+def test_seeds_that_do_not_vary_are_no_proof():
+    """One success in 23 configurations of five seeds with ten episodes is luck; so is one of two."""
+    rates = np.zeros((23, 5, 1))
+    rates[7, 2] = 10.0
+    rare = make_study(np.zeros((5, 1)), rates)
+    few = make_study(np.full((2, 1), 50.0), np.array([[[100.0], [100.0]], [[50.0], [50.0]]]))
+    for study, episodes, gain in ((rare, 10, 2.0), (few, 2, 50.0)):
+        study.curves, study.episodes = study.finals, episodes
+        assert analysis.luck.p_of_luck(luck_of_study(study)["Env0-v0"], gain) > 0.05
+        study.episodes = None  # of returns without any spread nothing is known
+    assert np.isnan(luck_of_study(few)["Env0-v0"]).all()
+
+
 def test_noise_that_ends_training_says_nothing_of_luck():
     rng = np.random.default_rng(0)
     baseline, useless = rng.normal(100, 1, 5), rng.normal(100, 1, (20, 5))

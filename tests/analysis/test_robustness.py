@@ -106,6 +106,7 @@ def test_score_and_conditions_by_hand(tmp_path, capsys):
     assert "no clear difference under noise over 3 of 5 test conditions" in text
     few = "(smallest possible: 0.029; too few seeds for an interval)"
     assert f"p = 0.029 {few}, Holm 0.057; clean return -10 %" in text
+    assert "% of the clean return without noise), p = 0.029" in text
 
 
 def test_lopsided_numbers_of_seeds_have_no_verdict(tmp_path, capsys):
@@ -125,6 +126,16 @@ def test_lopsided_numbers_of_seeds_have_no_verdict(tmp_path, capsys):
     write_tests(tmp_path / "one", {(SENSOR, 0.2): noisy}, "Hopper-v5", [1])
     run(tmp_path, "one")
     assert "too few seeds for a test of robustness over 1 of 1" in capsys.readouterr().out
+
+
+def test_environments_without_any_difference_are_not_averaged(tmp_path, capsys):
+    for env, gain in (("Hopper-v5", 20), ("Maze-v0", 0), ("Maze-v1", 0)):
+        for config, mean in ((("", 0.0), 0), ((SENSOR, 0.2), gain)):
+            returns = [mean + (i / 10 if gain else 0) for i in range(6)]
+            tests = {CLEAN: returns, (PUSH, "1.0"): returns}
+            write_tests(tmp_path / "runs", {config: tests}, env, range(1, 7))
+    assert run(tmp_path)["robustness_together"].empty
+    assert "Hopper-v5, trained with RandomNormalNoisyObservation" in capsys.readouterr().out
 
 
 def test_the_search_of_a_choice_has_no_baseline_to_play(tmp_path, capsys):

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from sweeps import ENDING, SCALE, row, run, write_pairs, write_run
 
-from analysis.runs import folder_of, in_short, left_out, missing_runs, read_runs
+from analysis.runs import finished, folder_of, in_short, left_out, missing_runs, read_runs
 from analysis.studies import make_studies, version_notes
 from noisy_wrappers import BASELINE, run_name
 
@@ -105,6 +105,18 @@ def test_more_seeds_for_the_baseline_or_for_one_noise_are_nothing_missing(tmp_pa
     assert {run.configuration.noise for run in missing if run not in hopper} == {"", ENDING}
 
 
+def test_a_choice_that_stops_early_in_one_environment_is_complete(tmp_path, capsys):
+    for env, last in (("Hopper-v5", 1010), ("Pusher-v5", 1025)):
+        for seed in range(1001, last + 1):
+            write_run(tmp_path / "runs/confirmation", [seed], env=env, seed=seed)
+            noise = {"noise": SCALE, "rate": 0.1}
+            write_run(tmp_path / "runs/confirmation", [seed + 9], env=env, seed=seed, **noise)
+    write_run(tmp_path / "runs/search", [1], seed=1, finished=False, noise=SCALE, rate=0.1)
+    run(tmp_path)
+    assert "not complete" not in capsys.readouterr().out
+    assert left_out(read_runs(tmp_path / "runs"))["status"].tolist() == ["unfinished"]
+
+
 def test_a_run_with_other_arguments_is_not_missing_besides(tmp_path):
     for noise, rate in (((), ()), (SCALE, 0.5), (ENDING, 0.5)):
         for seed in (1, 2, 3):
@@ -131,6 +143,13 @@ def test_studies_never_share_a_row(change, tmp_path):
     other = row(summary, **{name: value})
     assert other["mean"] == 99 and np.isnan(other["difference_percent"])
     assert row(summary, noise=SCALE)["baseline_mean"] == 10
+
+
+def test_the_order_of_the_environments_arguments_does_not_matter(tmp_path):
+    for seed, kwargs in enumerate((["a:1", "b:2"], ["b:2", "a:1"], ["a:1", "b:2"]), start=1):
+        write_run(tmp_path, [10], seed=seed, env_kwargs=kwargs)
+    runs = finished(read_runs(tmp_path))
+    assert len(runs) == 3 and {one.tested for one in runs} == {"tested with a:1, b:2"}
 
 
 def test_the_most_frequent_arguments_of_an_exp_name_are_its_study(tmp_path, capsys):

@@ -214,6 +214,14 @@ def test_fiellers_limits_by_hand():
     assert exact == pytest.approx((10 * low - 100, 10 * high - 100))
 
 
+def test_two_intervals_never_disagree_about_zero():
+    """Their degrees of freedom differ: Fieller's would be from 9.9 to 320 %."""
+    x, y = np.array([46.4, 260.6, 170.2, 247.2, 154.0]), np.array([76.8, 66, 89.8, 87.7, 41.9])
+    found = statistics.compare(x, y)
+    assert statistics.fieller(x, y)[0] > 0 > found.difference_low
+    assert np.isnan([found.percent_low, found.percent_high]).all() and found.difference_percent > 99
+
+
 def test_fiellers_interval_is_cut_or_does_not_exist():
     x, y = np.array([0.1, 0.2, 4.0]), np.array([8.0, 12, 10, 11])
     assert statistics.fieller(x, y)[0] == -100  # positive returns

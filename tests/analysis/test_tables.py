@@ -78,6 +78,11 @@ def test_over_environments_single_rates_have_no_verdict_where_one_of_them_has_no
     assert set(alone["verdict"]) == {"better"}
     said = capsys.readouterr().out
     assert "Pusher-v5: with 5/20 runs" in said and "there and over several environments" in said
+    more = {"algorithm": "PPO", "env": "Pusher-v5"}  # a study of one environment
+    write_pairs(tmp_path / "runs", range(101, 121), range(201, 206), **more)
+    write_pairs(tmp_path / "runs", [], range(201, 206), rate=0.2, **more)
+    run(tmp_path)
+    assert capsys.readouterr().out.count("there and over several environments") == 1
 
 
 def test_a_note_on_lopsided_seeds_needs_a_verdict(tmp_path, capsys):
@@ -214,6 +219,15 @@ def test_an_environment_whose_baseline_is_nearly_zero_is_in_every_table(tmp_path
     zero = row(sparse["statistics"], environment="Maze-v0", noise=ENDING)
     assert zero["verdict"] == "worse" and zero["difference"] == pytest.approx(-1.3)
     assert np.isnan(zero["iqm_change_percent"]) and zero["probability_of_improvement"] == 0
+    for seed, noisy in enumerate((95, 96, 97, 98, 99), start=1):  # together no percentage, alone two
+        config = {"noise": SCALE, "env": "Span-v0", "seed": seed}
+        write_run(tmp_path / "runs", [10 + seed / 10], env="Span-v0", seed=seed)
+        write_run(tmp_path / "runs", [noisy], rate=0.1, **config)
+        write_run(tmp_path / "runs", [-noisy + 35], rate=0.5, **config)
+    tables = run(tmp_path)
+    assert row(tables["statistics"], environment="Span-v0", noise_rate="0.10")["percent_low"] > 0
+    assert np.isnan(row(tables["noises"], environment="Span-v0")["difference_percent"])
+    assert "Span-v0: the mean" in (tmp_path / "results/noises.md").read_text()
     note = (tmp_path / "results/best.md").read_text()
     assert "No percentage, or not for every noise, on Car-v0 and Maze-v0: " in note
 
@@ -228,6 +242,9 @@ def test_an_environment_without_any_difference_says_nothing(same, tmp_path):
     best = row(tables["best"], environment="A-v0")
     assert best["difference"] == 0 and best[["difference_percent", "p"]].isna().all()
     assert row(tables["noises"], environment="B-v0")["verdict"] == "all equal"
+    # nor does it count for a noise that changes nothing there, where another one does
+    write_pairs(tmp_path / "runs", [], [same, same + 1], ENDING, env="A-v0")
+    assert SCALE not in set(run(tmp_path)["noises_together"]["noise"])
 
 
 # ------------------------------------------------------------------------------------------ as text
