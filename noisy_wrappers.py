@@ -295,7 +295,9 @@ class ObservationNoise(NoiseWrapper):
     def __init__(self, env: Env, noise_rate: Rate, *, keys: Keys = None, **parameters: Any):
         """Raise ValueError unless observations contain numbers, and keys are those of the space."""
         self.keys = _keys(keys)
-        super().__init__(env, noise_rate, **parameters, keys=self.keys)
+        if self.keys is not None:  # a wrapper of your own need not take them
+            parameters["keys"] = self.keys
+        super().__init__(env, noise_rate, **parameters)
         self._boxes = {} if isinstance(env, _ProbeEnv) else self._find_boxes(env)
         self._places: dict[EntryPath, Any] = {}  # of the boxes in the vector: slice, shape, dtype
         size = 0
@@ -305,6 +307,8 @@ class ObservationNoise(NoiseWrapper):
             size = place.stop
         # of what is perturbed
         self._shape = self._boxes[()].shape if () in self._boxes else (size,)
+        if type(self).__module__ != __name__:  # nobody knows what yours can reach
+            self._widen(lambda bound: (-np.inf, np.inf))
 
     def _find_boxes(self, env: Env) -> dict[EntryPath, gym.spaces.Box]:
         """Return the entries to perturb: {path in the observation: their space}."""
@@ -828,7 +832,7 @@ class RandomEarlyTermination(NoiseWrapper):
         each_step: bool = False,
         truncate: bool = False,
     ):
-        if any(env.has_wrapper_attr(name) for name in ("return_queue", "get_episode_rewards")):
+        if _records_episodes(env):
             raise ValueError(
                 "RandomEarlyTermination needs to be inside of what records episodes "
                 "(RecordEpisodeStatistics, Monitor): the record would miss those that it ends"
@@ -1346,7 +1350,7 @@ class Configuration:
         recorder = gym.wrappers.RecordEpisodeStatistics
         inside = next(layer for layer in _layers(env) if not isinstance(layer, NoiseWrapper))
         if record_statistics and not isinstance(inside, recorder):
-            if _layers(env, recorder) and not _layers(env, FiniteNumbers):  # which drops records
+            if _records_episodes(env):
                 advice = "let make_noisy do, or say record_statistics=False"
                 raise ValueError(f"this environment records its returns: {advice}")
             env = recorder(env)
@@ -1591,7 +1595,7 @@ def make_environments(
     try:
         test_env = make_env(args["env_id"], **kwargs)
     except TypeError as error:  # Gymnasium's words for what the user can mend on the command line
-        known = ("unexpected keyword argument", "must inherit from the gymnasium.Env")
+        known = ("unexpected keyword argument", "multiple values for", "must inherit from the gym")
         if not any(text in str(error) for text in known):
             raise
         raise SpaceError(str(error)) from error
@@ -1626,7 +1630,7 @@ def outcome(info: Mapping[str, Any]) -> float:
     """
     for name in ("is_success", "success"):
         value = np.asarray(info.get(name))  # PyTorch's tensors have a size() of their own
-        if value.size == 1 and value.dtype.kind in "biuf":
+        if value.size == 1 and value.dtype.kind in "biuf" and not np.isnan(value.item()):
             return float(value.item() > 0)
     return math.nan
 
@@ -1719,8 +1723,8 @@ class EnvState:
     attributes, with the number of children that they spawned; the streams, counters, rates and
     estimates of its noise wrappers; the returns that RecordEpisodeStatistics remembers; the global
     generators of ``random`` and NumPy; and further ``generators``. An environment that carries
-    anything else, or holds a generator elsewhere, does not resume exactly. Reset it with a seed
-    before.
+    anything else, holds a generator elsewhere, or makes one after its first reset, does not resume
+    exactly. Reset it with a seed before.
     """
 
     def __init__(self, env: Env, *generators: np.random.Generator):
@@ -1778,7 +1782,8 @@ def kept_generators(env: Env | None = None) -> Iterator[None]:
         generators += _generators(env).values()
     streams = [_stream(generator) for generator in generators]
     torch = sys.modules.get("torch")
-    with torch.random.fork_rng(devices=[]) if torch else contextlib.nullcontext():
+    gpus = range(torch.cuda.device_count()) if torch and torch.cuda.is_initialized() else ()
+    with torch.random.fork_rng(gpus) if torch else contextlib.nullcontext():
         try:
             yield
         finally:
@@ -1956,6 +1961,8 @@ def different_arguments(
     differing = {}
     for name in dict.fromkeys([*config["args"], *other["args"]]):
         values = ours.get(name), theirs.get(name)
+        if name == "env_kwargs":  # their order does not matter
+            values = sorted(values[0] or []), sorted(values[1] or [])
         if name not in may_differ and json.dumps(values[0]) != json.dumps(values[1]):
             differing[name] = values
     return differing
@@ -2000,8 +2007,8 @@ def _check_numbers(args: Mapping[str, Any]) -> None:
 def canonical_arguments(args: Mapping[str, Any]) -> dict[str, Any]:
     """Check a script's arguments, {name: value}; return those that have one way to be written.
 
-    They are ``env_id``, with its version, and the noises and rates of training and of tests; the
-    rate of tests is 1 if none is given. The module of "module:Env-v0" is imported.
+    They are ``env_id``, with its version, ``env_kwargs``, sorted, and the noises and rates of
+    training and of tests; the rate of tests is 1 if none is given. The module of "module:Env-v0" is imported.
 
     Raises:
         ValueError: a number out of its range, a bad ``exp_name``, ``runs_dir``, noise, rate or
@@ -2016,6 +2023,7 @@ def canonical_arguments(args: Mapping[str, Any]) -> dict[str, Any]:
     noises, rates = Configuration.read(args["noise"], args["noise_rate"]).texts
     tests = read_test_noise(args["test_noise"], args["test_noise_rate"]).for_tests()
     canonical = {"env_id": canonical_env_id(args["env_id"]), "noise": noises, "noise_rate": rates}
+    canonical["env_kwargs"] = sorted(args["env_kwargs"])
     return canonical | {"test_noise": tests.texts[0], "test_noise_rate": tests.texts[1]}
 
 
@@ -2132,6 +2140,16 @@ def _layers(env: Env, kind: Any = gym.Env) -> list[Any]:
     while isinstance(layers[-1], gym.Wrapper):
         layers.append(layers[-1].env)
     return [layer for layer in layers if isinstance(layer, kind)]
+
+
+def _records_episodes(env: Env) -> bool:
+    """Tell whether a wrapper records episodes; what is inside of FiniteNumbers, it drops."""
+    for layer in _layers(env):
+        if isinstance(layer, FiniteNumbers):
+            return False
+        if hasattr(layer, "return_queue") or hasattr(layer, "get_episode_rewards"):
+            return True  # RecordEpisodeStatistics, or Stable-Baselines3's Monitor
+    return False
 
 
 def _entries(space: gym.Space[Any], path: EntryPath = ()) -> Iterator[tuple[EntryPath, Any]]:

@@ -253,6 +253,7 @@ BAD = [  # arguments, what the line names
     ({"test_noise": ("RandomNormalNoisyReward(1.0)",), "test_noise_rate": (2.0,)}, "noise_rate"),
     ({"env_kwargs": ("length=5",)}, "env_kwargs: 'length=5' is not name:value"),
     ({"env_id": "toy_envs:Count-v0", "env_kwargs": ("mass:2.0",)}, "unexpected keyword argument"),
+    ({"env_id": "toy_envs:Count-v0", "env_kwargs": ("id:2",)}, "multiple values for"),
     ({"env_id": "toy_envs:NoEnv-v0"}, "must inherit from the gymnasium.Env class"),
     ({"seed": -1}, "--seed must be at least 0, not -1\n"),
     ({"gamma": 1.1}, "--gamma must be at most 1, not 1.1\n"),

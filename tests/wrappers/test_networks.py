@@ -109,11 +109,12 @@ def test_rewards_are_floats(reward):
 def test_an_environment_may_record_itself():
     """Its record is dropped, because Gymnasium would refuse a second one."""
     env = gym.wrappers.RecordEpisodeStatistics(gym.make("Pendulum-v1", max_episode_steps=2))
-    env = make_noisy(make_flat(env), [A], [1.0])
-    env.reset(seed=0)
-    env.step(np.zeros(1, np.float32))
-    *_, info = env.step(np.zeros(1, np.float32))
-    assert info["episode"]["l"] == 2
+    for noise, length in ((A, 2), ("RandomEarlyTermination(1)", 1)):
+        noisy = make_noisy(make_flat(env), [noise], [1.0])
+        noisy.reset(seed=0)
+        for _ in range(length):
+            *_, info = noisy.step(np.zeros(1, np.float32))
+        assert info["episode"]["l"] == length
 
 
 @pytest.mark.parametrize("bad", [np.nan, -np.inf])
@@ -230,6 +231,8 @@ def test_outcomes():
         assert outcome({"success": value}) == 1.0
     assert outcome({"is_success": torch.tensor(False)}) == 0.0
     assert np.isnan(outcome({"success": [True, False]})) and np.isnan(outcome({}))
+    assert outcome({"is_success": np.nan, "success": True}) == 1.0
+    assert np.isnan(outcome({"success": np.nan}))
 
 
 class Heedless(GenericEnv):

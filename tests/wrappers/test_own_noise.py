@@ -16,7 +16,14 @@ import pytest
 from cases import GenericEnv
 from gymnasium.utils.env_checker import check_env
 
-from noisy_wrappers import Configuration, EnvState, RewardNoise, parse_noise, run_name
+from noisy_wrappers import (
+    Configuration,
+    EnvState,
+    ObservationNoise,
+    RewardNoise,
+    parse_noise,
+    run_name,
+)
 
 ROOT = Path(__file__).parents[2]
 TEXT = "my_noises:StickyAction(3)"
@@ -119,6 +126,24 @@ def test_a_sweep_and_a_test_from_the_folder_of_the_noise(folder):
     rows = list(csv.DictReader((noisy.parent / "robustness.csv").open()))
     assert {row["noise"] for row in rows} == {"", TEXT}
     assert np.isfinite([float(row["episodic_return"]) for row in rows]).all()
+
+
+class Shift(ObservationNoise):
+    """Defines nothing but what docs/wrappers.md says."""
+
+    def __init__(self, env, noise_rate, by):
+        super().__init__(env, noise_rate, by=by)
+        self.by = by
+
+    def _perturb(self, observation):
+        return observation + self.by
+
+
+@pytest.mark.filterwarnings("ignore:.*WARN")
+def test_noise_on_observations_stays_within_its_space_and_can_be_made_again():
+    env = Shift(gym.make("Pendulum-v1"), 1.0, 5.0)
+    check_env(env, skip_render_check=True)
+    assert gym.make(env.spec).by == 5.0
 
 
 class Walk(RewardNoise):

@@ -22,7 +22,7 @@ from gymnasium.wrappers import RecordEpisodeStatistics
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from noisy_wrappers import RandomNormalNoisyObservation, make_noisy
+from noisy_wrappers import RandomNormalNoisyObservation, make_flat, make_noisy
 
 
 def spaces(draw):
@@ -96,6 +96,9 @@ def test_a_record_below_other_wrappers_is_refused():
     with pytest.raises(ValueError, match="this environment records its returns"):
         make_noisy(env, [], [])
     assert make_noisy(env, [], [], record_statistics=False) is env
+    with pytest.raises(ValueError, match="this environment records its returns"):
+        recorded = RecordEpisodeStatistics(make_flat(gym.make("Pendulum-v1")))
+        make_noisy(gym.wrappers.TimeLimit(recorded, 5), [], [])
 
 
 def test_a_record_of_the_true_return_that_there_is_is_kept():
