@@ -98,7 +98,8 @@ cd "$(dirname -- "$(readlink -f -- "${BASH_SOURCE[0]}")")" # it may be called th
 case ${1:-} in # how the executors call this script: run-one SWEEP FOLDER COMMAND
   run-one) # on a machine whose connection may break: the run must outlive its reader
     trap : TERM INT USR1
-    run_one "$2" "$3" "$4" | pass_on || exit 1
+    # a run that fails says so in its log: to GNU parallel, only a lost connection is a failure
+    run_one "$2" "$3" "$4" "${5:-}" | pass_on || true
     exit ;;
   slurm-task) slurm_task "$2" "$3" ;;
   "" | -h | --help) usage || true; exit ;;
@@ -138,7 +139,8 @@ export PYTHON=${PYTHON:-python}
 # A module of the user's, as in my_envs:MyEnv-v0, lies there, too. Without a colon there is none, and
 # the folder stays off the path: a file in it could have the name of one of Python's own modules.
 # (A status of a choice reads in choice.json which environments it has.)
-if [ "$caller" != "$PWD" ] && [[ $view = status || "${grid[*]}" = *:[A-Za-z_]* ]]; then
+if [ "$caller" != "$PWD" ] &&
+  [[ ($view = status && ${grid[0]:-} = choose) || "${grid[*]}" = *:[A-Za-z_]* ]]; then
   export PYTHONPATH=${PYTHONPATH:+$PYTHONPATH:}$caller
 fi
 lacking=$("$PYTHON" -c "import sys, importlib.util as u

@@ -47,7 +47,7 @@ import noisy_wrappers as noisy
 from analysis import folders
 from analysis.episodes import read_episodes, store_episodes
 from analysis.errors import fail, in_words, take_over_terminal, with_place
-from analysis.folders import NOT_SETTINGS, PHASES, DamageError
+from analysis.folders import NOT_SETTINGS, DamageError
 from analysis.formatting import DASH, rounded, slug
 from analysis.matrices import matrices
 from analysis.runs import study_name, study_of, usual_config, where_tested
@@ -113,7 +113,7 @@ class Player:
     def runs_dir(self):
         """The folder of all runs beside it, in both phases of a choice."""
         folder = self.folder.resolve().parent
-        return folder.parent if folder.name in PHASES else folder
+        return folder.parent if folders.is_phase(folder) else folder
 
     def name(self, condition):
         """Name a condition for people and files."""
@@ -273,18 +273,25 @@ def check_players(players, conditions, bad, args):
                     raise ValueError(f"{args.drawing} is not among its render_modes, {modes}")
                 for condition in conditions:
                     condition.wrap(env)
-            if args.stores(player) and not os.access(player.folder, os.W_OK):
+            found = read_episodes(player.folder) if args.stores(player) else {}
+            due = [one for one in conditions if lacks(found, player, one, args)]
+            if due and args.stores(player) and not os.access(player.folder, os.W_OK):
                 raise ValueError("cannot be written to; with another --seed nothing is stored")
             if not player.run.finished:
                 step = step_of(player)
                 print(f"{player.folder.name} is not finished: its policy of step {step} is tested")
-            stored[player] = read_episodes(player.folder) if args.stores(player) else {}
+            stored[player] = found
         except (Exception, SystemExit) as error:  # but for a ValueError, of the user's environment
             bad[player.folder] = with_place(error, ValueError)
     for script in sorted(changed):
         text = f"{script} has changed since some of these runs were trained"
         print(f"{text}: what plays may differ from what was trained", file=sys.stderr)
     return stored
+
+
+def lacks(stored, player, condition, args):
+    """Tell whether episodes of a condition are still to be played; stored: of read_episodes."""
+    return len(stored.get((condition, player.elsewhere), [])) < args.episodes
 
 
 def tell(bad):
@@ -302,8 +309,8 @@ def play(player, condition, args):
     with load(player, args.drawing) as (env, policy):
         env = condition.wrap(env)
         if args.video:
-            name = f"{player.folder.name}__{player.name(condition)}.mp4"
-            return record(env, policy, args.seed, args.video / name)
+            name = slug(f"{player.folder.name}__{player.name(condition)}")
+            return record(env, policy, args.seed, args.video / f"{name}.mp4")
         return noisy.play(env, policy, 1 if args.render else args.episodes, args.seed)
 
 
@@ -463,6 +470,11 @@ def check_args(args):
         fail("--noise-rates without --noises: name a noise, or leave the rates out")
 
 
+def at_home(player):
+    """Return the environment of a run that needs no arguments, in which --env-id may find it."""
+    return "" if player.run.args.get("env_kwargs") else player.run.environment
+
+
 def players_of(args):
     """Return the players, {run folder: why it cannot play}, and the conditions; see main.
 
@@ -479,7 +491,7 @@ def players_of(args):
     if args.env_id is not None:
         env_id = noisy.canonical_env_id(args.env_id)
         players = [
-            player if env_id == player.run.environment else replace(player, elsewhere=env_id)
+            player if env_id == at_home(player) else replace(player, elsewhere=env_id)
             for player in players
         ]
     return players, bad, conditions
@@ -509,7 +521,7 @@ def main(args):
     tasks = [
         (player, condition)
         for player, condition in itertools.product(stored, conditions)
-        if len(stored[player].get((condition, player.elsewhere), [])) < args.episodes
+        if lacks(stored[player], player, condition, args)
     ]
     failed = {}
     for (player, condition), result in play_all(tasks, args):

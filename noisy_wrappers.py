@@ -2008,7 +2008,8 @@ def canonical_arguments(args: Mapping[str, Any]) -> dict[str, Any]:
     """Check a script's arguments, {name: value}; return those that have one way to be written.
 
     They are ``env_id``, with its version, ``env_kwargs``, sorted, and the noises and rates of
-    training and of tests; the rate of tests is 1 if none is given. The module of "module:Env-v0" is imported.
+    training and of tests; the rate of tests is 1 if none is given. The module of "module:Env-v0" is
+    imported.
 
     Raises:
         ValueError: a number out of its range, a bad ``exp_name``, ``runs_dir``, noise, rate or

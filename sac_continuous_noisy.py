@@ -459,14 +459,14 @@ class Run:
 
     # in the order in which --overwrite deletes them: without result.json a run is not finished
     FILES = ["result.json", "checkpoint.pt", "policy.pt", "policy_*.pt", "eval.csv", "config.json"]
-    FILES += ["robustness.csv", "events.out.tfevents.*"]
+    FILES += ["robustness.csv", "robustness.csv.gz", "events.out.tfevents.*"]
 
     def __init__(self, args, env):
         """Open the folder; exit if another process uses it, or if it holds a different run."""
         self.args, self.env = args, env
         self.folder = noisy.run_folder(asdict(args))
         if self.folder.is_symlink():  # --overwrite would delete what is elsewhere
-            fail(f"{self.folder} is a link: remove it, or choose another --exp-name or --runs-dir")
+            fail(f"{self.folder} is a link: remove it, or use another --exp-name or --runs-dir", 1)
         with fail_on(OSError, f"--runs-dir {args.runs_dir}"):
             self.folder.mkdir(parents=True, exist_ok=True)
             self.lock = (self.folder / ".lock").open("a")

@@ -64,7 +64,8 @@ def luck_of_studies(studies):
             n_baseline, *n_noisy = map(len, samples)
             tried = [n for n in n_noisy if n]
             best_draws = np.full(DRAWS, np.nan)
-            if len(tried) > 1 and n_baseline and df > 0 and std > 0 and environment not in all_equal:
+            known = n_baseline and df > 0 and std > 0
+            if len(tried) > 1 and known and environment not in all_equal:
                 draws = draw_differences(std, df, n_baseline, tried, rng, samples[0])
                 best_draws = draws.max(axis=0)
             lucks[*study.key, environment] = best_draws

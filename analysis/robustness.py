@@ -154,8 +154,8 @@ def condition_rows(runs):
 def score_rows(runs, metric=RETURN):
     """Yield the score of every configuration with noise: over all environments, then in each.
 
-    `primary` are those over all environments that have two seeds of both kinds, of which not all have
-    the same result, or in the only one.
+    `primary` are those over all environments that have two seeds of both kinds, of which not all
+    have the same result, or in the only one.
     Tests in another environment are apart: they leave those at home as they are.
     """
     for _, group in runs.groupby(STUDY):

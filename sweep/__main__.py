@@ -21,6 +21,7 @@ from statistics import harmonic_mean
 from typing import NamedTuple
 
 from analysis.errors import take_over_terminal
+from analysis.folders import SUCCESS
 from analysis.logs import STOPPED, Log, is_locked, read_log
 from analysis.words import counted, duration
 from sweep.environment import cost
@@ -221,7 +222,8 @@ def show_report(args, runs, choices):
         place = shlex.quote(from_caller(args, args.runs_dir))
         program = shlex.quote(from_caller(args, "analyze.py"))
         print(f"See the curves with: tensorboard --logdir {place}")
-        print(f"Make tables and figures with: python {program} --runs-dir {place}")
+        metric = " --metric success_rate" if choices and args.metric == SUCCESS else ""
+        print(f"Make tables and figures with: python {program} --runs-dir {place}{metric}")
     return int(any(p.state != "done" for p in progresses))
 
 
@@ -287,8 +289,9 @@ def are_seen(runs):
     waited = bool(late)
     while late and time.monotonic() < deadline:
         time.sleep(1)
-        for folder in {run.folder.parent for run in late}:
-            os.listdir(folder)  # makes the file system look again
+        for folder in {folder for run in late for folder in (run.folder.parent, run.folder)}:
+            with contextlib.suppress(OSError):
+                os.listdir(folder)  # makes the file system look again
         late = list(filter(is_late, late))
     return waited
 

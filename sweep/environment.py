@@ -11,6 +11,7 @@ import math
 import sys
 import time
 import warnings
+import zlib
 from pathlib import Path
 from statistics import fmean
 from typing import NamedTuple
@@ -220,4 +221,7 @@ def remembered(args, env_id):
 def file_of(args, env_id):
     """Return the file of an environment with its options, beside the logs of its runs."""
     name = "_".join([env_id, *itertools.chain(*options_of_environments(args))])
-    return Path(args.runs_dir, "logs", noisy.safe_name(name) + ".json")
+    name = noisy.safe_name(name)
+    if len(name) > 200:  # a file's name has at most 255 bytes
+        name = f"{name[:180]}_{zlib.crc32(name.encode()):08x}"
+    return Path(args.runs_dir, "logs", f"{name}.json")

@@ -20,8 +20,9 @@ refusal_of() {
   echo "${2%/*}/logs/.refused-$1-${name%%_s*}_${name#*_s*_}"
 }
 
-# SWEEP FOLDER COMMAND: one run, its output framed by two lines that begin with "#"; returns its
-# status. The output goes into the log if `logged` is set.
+# SWEEP FOLDER COMMAND [BEGUN]: one run, its output framed by two lines that begin with "#"; returns
+# its status. The output goes into the log if `logged` is set. BEGUN is "new" where the machine of
+# benchmark.sh has no such folder: a finished run in it on this one is of an earlier sweep.
 # TERM and INT reach all processes of a run, from whoever sends them. USR1 reaches this shell
 # only, and means: have the run write its checkpoint and end. It sets `asked`.
 # The log is locked while the run lives, even if only the run itself survives: whoever else wants
@@ -36,7 +37,13 @@ run_one() {
   exec 9>>"$(log_of "$1")" || return
   if ! flock --nonblock 9; then
     echo "$1 is running already: waiting for it (another sweep, or a process that an ended run left)" >&2
-    flock 9 || return
+    flock 9 & # in the background, so that a signal ends the waiting
+    local waiting=$!
+    trap 'asked=1; kill "$waiting" || true' USR1
+    wait "$waiting" || return 143
+    trap - USR1
+  elif [ "${3:-}" = new ] && [ -e "$1/result.json" ]; then
+    rm -rf -- "${1:?}"
   fi
   [ ! -e "$1/result.json" ] || return 0
   [ -z "${logged:-}" ] || exec >&9
@@ -91,12 +98,23 @@ run_parallel() { # --termseq: where a connection is lost, the runs get TERM and 
   trap '' HUP
   local chatter='^parallel: (SIGHUP|Waiting for|\./benchmark)|will not be transferred'
   local options=(--jobs "${jobs:-100%}" --joblog "+$logs/joblog.tsv" --termseq "TERM,600000")
-  [ -z "$remote_dir" ] || options+=(--transferfile '{1}' --return '{1}')
-  parallel "${parallel_options[@]}" "${options[@]}" --line-buffer --tagstring '{1}' --colsep '\t' \
-    ./benchmark.sh run-one "$sweep" '{1}' '{2}' :::: "$list" 2> >(grep -Ev "$chatter" >&2) |
+  # run-one fails where the connection does: then another machine gets the run
+  options+=(--retries 3 --line-buffer --tagstring '{1}' --colsep '\t' --trim n)
+  local begun='' folder
+  if [ -n "$remote_dir" ]; then
+    options+=(--transferfile '{1}' --return '{1}')
+    # shellcheck disable=SC2016  # of Perl, by GNU parallel
+    begun='{=1 $_ = -e $_ ? "begun" : "new" =}' # here, when the run starts
+  fi
+  parallel "${parallel_options[@]}" "${options[@]}" \
+    ./benchmark.sh run-one "$sweep" '{1}' '{2}' "$begun" :::: "$list" 2> >(grep -Ev "$chatter" >&2) |
     while IFS= read -r line; do
       printf '%s\n' "${line#*$'\t'}" 2>/dev/null >>"$(log_of "${line%%$'\t'*}")" || true
     done
+  [ -n "$remote_dir" ] || return 0
+  while IFS=$'\t' read -r folder _; do # what was finished elsewhere may have a checkpoint here
+    [ ! -e "$folder/result.json" ] || rm -f "$folder/checkpoint.pt"
+  done <"$list"
 }
 stop_parallel() { # HUP: parallel starts no more runs, and waits for those that USR1 stops
   local seconds

@@ -58,7 +58,8 @@ def differences_of(run, planned):
     wanted = {"args": dict(defaults), "defaults": defaults}
     for name, words in planned.args.items():
         made = run.args.get(name, defaults.get(name))
-        wanted["args"][name] = made if is_same(made, words) else words
+        is_path = "Path" in planned.script.options.get(name, "")
+        wanted["args"][name] = made if is_same(made, words, is_path) else words
     for name, (made, words) in different_arguments(run.config, wanted, NOT_COMPARED).items():
         if name != "eval_frequency" or words is not None:  # without one, a run keeps its own
             said = " ".join(map(str, words)) if isinstance(words, list) else words

@@ -129,11 +129,18 @@ def configurations(args, algorithm, env_id):
         fail('--noises needs --noise-rates, or a rate with each noise, as in "NOISE@0.1"')
     if args.noise_rates and not crossed:
         fail("--noise-rates needs --noises that have no rate of their own")
-    return [
+    found = [
         configuration_of(pairs, common)
         for pairs in entries
         for common in (rates if pairs in crossed else [None])
     ]
+    named = {}
+    for configuration in found:
+        other = named.setdefault(configuration.slug, configuration)
+        if other != configuration:
+            advice = "try one of them in a sweep with another --exp-name"
+            fail(f"{configuration} and {other} would have the same folders: {advice}")
+    return found
 
 
 def configuration_of(pairs, common=None):

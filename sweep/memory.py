@@ -1,6 +1,6 @@
 """What a folder of choices keeps in choice.json: the commands, and what was fixed beforehand.
 
-{"commands": [{"algos": [...], "envs": [...], "words": [...], "extra": [...]}, ...],
+{"commands": [{"algos": [...], "envs": [...], "words": [...], "extra_words": [...]}, ...],
  "plans": {"ENVIRONMENT__EXP_NAME by METRIC": {"looks": [...], "level": ...}}}
 """
 

@@ -142,18 +142,22 @@ def spelt(name):
     return f"--{name.replace('_', '-')}"
 
 
-def is_same(value, words):
+def is_same(value, words, is_path=False):
     """Tell whether a value of config.json is what an option's words say.
 
     words: text, a list of text, or True or False; what they mean only the script knows for certain.
+    is_path: the option is one or several, of which "a/" and "./a" are the same.
     """
     if isinstance(words, list):
         values = value if isinstance(value, list | tuple) else [value]
-        return len(values) == len(words) and all(map(is_same, values, words))
+        pairs = zip(values, words, strict=False)
+        return len(values) == len(words) and all(is_same(*pair, is_path) for pair in pairs)
     if value is None or isinstance(value, bool | dict):
         return str(value) == str(words)
     if isinstance(value, int | float):
         return value == number(words)
+    if is_path and value == str(Path(words)):
+        return True
     return value == words or str(value).endswith(f".{words}")  # as of an enumeration
 
 

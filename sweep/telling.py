@@ -185,6 +185,7 @@ def write_choice(path, new):
 
     new: rows of halving.records.
     """
+
     def key(row):
         return tuple(row[: len(KEYS)])
 

@@ -168,7 +168,7 @@ def fresh_seeds_of_td3(paper):
         return []
     effect = found["difference_percent"], found["holm"]
     change = found["difference_percent"], np.nan, np.nan
-    claim, n = "The same, fresh seeds", f"{folder}: 24 + 24"
+    claim, n = "The same three, fresh seeds", f"{folder}: 24 + 24"
     return [row(claim, "F", paper, change, [effect], n, claimed=-1)]
 
 

@@ -378,6 +378,18 @@ def test_videos(runs, tmp_path):
     assert f"return {rounded(float(row['episodic_return']))}, " in result.stdout
 
 
+def test_the_name_of_a_video_fits_a_file_system(runs, tmp_path, monkeypatch):
+    def record(env, policy, seed, path):
+        path.touch()
+        return [[0, 1, 0]]
+
+    monkeypatch.setattr(evaluate, "record", record)
+    run_dir = one(runs, "PPO")
+    noises = [f"RandomEarlyTermination({step})" for step in range(100, 109)]
+    main(Args((run_dir,), ("+".join(noises),), video=tmp_path))
+    assert len(list(tmp_path.glob("*.mp4"))) == 2
+
+
 OWN = """
 import os
 import sys
@@ -549,7 +561,10 @@ def test_bad_arguments(runs, capsys, options, message, monkeypatch):
 
 def test_runs_that_cannot_be_written_to_are_not_played(runs, capsys, monkeypatch):
     monkeypatch.setattr(evaluate.os, "access", lambda path, mode: False)
-    refused(Args((one(runs, "PPO"),)), "cannot be written to; with another --seed", runs, capsys)
+    run_dir = one(runs, "PPO")
+    refused(Args((run_dir,)), "cannot be written to; with another --seed", runs, capsys)
+    store_episodes(run_dir, CLEAN, np.zeros((3, 3)))
+    assert main(Args((run_dir,), episodes=3)) == 0  # of what is stored there is a table
 
 
 @pytest.mark.slow
@@ -614,6 +629,12 @@ def test_another_environment(runs, capsys):
     assert all(int(row["episodic_length"]) <= 7 for row in rows[4:])
     table = capsys.readouterr().out.splitlines()[-1]
     assert f"{home}, tested in Heavy-v0" in table
+    # the own one, too, has not the training's arguments then
+    edit_args(run_dir, env_kwargs=["reset_noise_scale:0.0"])
+    main(Args((run_dir,), env_id=home, episodes=1))
+    assert [row["environment"] for row in stored(run_dir)][8:] == [home]
+    edit_args(run_dir, env_kwargs=[])
+    capsys.readouterr()
     refused(Args((run_dir,), env_id="Pendulum-v1"), "its observation space is Box", runs, capsys)
     scaled = lambda **options: gym.wrappers.RescaleAction(gym.make(home, **options), -1, 1)  # noqa: E731
     gym.register("Scaled-v0", scaled)

@@ -49,7 +49,7 @@ def test_a_single_configuration_is_students_test():
 
 
 def test_seeds_that_do_not_vary_are_no_proof():
-    """One success in 23 configurations of five seeds with ten episodes is luck; so is one of two."""
+    """One success in 23 configurations of five seeds with ten episodes is luck."""
     rates = np.zeros((23, 5, 1))
     rates[7, 2] = 10.0
     rare = make_study(np.zeros((5, 1)), rates)

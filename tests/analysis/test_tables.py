@@ -219,7 +219,7 @@ def test_an_environment_whose_baseline_is_nearly_zero_is_in_every_table(tmp_path
     zero = row(sparse["statistics"], environment="Maze-v0", noise=ENDING)
     assert zero["verdict"] == "worse" and zero["difference"] == pytest.approx(-1.3)
     assert np.isnan(zero["iqm_change_percent"]) and zero["probability_of_improvement"] == 0
-    for seed, noisy in enumerate((95, 96, 97, 98, 99), start=1):  # together no percentage, alone two
+    for seed, noisy in enumerate((95, 96, 97, 98, 99), start=1):  # alone it has percentages
         config = {"noise": SCALE, "env": "Span-v0", "seed": seed}
         write_run(tmp_path / "runs", [10 + seed / 10], env="Span-v0", seed=seed)
         write_run(tmp_path / "runs", [noisy], rate=0.1, **config)

@@ -328,14 +328,15 @@ def test_a_folder_that_is_a_link_is_refused(tmp_path, capsys):
     (other / "eval.csv").write_text("mine")
     run_dir.symlink_to(other)
     for overwrite in (True, False):
-        line = refused(capsys, run, "PPO", tmp_path / "runs", overwrite=overwrite, **ALONE)
-        assert f"{run_dir} is a link: remove it, or choose" in line
+        more = {"overwrite": overwrite, **ALONE}
+        line = refused(capsys, run, "PPO", tmp_path / "runs", code=1, **more)  # other seeds may run
+        assert f"{run_dir} is a link: remove it, or use" in line
     assert [path.read_text() for path in other.iterdir()] == ["mine"]
 
 
 def test_overwrite_deletes_our_files_and_no_others(tmp_path, monkeypatch):
     mine = ["notes.json", "notes.tmp", "events.md", "robustness.csv.bak", "my_policy.pt"]
-    ours = ["robustness.csv", "policy_7.pt", "policy_7.pt.tmp"]
+    ours = ["robustness.csv", "robustness.csv.gz", "policy_7.pt", "policy_7.pt.tmp"]
     links = ["eval.csv", "eval.csv.tmp", "policy.pt", "policy_20.pt", "checkpoint.pt.tmp"]
     run_dir = run("PPO", tmp_path / "runs", keep_policies=True, **ALONE)
     target = tmp_path / "target"

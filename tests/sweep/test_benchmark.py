@@ -353,23 +353,44 @@ def test_machines_without_a_shared_folder(sshd, tmp_path):
     assert again.code == 0, again.out + again.err
     assert attempts(folder)[1][0].startswith("resumed at step "), "not resumed"
     assert json.loads((folder / "result.json").read_text())["total_timesteps"] == 1_200_000
+    assert not (folder / "checkpoint.pt").exists()  # of the first attempt
+    shutil.rmtree(folder)  # the copy over there is finished, and old
+    grid[-1] = "3000"
+    third = run(*grid, *machine, env=sshd, cwd=here)
+    assert third.code == 0, third.out + third.err
+    assert json.loads((folder / "result.json").read_text())["total_timesteps"] == 3_000
 
 
 @pytest.mark.slow
 def test_a_lost_connection(sshd, tmp_path):
+    """The run over there saves a checkpoint and ends, and goes on when the machine is back."""
     grid = ["baseline", *GRID[1:7], *FOREVER, "--runs-dir", tmp_path]
-    grid += ["--executor", "parallel", "--sshlogin", "second"]
-    (folder,) = folders(*grid[:-4])
-    sweep = start(*grid, env=sshd)
+    (folder,) = folders(*grid)
+    sweep = start(*grid, "--executor", "parallel", "--sshlogin", "second", env=sshd)
     wait_for(lambda: is_training(folder), what="the first evaluation")
     subprocess.run(["pkill", "-KILL", "-f", f"^{sshd['PARALLEL_SSH']} second"], check=True)
+    wait_for(lambda: "resumed at step" in log_of(folder).read_text(), what="the second attempt")
+    sweep.send_signal(signal.SIGINT)
     out, _ = sweep.communicate(timeout=PATIENCE)
-    assert sweep.returncode == 1
-    assert re.search(rf"(lost|still running) +{log_of(folder)} +step=", out)
-    wait_for(lambda: not processes(tmp_path), what="the run over there")
-    # the sweep may have reported while the run over there was still stopping
-    assert re.search(rf"lost +{log_of(folder)} +step=", view("report", *grid[:-4]).out)
+    assert sweep.returncode == 130 and not processes(tmp_path), out
     assert (folder / "checkpoint.pt").exists()
+
+
+@pytest.mark.slow
+def test_a_machine_that_goes_away_leaves_its_runs_to_the_others(tmp_path, stub):
+    """It refuses each run in a moment, while the others are busy."""
+    need("parallel")
+    ssh = tmp_path / "ssh"  # ssh HOST -- COMMAND
+    ssh.write_text(f'#!/bin/sh\n[ ! -e {tmp_path}/dead ] || exit 255\nshift 2\nexec sh -c "$*"\n')
+    ssh.chmod(0o755)
+    grid = ["baseline", *GRID[1:5], "--seeds", "1-6", "--total-timesteps", "200000"]
+    grid += ["--runs-dir", tmp_path / "runs", "--jobs", "1"]
+    machines = ["--executor", "parallel", "--sshlogin", "second,:"]
+    sweep = start(*grid, *machines, env=stub | {"PARALLEL_SSH": str(ssh)})
+    wait_for(lambda: len(processes("stub_run.py", tmp_path)) > 1, what="both machines")
+    (tmp_path / "dead").touch()
+    out, err = sweep.communicate(timeout=PATIENCE)
+    assert sweep.returncode == 0 and "6 runs: 6 done" in out, out + err
 
 
 @pytest.mark.slow
@@ -614,6 +635,19 @@ def test_a_killed_sweep_stops_its_runs(engine, tmp_path):
     wait_for(lambda: not processes(tmp_path), what="the run's end")
     wait_for(lambda: attempts(runs[0])[0][-1].endswith("exit=143"), what="the log's end")
     assert check_stopped(runs) == 1
+
+
+@pytest.mark.slow
+def test_a_sweep_that_waits_for_another_can_be_stopped(tmp_path, stub):
+    need("parallel")
+    grid = ["baseline", *GRID[1:7], *FOREVER, "--runs-dir", tmp_path]
+    first = start(*grid, env=stub)
+    wait_for(lambda: processes("stub_run.py", tmp_path), what="the run")
+    second = start(*grid, "--executor", "parallel", env=stub)
+    waiting = ["pgrep", "-fx", "flock 9"]
+    wait_for(lambda: not subprocess.run(waiting).returncode, what="a sweep that waits")
+    second.send_signal(signal.SIGINT)
+    assert second.wait(timeout=PATIENCE) == 130 and first.poll() is None
 
 
 @pytest.mark.slow

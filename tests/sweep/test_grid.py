@@ -27,6 +27,8 @@ from sweep.grid import MOST_BASELINES
 ALGORITHMS = {"sac": 5, "td3": 5, "ppo": 10}  # seeds
 SCALE = "RandomUniformScaleReward(0.5, 1.5)"
 A = "RandomNormalNoisyReward(1)"
+KEYS = "RandomDropoutObservation(0.5,keys=('a','b'))"
+JOINED = "RandomDropoutObservation(0.5,keys=('a-b',))"
 BOX = (
     "╭─ Parsing error ─╮\n│ Argument --a: bad │\n│ ───── │\n│ For help, see │\n╰─────╯\n"  # of tyro
 )
@@ -315,6 +317,7 @@ def test_an_algorithm_is_a_script_of_the_project_or_of_the_callers_folder(elsewh
         ("--label text-1 --hidden 32 32", {"label": "text-1", "hidden": [32, 32]}),
         ("--entropy -1e-3 --shift=-2", {"entropy": -0.001, "shift": -2.0}),
         ("--data /a/b.txt --width 1_000", {"data": "/a/b.txt", "width": 1_000}),
+        ("--data /a//b/", {"data": "/a/b"}),
         ("--width None --kind b", {"width": None, "kind": "b"}),
         ("--layer_norm --no-layer_norm", {"layer_norm": False}),
     ],
@@ -403,6 +406,7 @@ def test_baselines_that_pay(noises, more, baselines):
         (f"custom --noises {A}", "--noises needs --noise-rates, or a rate with each"),
         ("custom --noise-rates 1", "--noise-rates needs --noises that have no rate of their own"),
         (f"custom --noises {A}@1+{A}", "give each of these noises a rate with @, or none"),
+        (f"custom --noises {KEYS} {JOINED} --noise-rates 1", "would have the same folders: try"),
         ("paper --budget 5", "--budget is an option of choose"),
         (f"{C} --seeds 1-3", "leave out --seeds"),
         (f"{C} --noises paper --budget 89", "--budget must be at least 90, a run for each"),
