@@ -39,6 +39,7 @@ import noisy_wrappers as noisy
 
 TEST_SEED = 1_000_000  # seed of the first test episode, in every test of every run
 STEP_LIMIT = 10_000  # time limit of episodes, if neither the environment nor the user sets one
+STOPPING = signal.SIGTERM, signal.SIGINT, signal.SIGHUP  # a checkpoint, then the end
 EVAL_FREQUENCY = 50_000  # default of --eval-frequency, or a tenth of the run if that is less
 
 
@@ -389,9 +390,11 @@ def updater(loss, network, optimizer, args):
     module = nn.ModuleList([network])
     module.forward = functools.partial(loss, network)
     parameters = dict(module.named_parameters())
+    layers = [layer for _, layer in module.named_modules(remove_duplicate=False)]
+    is_shared = len(set(layers)) < len(layers)  # a layer at two places must be swapped once
+    call = functools.partial(functional_call, module, tie_weights=not is_shared)
 
     def clipped_gradient(learned, inputs):
-        call = functools.partial(functional_call, module)
         gradient, (_, curves) = grad_and_value(call, has_aux=True)(learned, inputs)
         norm = torch.stack([value.norm() for value in gradient.values()]).norm()
         scale = (args.max_grad_norm / (norm + 1e-6)).clamp(max=1.0)  # as clip_grad_norm_()
@@ -406,8 +409,11 @@ def updater(loss, network, optimizer, args):
         inputs = [torch.tensor(float(x)) if type(x) in numbers else x for x in inputs]
         gradient, curves = gradient_of(learned, tuple(inputs))
         for name, parameter in parameters.items():
-            # the fused Adam of PyTorch 2.13 silently misreads gradients that are not contiguous
-            parameter.grad = gradient[name].contiguous() if name in learned else None
+            value = gradient.get(name)  # None: frozen
+            # the fused Adam of PyTorch 2.13 silently misreads gradients of another memory layout
+            if value is not None and value.stride() != parameter.stride():
+                value = torch.empty_like(parameter).copy_(value)
+            parameter.grad = value
         optimizer.step()
         return curves
 
@@ -471,9 +477,12 @@ def say(text):
 def compiled(function):
     """Compile a function as one graph; where that fails, say why and go on without."""
     graph = torch.compile(function, fullgraph=True, dynamic=False, isolate_recompiles=True)
+    is_new = True
 
     def call(*inputs):
-        nonlocal graph
+        nonlocal graph, is_new
+        if is_new:  # Ctrl-C reaches the compiler, too, which must not end by it
+            signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
         try:
             return graph(*inputs)
         except torch._dynamo.exc.FailOnRecompileLimitHit:
@@ -484,6 +493,10 @@ def compiled(function):
             say(f"not compiled, so it is slower: {reason} (the compiler's cache is {cache})")
             graph = function
             return function(*inputs)
+        finally:
+            if is_new:
+                is_new = False
+                signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)
 
     return call
 
@@ -667,7 +680,7 @@ class Run:
             "noise_applied": {name: [w.times_applied, w.opportunities] for name, w in noises},
         }
         self._write("result.json", json.dumps(self.result, indent=2) + "\n")
-        self._delete("checkpoint.pt")
+        self._delete("checkpoint.pt", "checkpoint.pt.tmp")
         say(f"{self.folder} is finished after {step} steps: {self.last_test}")
 
     def _delete(self, *patterns):
@@ -712,7 +725,7 @@ def stop_at_signals():
             with contextlib.suppress(OSError):  # print() is not safe in here
                 os.write(1, b"stopping after this episode; Ctrl-C again: at once, without saving\n")
 
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+    for number in STOPPING:
         if signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP
             signal.signal(number, remember)
     return lambda: received[0] if received else 0

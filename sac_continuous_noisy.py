@@ -39,6 +39,7 @@ import noisy_wrappers as noisy
 
 TEST_SEED = 1_000_000  # seed of the first test episode, in every test of every run
 STEP_LIMIT = 10_000  # time limit of episodes, if neither the environment nor the user sets one
+STOPPING = signal.SIGTERM, signal.SIGINT, signal.SIGHUP  # a checkpoint, then the end
 EVAL_FREQUENCY = 10_000  # default of --eval-frequency, or a tenth of the run if that is less
 LOG_STD_MIN, LOG_STD_MAX = -5, 2
 
@@ -276,6 +277,7 @@ def learn(args, env, test_env, stop):
         noisy.set_progress(env, start / args.total_timesteps)  # for rates that change
         observation, _ = env.reset()
 
+    curves = {}  # the latest value of each
     for global_step in range(start + 1, args.total_timesteps + 1):
         # ACT
         if global_step <= args.learning_starts:
@@ -297,7 +299,7 @@ def learn(args, env, test_env, stop):
             batch = [tensor.to(device) for tensor in buffer.sample(args.batch_size, rng)]
             observations, actions = batch[:2]
             eps = torch.randn(actions.shape).to(device)
-            curves = update_critic(target, actor, temperature, batch, eps, args.gamma)
+            curves |= update_critic(target, actor, temperature, batch, eps, args.gamma)
 
             # LEARN: actor and temperature, N updates every N steps
             if global_step % args.policy_frequency == 0:
@@ -357,7 +359,10 @@ def updater(loss, network, optimizer, args):
     module = nn.ModuleList([network])
     module.forward = functools.partial(loss, network)
     parameters = dict(module.named_parameters())
-    gradient_of = grad_and_value(functools.partial(functional_call, module), has_aux=True)
+    layers = [layer for _, layer in module.named_modules(remove_duplicate=False)]
+    is_shared = len(set(layers)) < len(layers)  # a layer at two places must be swapped once
+    call = functools.partial(functional_call, module, tie_weights=not is_shared)
+    gradient_of = grad_and_value(call, has_aux=True)
     gradient_of = compiled(gradient_of) if args.compile else gradient_of
     device = next(network.parameters()).device
     precision = torch.autocast(device.type, torch.bfloat16, enabled=args.matmul_precision == "bf16")
@@ -370,8 +375,11 @@ def updater(loss, network, optimizer, args):
         with precision:
             gradient, (_, curves) = gradient_of(learned, tuple(inputs))
         for name, parameter in parameters.items():
-            # the fused Adam of PyTorch 2.13 silently misreads gradients that are not contiguous
-            parameter.grad = gradient[name].contiguous() if name in learned else None
+            value = gradient.get(name)  # None: frozen
+            # the fused Adam of PyTorch 2.13 silently misreads gradients of another memory layout
+            if value is not None and value.stride() != parameter.stride():
+                value = torch.empty_like(parameter).copy_(value)
+            parameter.grad = value
         # Intel's processors are slow with 1e-45, the momentum of dead units: flush it here
         torch.set_flush_denormal(True)
         optimizer.step()
@@ -411,9 +419,12 @@ def say(text):
 def compiled(function):
     """Compile a function as one graph; where that fails, say why and go on without."""
     graph = torch.compile(function, fullgraph=True, dynamic=False, isolate_recompiles=True)
+    is_new = True
 
     def call(*inputs):
-        nonlocal graph
+        nonlocal graph, is_new
+        if is_new:  # Ctrl-C reaches the compiler, too, which must not end by it
+            signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
         try:
             return graph(*inputs)
         except torch._dynamo.exc.FailOnRecompileLimitHit:
@@ -424,6 +435,10 @@ def compiled(function):
             say(f"not compiled, so it is slower: {reason} (the compiler's cache is {cache})")
             graph = function
             return function(*inputs)
+        finally:
+            if is_new:
+                is_new = False
+                signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)
 
     return call
 
@@ -607,7 +622,7 @@ class Run:
             "noise_applied": {name: [w.times_applied, w.opportunities] for name, w in noises},
         }
         self._write("result.json", json.dumps(self.result, indent=2) + "\n")
-        self._delete("checkpoint.pt")
+        self._delete("checkpoint.pt", "checkpoint.pt.tmp")
         say(f"{self.folder} is finished after {step} steps: {self.last_test}")
 
     def _delete(self, *patterns):
@@ -652,7 +667,7 @@ def stop_at_signals():
             with contextlib.suppress(OSError):  # print() is not safe in here
                 os.write(1, b"stopping after this episode; Ctrl-C again: at once, without saving\n")
 
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+    for number in STOPPING:
         if signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP
             signal.signal(number, remember)
     return lambda: received[0] if received else 0

@@ -216,7 +216,8 @@ def watch_updates(updater, seen):
             check(kept, f"{own.name}() learns a layer that was replaced: change it in place")
             if not hasattr(own, "first"):
                 with noisy.kept_generators(), Broadcasts(own.name):
-                    _, curves = loss(network, *inputs)
+                    # copies, because a layer may change in forward(), as spectral_norm() does
+                    _, curves = loss(*copy.deepcopy((network, *inputs)))
                 for name, value in curves.items():
                     one = torch.as_tensor(value).numel() == 1
                     check(one, f"the curve {name!r} of {own.name}() is no number: take its mean()")
@@ -304,7 +305,7 @@ def check_transitions(name, inputs, places):
             at_limit.append(any(place.at_limit for place in later))
     columns = [x.flatten().tolist() for x in numbers]
     few = [column for column in columns if len(set(column)) <= size // 2]  # flags or discounts
-    if len(few) == 1 and any(at_limit):
+    if len(few) == 1 and any(at_limit) and not all(at_limit):
         values = [few[0][row] for row in rows]
         is_flag = set(values) <= {0, 1} and values == at_limit
         is_discount = [value == 0 for value in values] == at_limit
@@ -476,7 +477,8 @@ def is_saved(network, seen):
     state, saved = network.state_dict(), seen.script.read_state(seen.folder / "policy.pt")
     parts = [part for part in saved.values() if isinstance(part, dict)]
     alike = [part for part in parts if part.keys() == state.keys()]
-    return any(all(map(torch.equal, part.values(), state.values())) for part in alike)
+    state = [value.cpu() for value in state.values()]  # as read_state() has them
+    return any(all(map(torch.equal, part.values(), state)) for part in alike)
 
 
 def gaps_in_losses(seen, policy):
@@ -506,4 +508,4 @@ def actions_in_loss(update, seen):
 
     with torch.no_grad(), torch.nn.modules.module.register_module_forward_pre_hook(note):
         update.loss(update.network, *update.inputs)
-    return (raw[0].numpy(), asked[0].numpy()) if raw and asked else ()
+    return (raw[0].numpy(force=True), asked[0].numpy(force=True)) if raw and asked else ()

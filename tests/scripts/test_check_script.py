@@ -71,7 +71,7 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
     ],
     ("trains", "td3", "makes (16, 16) of (16, 1) and (16,)"): [(".squeeze(1) for", " for")],
     ("trains", "td3", "critic_loss() learns a layer that was replaced"): [
-        before("            curves = update_critic(", "critic.networks[0][4] = nn.Linear(256, 1)")
+        before("            curves |= update_critic(", "critic.networks[0][4] = nn.Linear(256, 1)")
     ],
     ("trains", "sac", "the curve 'alpha' of actor_loss() is no number"): [
         ('"alpha": alpha}', '"alpha": log_prob}')
@@ -100,7 +100,7 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
     ("follows", "sac", "scale of 'target'"): [  # a buffer
         (INPUTS, f"{INPUTS} / self.scale"),
         before("        self.networks = nn.", 'self.register_buffer("scale", torch.ones(1))'),
-        before("            curves = update_critic(", "critic.scale += 0.01"),
+        before("            curves |= update_critic(", "critic.scale += 0.01"),
     ],
     ("follows", "td3", "'target_actor' is 'actor' itself"): [
         before("    q_optimizer = torch", "target_actor, target_critic = actor, critic")
@@ -238,7 +238,7 @@ def test_a_part_that_two_optimizers_hold_is_told(tmp_path):
 def test_what_is_right_is_told_by_no_word(tmp_path):
     """A layer that is frozen at first, and a number that a loss knows to be a tensor."""
     frozen = "actor.network[0].requires_grad_(global_step > 60)"
-    right = [before("            curves = update_critic(", frozen)]
+    right = [before("            curves |= update_critic(", frozen)]
     right.append((" * gamma * next", " * gamma.square().sqrt() * next"))
     assert check_script.trains(broken(tmp_path, "td3", *right)) == ""
 

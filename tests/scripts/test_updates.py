@@ -5,6 +5,7 @@ order; they share nothing else, so equal final weights mean equal algorithms.
 """
 
 import copy
+import signal
 from dataclasses import replace
 from types import SimpleNamespace
 from unittest import mock
@@ -454,6 +455,12 @@ def random_batch(size):
     return [*batch, (torch.arange(size) % 3 == 0).float()]
 
 
+def test_every_curve_is_logged_whatever_the_policy_frequency(tmp_path):
+    args = sac.Args(**OFF_POLICY | {"total_timesteps": 55, "policy_frequency": 3})
+    sac.train(replace(args, runs_dir=str(tmp_path)))  # the last update of the actor is at step 54
+    assert [step for step, _ in curves(next(tmp_path.iterdir()))["losses/actor_loss"]] == [55]
+
+
 def assert_curves(curves, **expected):
     found = {name: curves[name] for name in expected}
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
@@ -664,18 +671,59 @@ def test_only_bf16_computes_products_in_bfloat16():
 
 @two_scripts
 def test_a_gradient_of_any_strides_is_applied_as_it_is(algorithm):
-    """The fused Adam of PyTorch 2.13 reads a gradient's memory as if it were contiguous."""
+    """The fused Adam of PyTorch 2.13 reads a gradient's memory as if it were the parameter's."""
     signs = torch.tensor([[1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
-    script, network = SCRIPTS[algorithm], nn.Linear(3, 2, bias=False)
-    before = network.weight.detach().clone()
-    optimizer = torch.optim.Adam(network.parameters(), lr=0.5, fused=True)
 
     def loss(network):
         return (network.weight.T * signs).sum(), {}
 
-    script.updater(loss, network, optimizer, script.Args(compile=False))()
-    # Adam's first step is the learning rate, against the sign of the gradient
-    torch.testing.assert_close(network.weight.detach(), before - 0.5 * signs.T)
+    for by_columns in (False, True):  # as the weights of torch.linalg.qr() are
+        script, network = SCRIPTS[algorithm], nn.Linear(3, 2, bias=False)
+        if by_columns:
+            network.weight.data = torch.randn(3, 2).T
+        before = network.weight.detach().clone()
+        optimizer = torch.optim.Adam(network.parameters(), lr=0.5, fused=True)
+        script.updater(loss, network, optimizer, script.Args(compile=False))()
+        # Adam's first step is the learning rate, against the sign of the gradient
+        torch.testing.assert_close(network.weight.detach(), before - 0.5 * signs.T)
+
+
+@two_scripts
+def test_a_layer_that_stands_at_two_places_is_learned_as_one(algorithm):
+    """As the trunk of an actor and a critic. Its parameters stay the ones that were there."""
+    script, trunk = SCRIPTS[algorithm], nn.Linear(3, 4)
+    heads = [nn.Sequential(trunk, nn.Linear(4, 1)) for _ in range(2)]
+    network, x = nn.ModuleList(heads), torch.randn(5, 3)
+    plain = copy.deepcopy(network)
+
+    def loss(network, x):
+        return network[0](x).square().mean() + network[1](x).square().mean(), {}
+
+    args = script.Args(compile=False)
+    args.max_grad_norm = 1e9
+    update = script.updater(loss, network, torch.optim.SGD(network.parameters(), 0.1), args)
+    optimizer = torch.optim.SGD(plain.parameters(), 0.1)
+    for _ in range(3):
+        update(x)
+        optimizer.zero_grad()
+        loss(plain, x)[0].backward()
+        optimizer.step()
+    torch.testing.assert_close(network.state_dict(), plain.state_dict())
+    assert all(isinstance(p, nn.Parameter) for p in (heads[0][0].weight, heads[1][0].weight))
+
+
+def test_signals_that_end_the_compiler_wait_until_it_is_done(monkeypatch):
+    """Ctrl-C reaches all processes of a terminal: without it, an update would not be compiled."""
+    masks = []
+
+    def function():
+        masks.append(signal.pthread_sigmask(signal.SIG_BLOCK, []))
+
+    monkeypatch.setattr(torch, "compile", lambda function, **kwargs: function)
+    update = sac.compiled(function)
+    update()
+    update()
+    assert masks == [set(sac.STOPPING), set()]
 
 
 # PARTS
