@@ -73,7 +73,7 @@ class Args:
     cuda: bool = False  # train on a GPU (not tested on one yet); these networks are small
     torch_threads: int = 1  # CPU threads; runs in parallel gain more than extra threads
     compile: bool = True  # compile the updates, if there is a C++ compiler
-    # medium: other kernels, used only where they are as exact
+    # medium: other kernels, where they round no more than highest
     matmul_precision: Literal["highest", "medium"] = "highest"
 
     # ALGORITHM
@@ -627,7 +627,9 @@ class Run:
         speed = (step - self.first_step) / (now - self.begun)
         tags = {"charts/SPS": speed}
         for group, values in groups.items():
-            tags |= {f"{group}/{name}": float(value) for name, value in values.items()}
+            for name, value in values.items():
+                with fail_on(Exception, f"{group}/{name} is no number", 1):
+                    tags[f"{group}/{name}"] = float(value)
         if not all(map(math.isfinite, tags.values())):
             raise noisy.NotFiniteError(f"step {step}: training diverged: {tags}")
         for tag, value in tags.items():

@@ -74,7 +74,7 @@ class Args:
     cuda: bool = False  # train on a GPU (not tested on one yet); these networks are small
     torch_threads: int = 1  # CPU threads; runs in parallel gain more than extra threads
     compile: bool = True  # compile the updates, if there is a C++ compiler
-    # medium: other kernels, used only where they are as exact; bf16: fast where it exists, rounds
+    # medium: faster kernels, where they round no more than highest; bf16: much faster, but rounds
     matmul_precision: Literal["highest", "medium", "bf16"] = "medium"
 
     # ALGORITHM
@@ -139,7 +139,7 @@ class Actor(nn.Module):
     def sample(self, observations, eps):
         """Return actions (B, A) and their log-probabilities (B,)."""
         actions, squashed, log_std = self(observations, eps)
-        # the density of the normal, where (x - mean) / std is eps, then of tanh and the scaling
+        # log-density of the normal at mean + std * eps, then the change by tanh and the scaling
         log_prob = -0.5 * eps.square() - log_std - 0.5 * math.log(2 * math.pi)
         log_prob = log_prob - torch.log(self.action_scale * (1 - squashed.square()) + 1e-6)
         return actions, log_prob.sum(1)
@@ -569,7 +569,9 @@ class Run:
         speed = (step - self.first_step) / (now - self.begun)
         tags = {"charts/SPS": speed}
         for group, values in groups.items():
-            tags |= {f"{group}/{name}": float(value) for name, value in values.items()}
+            for name, value in values.items():
+                with fail_on(Exception, f"{group}/{name} is no number", 1):
+                    tags[f"{group}/{name}"] = float(value)
         if not all(map(math.isfinite, tags.values())):
             raise noisy.NotFiniteError(f"step {step}: training diverged: {tags}")
         for tag, value in tags.items():

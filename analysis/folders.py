@@ -104,10 +104,10 @@ class Run:
     @property
     def tested(self):
         """Where it was tested, if that is not the clean environment as its id makes it."""
-        told = [f"under {self.tested_under}"] if self.tested_under != BASELINE else []
-        if kwargs := self.args.get("env_kwargs"):
-            told.append(f"with {', '.join(sorted(kwargs))}")
-        return " ".join(["tested", *told]) if told else ""
+        kwargs = self.args.get("env_kwargs")  # of the training, too
+        told = [f"with {', '.join(sorted(kwargs))}"] if kwargs else []
+        told += [f"tested under {self.tested_under}"] if self.tested_under != BASELINE else []
+        return "; ".join(told)
 
 
 # --------------------------------------------------------------------------- which folders are runs

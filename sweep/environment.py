@@ -13,7 +13,7 @@ import time
 import warnings
 import zlib
 from pathlib import Path
-from statistics import fmean
+from statistics import fmean, median
 from typing import NamedTuple
 
 import gymnasium as gym
@@ -71,8 +71,9 @@ def ask(env_id, configurations=(), max_episode_steps=None, env_kwargs=()):
 def time_steps(env):
     """Return seconds a step, an episode's length and how many different rewards there were.
 
-    Each step bears its share of a reset: an episode is as long as those that ended while it was
-    timed, or as the time limit if none did. Different rewards are counted up to MANY.
+    Medians, because other programs may interrupt some steps. Each step bears its share of a reset:
+    an episode is as long as those that ended while it was timed, or as the time limit if none did.
+    Different rewards are counted up to MANY.
     """
     env.action_space.seed(1)
     env.reset(seed=1)
@@ -95,7 +96,7 @@ def time_steps(env):
         if ended := terminated or truncated:
             episodes, last_end = episodes + 1, len(steps)
     length = last_end / episodes if episodes else env.spec.max_episode_steps
-    return fmean(steps) + fmean(resets) / length, math.ceil(length), len(rewards)
+    return median(steps) + median(resets) / length, math.ceil(length), len(rewards)
 
 
 def why_unfit(env, configuration):

@@ -185,6 +185,16 @@ def train(path, options, runs_dir, episodes=0, updates=0, **changed):
     return seen
 
 
+def what_resuming_changes(trial, name):
+    """Return "" or which file differs, and from which step on."""
+    resumed, run = (trial.read(one, name) for one in (trial.resumed, trial.run))
+    lines = zip(resumed.splitlines(), run.splitlines(), strict=False)
+    other = [line for line, wanted in lines if line != wanted]
+    is_table = name.endswith(".csv") and other
+    at = f" from step {other[0].decode().partition(',')[0]} on" if is_table else ""
+    return "" if resumed == run else f"another {name}{at}"
+
+
 def other_values(args):
     """Return other values of numbers and flags that make another run."""
     values = {name: x for name, x in asdict(args).items() if isinstance(x, int | float)}
@@ -217,10 +227,7 @@ def watch_updates(updater, seen):
             if not hasattr(own, "first"):
                 with noisy.kept_generators(), Broadcasts(own.name):
                     # copies, because a layer may change in forward(), as spectral_norm() does
-                    _, curves = loss(*copy.deepcopy((network, *inputs)))
-                for name, value in curves.items():
-                    one = torch.as_tensor(value).numel() == 1
-                    check(one, f"the curve {name!r} of {own.name}() is no number: take its mean()")
+                    loss(*copy.deepcopy((network, *inputs)))
             if seen.start == 0:
                 check_transitions(own.name, inputs, seen.places)
             curves, own.inputs = update(*inputs), inputs
@@ -317,8 +324,11 @@ def remarks(seen):
     """Yield what may be meant so."""
     for name in seen.idle:
         yield f" (with these options nothing learns by {name}())"
-    for update in seen.updates:
-        for name in unused_inputs(update):
+    tried = [(update, *one) for update in seen.updates for one in try_inputs(update)]
+    used = {id(part) for _, _, part, is_used in tried if is_used}
+    for update, name, part, is_used in tried:
+        by_another = "[" in name and id(part) in used  # one minibatch for several losses
+        if not is_used and not by_another:
             yield f" ({update.name}() does not depend on {name})"
     for name in unused_options(seen):
         yield f" (nothing reads --{name.replace('_', '-')})"
@@ -328,12 +338,11 @@ def remarks(seen):
             yield f" (the optimizers of {one.name}() and {other.name}() share {both} tensors)"
 
 
-def unused_inputs(update):
-    """Return the inputs that a loss does not depend on, such as "target" or "batch[4]".
+def try_inputs(update):
+    """Yield an input's name, such as "target" or "batch[4]", itself, and whether a loss uses it.
 
     Those are networks, tensors and numbers, but not whole numbers, which may be sizes.
     """
-    unused = []
     expected = outcome_of(update, update.inputs)
     names = list(inspect.signature(update.loss).parameters)[1:]
     for i, (name, given) in enumerate(zip(names, update.inputs, strict=False)):
@@ -344,16 +353,16 @@ def unused_inputs(update):
                 continue
             inputs = list(update.inputs)
             inputs[i] = [*given[:j], other, *given[j + 1 :]] if is_list else other
-            if outcome_of(update, inputs) == expected:
-                unused.append(f"{name}[{j}]" if is_list else name)
-    return unused
+            is_used = outcome_of(update, inputs) != expected
+            yield f"{name}[{j}]" if is_list else name, part, is_used
 
 
 def outcome_of(update, inputs):
     """Return a loss and its curves as numbers."""
     with noisy.kept_generators():  # a loss may draw, though it should not
         loss, curves = update.loss(update.network, *inputs)
-    return [float(torch.as_tensor(value).detach()) for value in (loss, *curves.values())]
+    values = map(torch.as_tensor, (loss, *curves.values()))
+    return [float(value.detach().double().sum()) for value in values]
 
 
 def changed(given):

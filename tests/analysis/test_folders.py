@@ -18,7 +18,7 @@ def test_a_run_of_an_algorithm_of_ones_own(tmp_path):
     run = read_run(folder, "search")
     assert (run.algorithm, run.script, run.release) == ("REDQ", "my_redq.py", "0.4")
     assert run.args["sizes"] == [[64, 64], [8]] and run.phase == "search"
-    assert run.tested == "tested under RandomActionDelay(1) at 0.5 with goal:3"
+    assert run.tested == "with goal:3; tested under RandomActionDelay(1) at 0.5"
 
 
 @pytest.mark.parametrize(

@@ -149,7 +149,7 @@ def test_the_order_of_the_environments_arguments_does_not_matter(tmp_path):
     for seed, kwargs in enumerate((["a:1", "b:2"], ["b:2", "a:1"], ["a:1", "b:2"]), start=1):
         write_run(tmp_path, [10], seed=seed, env_kwargs=kwargs)
     runs = finished(read_runs(tmp_path))
-    assert len(runs) == 3 and {one.tested for one in runs} == {"tested with a:1, b:2"}
+    assert len(runs) == 3 and {one.tested for one in runs} == {"with a:1, b:2"}
 
 
 def test_the_most_frequent_arguments_of_an_exp_name_are_its_study(tmp_path, capsys):

@@ -12,6 +12,8 @@ import torch._inductor.config
 import watched_run
 from check_script import BrokenError, Trial
 
+import ppo_continuous_noisy as ppo
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -73,9 +75,7 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
     ("trains", "td3", "critic_loss() learns a layer that was replaced"): [
         before("            curves |= update_critic(", "critic.networks[0][4] = nn.Linear(256, 1)")
     ],
-    ("trains", "sac", "the curve 'alpha' of actor_loss() is no number"): [
-        ('"alpha": alpha}', '"alpha": log_prob}')
-    ],
+    ("trains", "sac", "losses/alpha is no number"): [('"alpha": alpha}', '"alpha": log_prob}')],
     ("trains", "sac", "takes a time limit for an end"): [
         (
             "reward, next_observation, terminated, truncated)\n        observation =",
@@ -110,7 +110,9 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
         ("target(next_observations, next_actions)", "target[0](next_observations, next_actions)"),
         ("target_param.lerp_(param, args.tau)", "pass"),
     ],
-    ("resumes", "td3", MISSING): [('state |= {"target_actor": target_actor, ', "state |= {")],
+    ("resumes", "td3", "another eval.csv from step "): [
+        ('state |= {"target_actor": target_actor, ', "state |= {")
+    ],
     ("resumes", "sac", MISSING): [  # which changes after the first stop
         before("    target_entropy = -", "scale = 1.0"),
         before("        # STEP\n", "scale = 2.0 if global_step == 90 else scale"),
@@ -240,6 +242,9 @@ def test_what_is_right_is_told_by_no_word(tmp_path):
     frozen = "actor.network[0].requires_grad_(global_step > 60)"
     right = [before("            curves |= update_critic(", frozen)]
     right.append((" * gamma * next", " * gamma.square().sqrt() * next"))
+    # errors of each sample, as for priorities, that are no curve
+    right.append(("return loss, values | losses", 'return loss, values | {"errors": q1 - y}'))
+    right.append(before("            # LEARN: actor", 'curves.pop("errors")'))
     assert check_script.trains(broken(tmp_path, "td3", *right)) == ""
 
 
@@ -272,6 +277,21 @@ def test_what_is_given_and_not_used_is_told(remark, tmp_path):
     assert told == f" ({remark})"
 
 
+def test_an_item_of_a_minibatch_that_another_loss_uses_is_no_remark():
+    batch, network = [torch.ones(3), torch.ones(3)], torch.nn.Linear(1, 1)
+
+    def update(name, loss):
+        more = {"loss": loss, "network": network, "inputs": [batch], "optimizer": None}
+        return SimpleNamespace(name=name, stepped=set(), **more)
+
+    updates = [update("a", lambda network, batch: (batch[0].sum(), {}))]
+    args = ppo.Args()
+    seen = SimpleNamespace(idle=[], updates=updates, script=ppo, args=args)
+    assert "a() does not depend on batch[1]" in "".join(watched_run.remarks(seen))
+    updates.append(update("b", lambda network, batch: (batch[1].sum(), {})))
+    assert "does not depend" not in "".join(watched_run.remarks(seen))
+
+
 def test_a_gradient_in_one_update_will_do():
     """Another loss may leave a shared part of the network without one."""
     shared = torch.ones(1)
@@ -302,6 +322,7 @@ DISCOUNTS = [0.9 * (1 - x) for x in AT_LIMIT]
     [
         (BEFORE, AFTER, [REWARDS, [0.0] * 5], ""),
         (BEFORE, [0.3, 0.3, *AFTER[2:]], [REWARDS, [0.0] * 5], ""),  # some steps later
+        (BEFORE, [0.3, 0.3, 1.4, 1.4, 1.4], [REWARDS, [0.0] * 5], ""),  # whole episodes
         ([9.0, *BEFORE[1:]], [-9.0, *AFTER[1:]], [REWARDS, [0.0] * 5], ""),  # of a model
         (BEFORE, AFTER, [REWARDS, [0.0] * 5, AT_LIMIT], ""),  # terminated, and truncated
         (BEFORE, AFTER, [REWARDS, [0.9] * 5, AT_LIMIT], ""),  # a discount, and truncated
