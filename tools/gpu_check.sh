@@ -171,6 +171,7 @@ import contextlib, os, sys
 from types import SimpleNamespace
 
 import bench
+import torch
 
 algorithms, environments = sys.argv[1].split(), sys.argv[2:]
 jobs, cuda = [int(number) for number in os.environ["JOBS"].split()], ["--cuda"]
@@ -178,12 +179,15 @@ cores = sorted(os.sched_getaffinity(0), reverse=True)
 device = "GPU"
 if os.environ["DEVICE"] == "cpu":
     device, cuda, bench.LEARNING_STARTS = "CPU in place of a GPU", [], 100
+processor = torch.cpu.get_capabilities()
+names = ("avx512_bf16", "amx_bf16", "bf16", "sve_bf16")
+has_bf16 = device == "GPU" or any(processor.get(name) for name in names)  # as the scripts ask
 options = SimpleNamespace(seconds=float(os.environ["SECONDS_OF_BLOCK"]), clock="wall")
 runs = [f"{number} at a time" if number > 1 else "1 run" for number in jobs]
 print(f"| | {' | '.join(runs)} |\n|---|{'---|' * len(jobs)}", flush=True)
 for algorithm in algorithms:
     # on a GPU "medium" is computed as "highest", which is the default there
-    precisions = [] if algorithm == "ppo" else ["bf16"]
+    precisions = ["bf16"] if has_bf16 and algorithm != "ppo" else []
     precisions += ["highest", "medium"] if device != "GPU" else []
     cases = {}  # the flags and the largest number of runs
     for environment in environments:

@@ -36,7 +36,7 @@ def test_a_rehearsal_passes(tmp_path):
     _, _, resumed = runs
     assert resumed.endswith("eval.csv as without a stop |")
     assert "resumed at step 192" in (tmp_path / "sac-Pendulum-v1-resumed.log").read_text()
-    assert len(speeds) == 6
+    assert len(speeds) in (5, 6)  # without bfloat16, and with
     for row in speeds:
         speed = row.split("|")[2]
         assert float(speed.replace(",", "")) > 0
