@@ -98,8 +98,8 @@ cd "$(dirname -- "$(readlink -f -- "${BASH_SOURCE[0]}")")" # it may be called th
 case ${1:-} in # how the executors call this script: run-one SWEEP FOLDER COMMAND
   run-one) # on a machine whose connection may break: the run must outlive its reader
     trap : TERM INT USR1
-    # a run that fails says so in its log: to GNU parallel, only a lost connection is a failure
-    run_one "$2" "$3" "$4" "${5:-}" | pass_on || true
+    # A run that fails says so in its log: to GNU parallel, only a machine can fail
+    run_one "$2" "$3" "$4" "${5:-}" | pass_on || [ $? -ne 99 ]
     exit ;;
   slurm-task) slurm_task "$2" "$3" ;;
   "" | -h | --help) usage || true; exit ;;

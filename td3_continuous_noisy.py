@@ -328,7 +328,7 @@ def updater(loss, network, optimizer, args):
     module = nn.ModuleList([network])
     module.forward = functools.partial(loss, network)
     parameters = dict(module.named_parameters())
-    layers = [layer for _, layer in module.named_modules(remove_duplicate=False)]
+    layers = [x for _, x in module.named_modules(remove_duplicate=False) if x._parameters]
     is_shared = len(set(layers)) < len(layers)  # a layer at two places must be swapped once
     call = functools.partial(functional_call, module, tie_weights=not is_shared)
     gradient_of = grad_and_value(call, has_aux=True)
@@ -539,8 +539,9 @@ class Run:
         tags = {"charts/SPS": speed}
         for group, values in groups.items():
             for name, value in values.items():
-                with fail_on(Exception, f"{group}/{name} is no number", 1):
-                    tags[f"{group}/{name}"] = float(value)
+                if torch.is_tensor(value) and value.numel() != 1:
+                    fail(f"{group}/{name} is no number: take its mean()", 1)
+                tags[f"{group}/{name}"] = float(value)
         if not all(map(math.isfinite, tags.values())):
             raise noisy.NotFiniteError(f"step {step}: training diverged: {tags}")
         for tag, value in tags.items():

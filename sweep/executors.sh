@@ -22,7 +22,7 @@ refusal_of() {
 
 # SWEEP FOLDER COMMAND [BEGUN]: one run, its output framed by two lines that begin with "#"; returns
 # its status. The output goes into the log if `logged` is set. BEGUN is "new" where the machine of
-# benchmark.sh has no such folder: a finished run in it on this one is of an earlier sweep.
+# benchmark.sh has no such folder: a finished run in it on this one may be old.
 # TERM and INT reach all processes of a run, from whoever sends them. USR1 reaches this shell
 # only, and means: have the run write its checkpoint and end. It sets `asked`.
 # The log is locked while the run lives, even if only the run itself survives: whoever else wants
@@ -34,7 +34,7 @@ run_one() {
   asked=
   [ ! -e "$refusal" ] || return 2
   mkdir -p "${1%/*}/logs" # on a machine that does not share the folder, too
-  exec 9>>"$(log_of "$1")" || return
+  exec 9>>"$(log_of "$1")" || return 99 # this machine cannot write: another one may
   if ! flock --nonblock 9; then
     echo "$1 is running already: waiting for it (another sweep, or a process that an ended run left)" >&2
     flock 9 & # in the background, so that a signal ends the waiting
@@ -43,12 +43,12 @@ run_one() {
     wait "$waiting" || return 143
     trap - USR1
   elif [ "${3:-}" = new ] && [ -e "$1/result.json" ]; then
-    rm -rf -- "${1:?}"
+    mv -- "$1" "${1%/*}/.${1##*/}.old-$(date +%s)" # hidden, and not deleted: it may have been lost
   fi
   [ ! -e "$1/result.json" ] || return 0
   [ -z "${logged:-}" ] || exec >&9
   export OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 PYTHONUNBUFFERED=1
-  echo "# $(date '+%F %T') $HOSTNAME: $2" || return # the disk is full, as bash says
+  echo "# $(date '+%F %T') $HOSTNAME: $2" || return 99 # the disk is full, as bash says
   bash -c "exec $2" 2>&1 &
   local child=$! status=0
   trap : TERM INT
@@ -99,7 +99,8 @@ run_parallel() { # --termseq: where a connection is lost, the runs get TERM and 
   local chatter='^parallel: (SIGHUP|Waiting for|\./benchmark)|will not be transferred'
   local options=(--jobs "${jobs:-100%}" --joblog "+$logs/joblog.tsv" --termseq "TERM,600000")
   # run-one fails where the connection does: then another machine gets the run
-  options+=(--retries 3 --line-buffer --tagstring '{1}' --colsep '\t' --trim n)
+  local commas=${sshlogin//[^,]/}
+  options+=(--retries "$((${#commas} + 3))" --line-buffer --tagstring '{1}' --colsep '\t' --trim n)
   local begun='' folder
   if [ -n "$remote_dir" ]; then
     options+=(--transferfile '{1}' --return '{1}')
@@ -110,7 +111,7 @@ run_parallel() { # --termseq: where a connection is lost, the runs get TERM and 
     ./benchmark.sh run-one "$sweep" '{1}' '{2}' "$begun" :::: "$list" 2> >(grep -Ev "$chatter" >&2) |
     while IFS= read -r line; do
       printf '%s\n' "${line#*$'\t'}" 2>/dev/null >>"$(log_of "${line%%$'\t'*}")" || true
-    done
+    done || true # runs that were given up
   [ -n "$remote_dir" ] || return 0
   while IFS=$'\t' read -r folder _; do # what was finished elsewhere may have a checkpoint here
     [ ! -e "$folder/result.json" ] || rm -f "$folder/checkpoint.pt"

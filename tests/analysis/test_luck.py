@@ -59,6 +59,8 @@ def test_seeds_that_do_not_vary_are_no_proof():
         assert analysis.luck.p_of_luck(luck_of_study(study)["Env0-v0"], gain) > 0.05
         study.episodes = None  # of returns without any spread nothing is known
     assert np.isnan(luck_of_study(few)["Env0-v0"]).all()
+    rounded = make_study(np.full((3, 1), 0.1), np.array([3 * [[0.2]], 3 * [[0.1]]]))
+    assert np.isnan(luck_of_study(rounded)["Env0-v0"]).all()
 
 
 def test_noise_that_ends_training_says_nothing_of_luck():

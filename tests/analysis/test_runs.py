@@ -112,9 +112,11 @@ def test_a_choice_that_stops_early_in_one_environment_is_complete(tmp_path, caps
             noise = {"noise": SCALE, "rate": 0.1}
             write_run(tmp_path / "runs/confirmation", [seed + 9], env=env, seed=seed, **noise)
     write_run(tmp_path / "runs/search", [1], seed=1, finished=False, noise=SCALE, rate=0.1)
+    (tmp_path / "runs/search/begun").mkdir()
+    (tmp_path / "runs/search/begun/.lock").touch()  # no config.json yet
     run(tmp_path)
     assert "not complete" not in capsys.readouterr().out
-    assert left_out(read_runs(tmp_path / "runs"))["status"].tolist() == ["unfinished"]
+    assert left_out(read_runs(tmp_path / "runs"))["status"].tolist() == 2 * ["unfinished"]
 
 
 def test_a_run_with_other_arguments_is_not_missing_besides(tmp_path):

@@ -712,6 +712,23 @@ def test_a_layer_that_stands_at_two_places_is_learned_as_one(algorithm):
     assert all(isinstance(p, nn.Parameter) for p in (heads[0][0].weight, heads[1][0].weight))
 
 
+@two_scripts
+def test_a_weight_of_two_layers_is_learned_from_both(algorithm):
+    """Also beside an activation that stands at two places."""
+    script, act = SCRIPTS[algorithm], nn.Tanh()
+    network = nn.Sequential(nn.Linear(3, 3), act, nn.Linear(3, 3), act)
+    network[2].weight = network[0].weight
+    plain, x = copy.deepcopy(network), torch.randn(5, 3)
+    args = script.Args(compile=False)
+    args.max_grad_norm = 1e9
+    optimizer = torch.optim.SGD(network.parameters(), 0.1)
+    script.updater(lambda network, x: (network(x).square().sum(), {}), network, optimizer, args)(x)
+    optimizer = torch.optim.SGD(plain.parameters(), 0.1)
+    plain(x).square().sum().backward()
+    optimizer.step()
+    torch.testing.assert_close(network.state_dict(), plain.state_dict())
+
+
 def test_signals_that_end_the_compiler_wait_until_it_is_done(monkeypatch):
     """Ctrl-C reaches all processes of a terminal: without it, an update would not be compiled."""
     masks = []
