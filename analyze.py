@@ -252,8 +252,7 @@ def incomplete_note(left, compared):
     left: the runs left out. Those of a choice, which looks as it has planned, do not matter.
     """
     top_folder = left["run"].map(lambda run: run.partition("/")[0])  # some runs tell no phase
-    of_a_choice = left["phase"].isin(PHASES) | top_folder.isin(PHASES)
-    due = left[left["status"].isin(MORE_TO_COME) & ~of_a_choice]
+    due = left[left["status"].isin(MORE_TO_COME) & ~top_folder.isin(PHASES)]
     if len(due) and not compared.noises.empty:
         number = due["status"].value_counts(sort=False)
         counts = ", ".join(f"{n:,} {status}" for status, n in number.items())

@@ -48,10 +48,11 @@ from analysis import folders
 from analysis.episodes import read_episodes, store_episodes
 from analysis.errors import fail, in_words, take_over_terminal, with_place
 from analysis.folders import NOT_SETTINGS, DamageError
-from analysis.formatting import DASH, rounded, slug
+from analysis.formatting import DASH, rounded
 from analysis.matrices import matrices
 from analysis.runs import study_name, study_of, usual_config, where_tested
 from analysis.statistics import mean_std
+from analysis.words import slug
 
 PROJECT = Path(__file__).resolve().parent
 STORED = "what was played is stored, but nothing with another --seed"
@@ -114,6 +115,11 @@ class Player:
         """The folder of all runs beside it, in both phases of a choice."""
         folder = self.folder.resolve().parent
         return folder.parent if folders.is_phase(folder) else folder
+
+    def moved_to(self, env_id):
+        """Return the player in an environment without the training's --env-kwargs."""
+        is_home = env_id == self.run.environment and not self.run.args.get("env_kwargs")
+        return self if is_home else replace(self, elsewhere=env_id)
 
     def name(self, condition):
         """Name a condition for people and files."""
@@ -470,11 +476,6 @@ def check_args(args):
         fail("--noise-rates without --noises: name a noise, or leave the rates out")
 
 
-def at_home(player):
-    """Return the environment of a run that needs no arguments, in which --env-id may find it."""
-    return "" if player.run.args.get("env_kwargs") else player.run.environment
-
-
 def players_of(args):
     """Return the players, {run folder: why it cannot play}, and the conditions; see main.
 
@@ -490,10 +491,7 @@ def players_of(args):
         sys.path.append(str(here))
     if args.env_id is not None:
         env_id = noisy.canonical_env_id(args.env_id)
-        players = [
-            player if env_id == at_home(player) else replace(player, elsewhere=env_id)
-            for player in players
-        ]
+        players = [player.moved_to(env_id) for player in players]
     return players, bad, conditions
 
 

@@ -13,11 +13,12 @@ from scipy import special
 
 from analysis import effects, style
 from analysis.folders import RETURN, SUCCESS
-from analysis.formatting import seeds_between, seeds_of, slug
+from analysis.formatting import seeds_between, seeds_of
 from analysis.heatmap import heatmaps
 from analysis.power import CONFIDENCE, LEVEL
 from analysis.runs import KEYS, rows_of
 from analysis.statistics import SEEDS_FOR_INTERVAL, least_variance
+from analysis.words import slug
 from noisy_wrappers import BASELINE, rate_order
 
 COLUMN_END = "_column"  # of the name of a figure that is as wide as a column

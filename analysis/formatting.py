@@ -2,7 +2,6 @@
 
 import math
 import re
-import zlib
 from dataclasses import dataclass
 from itertools import product
 
@@ -131,12 +130,6 @@ class Table:
     only_csv: tuple = ()  # columns that would make the table wider than a page
     view: pd.DataFrame | None = None  # what people read, if that is not the frame
     rates_beside: bool = False  # a column for each noise rate, with mean, std and n in its cells
-
-
-def slug(text):
-    """Turn a label or a noise into a part of a file name; a long one is cut and keeps a hash."""
-    name = re.sub(r"[^A-Za-z0-9._=+-]+", "_", text).strip("_")
-    return name if len(name) <= 150 else f"{name[:140]}_{zlib.crc32(name.encode()):08x}"
 
 
 # Columns that are shown as one, which begins with the number: its spread is the standard deviation

@@ -8,7 +8,7 @@ returns. Keeping the baseline fixed would not do: a baseline that was unlucky is
 import numpy as np
 
 from analysis.runs import STUDY
-from analysis.statistics import contrast, exact, least_variance, pooled_std
+from analysis.statistics import contrast, pooled_std
 
 DRAWS = 10_000
 SEEDS_TO_RESAMPLE = 20  # with fewer seeds of the baseline, returns are taken as normal
@@ -54,13 +54,7 @@ def luck_of_studies(studies):
             samples = [study.sample(config, e) for config in study.finals]
             best = max(filter(len, samples[1:]), key=np.mean, default=None)
             kept = [s for s in samples if s is best or not clearly_worse(s, samples[0])]
-            std, df = pooled_std(kept)
-            std = exact(std, *kept) if df > 0 else 0.0
-            if study.episodes:  # seeds that all succeed are no proof that all would
-                everything = np.concatenate(kept)
-                n = len(everything)
-                least = n * least_variance(everything.mean(), n * study.episodes)
-                std = max(std, np.sqrt(least))
+            std, df = pooled_std(kept, study.episodes)
             n_baseline, *n_noisy = map(len, samples)
             tried = [n for n in n_noisy if n]
             best_draws = np.full(DRAWS, np.nan)

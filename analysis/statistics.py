@@ -41,7 +41,7 @@ def exact(value, *samples):
 def are_different(values):
     """Tell whether values, without those that are not finite, differ by more than rounding."""
     values = values[np.isfinite(values)]
-    return len(values) > 1 and np.ptp(values) > 1e-12 * abs(values).max()
+    return len(values) > 1 and exact(np.ptp(values), values) > 0
 
 
 def mean_std(values):
@@ -52,11 +52,21 @@ def mean_std(values):
     return mean, exact(values.std(ddof=1), values) if len(values) > 1 else nan, len(values)
 
 
-def pooled_std(samples):
-    """Return the standard deviation within samples (n_i), and its degrees of freedom."""
-    df = sum(len(sample) - 1 for sample in samples if len(sample))
-    squares = sum(((sample - np.mean(sample)) ** 2).sum() for sample in samples if len(sample))
-    return np.sqrt(squares / max(1, df)), df
+def pooled_std(samples, episodes=None):
+    """Return the standard deviation within samples (n_i), and its degrees of freedom.
+
+    episodes: where the values are rates of success in percent, of so many episodes each: it is at
+    least that of chance, see variance_of_mean.
+    """
+    samples = [sample for sample in samples if len(sample)]
+    df = sum(len(sample) - 1 for sample in samples)
+    squares = sum(((sample - np.mean(sample)) ** 2).sum() for sample in samples)
+    std = exact(sqrt(squares / max(1, df)), *samples)
+    if episodes:
+        values = np.concatenate(samples)
+        least = least_variance(values.mean(), episodes * len(values))  # of the mean of all
+        std = max(std, sqrt(len(values) * least))
+    return std, df
 
 
 # ------------------------------------------------------------------------------------- percentages

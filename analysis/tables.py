@@ -8,11 +8,12 @@ import pandas as pd
 from analysis import statistics, verdicts
 from analysis.comparisons import IQM, IQM_CHANGE, PROBABILITY, compare_all, results
 from analysis.folders import SEARCH, SUCCESS
-from analysis.formatting import Table, listed, seeds_of, slug
+from analysis.formatting import Table, listed, seeds_of
 from analysis.luck import add_luck, luck_of_studies
 from analysis.power import CONFIDENCE
 from analysis.runs import KEYS, STUDY, rows_of, study_name
 from analysis.verdicts import ALL_EQUAL
+from analysis.words import slug
 from noisy_wrappers import BASELINE
 
 CONSISTENT_PERCENT = 80  # of the environments, as in the paper
@@ -124,18 +125,20 @@ def lopsided_notes(compared):
     noises = compared.noises[compared.noises["p"].notna() & (compared.noises["lopsided"] == 1)]
     rates = compared.rates[compared.rates["smallest_p"].isna()]
     together = compared.rates_together[compared.rates_together["smallest_p"].isna()]
-    notes = []
-    for rows in (noises, rates):
-        for key, group in rows.groupby(STUDY, sort=False):
-            said = "a verdict may be wrong more often than in 5 %"
-            if rows is rates:
-                also = " and over several environments" if rows_of(together, key).any() else ""
-                said = f"single rates have no verdict there{also}, which would be wrong too often"
-            seeds = sorted({seeds_of(*pair) for pair in group[["n", "n_baseline"]].to_numpy()})
-            notes.append(
-                f"{study_name(*key)}, {', '.join(group['environment'].unique())}: with "
-                f"{listed(seeds)} runs with and without noise {said}"
-            )
+
+    def note(key, rows, said):
+        seeds = sorted({seeds_of(*pair) for pair in rows[["n", "n_baseline"]].to_numpy()})
+        where = f"{study_name(*key)}, {', '.join(rows['environment'].unique())}"
+        return f"{where}: with {listed(seeds)} runs with and without noise {said}"
+
+    notes = [
+        note(key, rows, "a verdict may be wrong more often than in 5 %")
+        for key, rows in noises.groupby(STUDY, sort=False)
+    ]
+    for key, rows in rates.groupby(STUDY, sort=False):
+        also = " and over several environments" if rows_of(together, key).any() else ""
+        said = f"single rates have no verdict there{also}, which would be wrong too often"
+        notes.append(note(key, rows, said))
     return notes
 
 

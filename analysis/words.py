@@ -1,4 +1,7 @@
-"""Counts and durations in sentences, for what must not wait for pandas."""
+"""Counts, durations and names of files, for what must not wait for pandas."""
+
+import re
+import zlib
 
 
 def counted(number, word):
@@ -18,3 +21,9 @@ def duration(seconds):
         return f"{seconds / 60:.0f} min"
     hours = round(seconds / 3600, 1)
     return f"{hours:,.0f} h" if hours >= 100 else f"{hours:.1f} h"
+
+
+def slug(text):
+    """Turn a label or a noise into a part of a file name; a long one is cut and keeps a hash."""
+    name = re.sub(r"[^A-Za-z0-9._=+-]+", "_", text).strip("_")
+    return name if len(name) <= 150 else f"{name[:140]}_{zlib.crc32(name.encode()):08x}"

@@ -11,7 +11,6 @@ import math
 import sys
 import time
 import warnings
-import zlib
 from pathlib import Path
 from statistics import fmean, median
 from typing import NamedTuple
@@ -21,7 +20,7 @@ import gymnasium as gym
 import noisy_wrappers as noisy
 from analysis.errors import fail, with_place
 from analysis.folders import read_json
-from analysis.words import duration
+from analysis.words import duration, slug
 from sweep.scripts import number
 
 # Seconds of learning for each step, without the environment's own, and what each number of an
@@ -222,7 +221,4 @@ def remembered(args, env_id):
 def file_of(args, env_id):
     """Return the file of an environment with its options, beside the logs of its runs."""
     name = "_".join([env_id, *itertools.chain(*options_of_environments(args))])
-    name = noisy.safe_name(name)
-    if len(name) > 200:  # a file's name has at most 255 bytes
-        name = f"{name[:180]}_{zlib.crc32(name.encode()):08x}"
-    return Path(args.runs_dir, "logs", f"{name}.json")
+    return Path(args.runs_dir, "logs", f"{slug(noisy.safe_name(name))}.json")

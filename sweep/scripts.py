@@ -150,8 +150,9 @@ def is_same(value, words, is_path=False):
     """
     if isinstance(words, list):
         values = value if isinstance(value, list | tuple) else [value]
-        pairs = zip(values, words, strict=False)
-        return len(values) == len(words) and all(is_same(*pair, is_path) for pair in pairs)
+        if len(values) != len(words):
+            return False
+        return all(is_same(*pair, is_path) for pair in zip(values, words, strict=True))
     if value is None or isinstance(value, bool | dict):
         return str(value) == str(words)
     if isinstance(value, int | float):

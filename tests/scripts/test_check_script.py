@@ -75,7 +75,9 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
     ("trains", "td3", "critic_loss() learns a layer that was replaced"): [
         before("            curves |= update_critic(", "critic.networks[0][4] = nn.Linear(256, 1)")
     ],
-    ("trains", "sac", "losses/alpha is no number"): [('"alpha": alpha}', '"alpha": log_prob}')],
+    ("trains", "sac", "losses/alpha is no number: take its mean()"): [
+        ('"alpha": alpha}', '"alpha": log_prob}')
+    ],
     ("trains", "sac", "takes a time limit for an end"): [
         (
             "reward, next_observation, terminated, truncated)\n        observation =",
