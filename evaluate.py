@@ -221,12 +221,26 @@ def load(player, render_mode=None):
             check_spaces(player, noisy.Spaces(run.config), env)
         elif player.elsewhere:
             raise ValueError("a run of 0.3 does not tell its spaces: it is tested at home alone")
+        use_kernels_of(run)
         try:
             policy = script.load_policy(player.folder, env if run.release == "0.3" else None)
         except Exception as error:  # a damaged file may raise anything
             text = f"policy.pt is not a policy for {player.environment}: {in_words(error)}"
             raise ValueError(text) from None
         yield env, policy
+
+
+def use_kernels_of(run):
+    """Multiply matrices as the run did, so that its actions are the same to the last digit.
+
+    But not where "medium" would round here to bfloat16: see train() in the scripts.
+    """
+    import torch  # here, because it takes a second, and bad input should not wait for it
+
+    processor = torch.cpu.get_capabilities()
+    would_round = processor.get("amx_tile") or processor.get("bf16")
+    is_medium = run.config.get("matmul_precision") == "medium" and not would_round
+    torch.set_float32_matmul_precision("medium" if is_medium else "highest")
 
 
 def check_spaces(player, trained_in, env):

@@ -19,6 +19,7 @@ import gymnasium as gym
 import imageio.v3 as imageio
 import numpy as np
 import pytest
+import torch
 
 import evaluate
 import ppo_continuous_noisy as ppo
@@ -99,12 +100,15 @@ def run(*options, cwd=None, **environment):
 def test_clean_returns_are_those_of_the_last_evaluation(runs, algorithm):
     run_dir = one(runs, algorithm)
     [finished], _ = evaluate.find_players([run_dir])
+    torch.set_float32_matmul_precision("highest")  # as in a new process
     played = evaluate.play(finished, BASELINE, Args((run_dir,), episodes=10, seed=1_000_000))
     with open(run_dir / "eval.csv", newline="") as file:
         last = list(csv.DictReader(file))[-10:]
     rows = [(float(row["episodic_return"]), int(row["episodic_length"])) for row in last]
     assert [(value, length) for value, length, _ in played] == rows
     assert len(set(rows)) > 1
+    precision = finished.run.config["matmul_precision"]  # returns of longer episodes depend on it
+    assert torch.get_float32_matmul_precision() == precision
 
 
 def test_noisy_returns_are_those_of_a_loop_of_ones_own(runs):
