@@ -43,7 +43,7 @@ def test_a_missing_run_is_not_a_score():
     assert statistics.compare(padded, Y) == pytest.approx(statistics.compare(X, Y), nan_ok=True)
 
 
-@pytest.mark.parametrize(("shift", "envs"), [(0, 1), (1.5, 1), (2.5, 1), (0, 5), (1.5, 5)])
+@pytest.mark.parametrize(("shift", "envs"), [(0, 1), (2.5, 1), (1.5, 5)])
 def test_coverage_of_the_probability_of_improvement(shift, envs):
     rng = np.random.default_rng(1)
     truth, inside, trials = stats.norm.cdf(shift / np.sqrt(2)), 0, 400
@@ -76,28 +76,22 @@ MIXTURES = {  # the second is as narrow as the peaks of PPO on HalfCheetah
 }
 
 
-def covered(n, intervals, distributions=DISTRIBUTIONS, trials=500):
+def covered(n, distributions, trials=500):
     """Percent of samples of n seeds whose interval holds the true IQM: the worst distribution."""
     worst = 100.0
     for seed, draw in enumerate(distributions.values()):
         rng = np.random.default_rng(seed)
         truth = iqm(draw(rng, 400_000))
-        low, high = intervals(draw(rng, (trials, n)))
+        samples = draw(rng, (trials, n))
+        low, high = np.array([bootstrap_iqm(sample[:, None])[1:] for sample in samples]).T
         worst = min(worst, 100 * np.mean((low <= truth) & (truth <= high)))
     return worst
 
 
-def ours(samples):
-    return np.array([bootstrap_iqm(sample[:, None])[1:] for sample in samples]).T
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(("n", "usual", "mixtures"), [(3, 94, 75), (5, 96, 85), (10, 95, 89)])
-def test_coverage_of_the_iqm_is_what_the_page_says(n, usual, mixtures):
-    assert int(covered(n, ours)) == usual
-    assert int(covered(n, ours, MIXTURES)) == mixtures
-    page = " ".join(DOCS.read_text().split())
-    assert f"| {n} | {usual} % | {mixtures} % |" in page
+def test_coverage_of_the_iqm_is_what_the_page_says():
+    usual, mixtures = int(covered(5, DISTRIBUTIONS)), int(covered(5, MIXTURES))
+    assert f"| 5 | {usual} % | {mixtures} % |" in DOCS.read_text()
 
 
 def test_satterthwaites_interval_of_three_seeds_is_welchs():

@@ -11,10 +11,9 @@ from sweeps import run, small_sweep
 from analysis.formatting import DASH, Table, shown
 from analysis.latex import latex_table
 
-PAPERS = {  # by the inches of their text: ICML, NeurIPS, ACM
+PAPERS = {  # by the inches of their text: ICML, NeurIPS
     6.75: r"\documentclass[twocolumn]{article}\setlength{\textwidth}{6.75in}%s\begin{document}",
     5.5: r"\documentclass{article}\setlength{\textwidth}{5.5in}%s\begin{document}",
-    7.0: r"\documentclass[sigconf,nonacm]{acmart}%s\begin{document}\title{T}\maketitle",
 }
 
 
@@ -91,8 +90,6 @@ def test_tables_and_figures_fit_into_a_paper(inches, tmp_path):
     (out / "paper.tex").write_text(document + r"Text.\clearpage\end{document}")
     command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "paper.tex"]
     done = subprocess.run(command, cwd=out, capture_output=True, text=True)
-    if "not found" in done.stdout:
-        pytest.skip("a package of LaTeX is not installed")
     assert done.returncode == 0, done.stdout[-2000:]
     wide = re.findall(r"Overfull \\hbox \(([0-9.]+)pt", done.stdout)
     assert all(float(points) < 2 for points in wide), wide

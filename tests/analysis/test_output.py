@@ -59,6 +59,7 @@ def test_files_are_utf_8_whatever_the_locale(tmp_path):
     assert b"na?ve |<b>$x$ ?" in done.stdout
     texts = {path.suffix: path.read_text("utf-8") for path in tmp_path.rglob("*.[cmth][sdet]*")}
     assert texts.keys() == {".csv", ".md", ".tex", ".html"}
+    assert "<b>$x" not in texts[".html"] and "&lt;b&gt;$x" in texts[".html"]
     assert "naïve" in (tmp_path / "runs/results/summary_SAC.csv").read_text("utf-8")
     table = (tmp_path / "runs/results/summary_SAC.md").read_text("utf-8")
     assert r"naïve \|&lt;b>$x$ ±" in table

@@ -112,13 +112,6 @@ def test_a_section_that_is_empty_or_says_nothing_new_is_left_out(tmp_path):
     assert "statistics" in sections()
 
 
-def test_names_are_text_and_never_html(tmp_path):
-    write_pairs(tmp_path / "runs", range(5), range(5), exp_name="<b>x")
-    run(tmp_path)
-    page = (tmp_path / "results/report.html").read_text("utf-8")
-    assert "<b>x" not in page and "&lt;b&gt;x" in page
-
-
 def test_options_reach_what_they_are_of(tmp_path, capsys):
     """And what is not complete, or made by several versions, is said."""
     write_pairs(tmp_path / "runs", range(100, 106), range(100, 105))

@@ -122,10 +122,6 @@ def test_lopsided_numbers_of_seeds_have_no_verdict(tmp_path, capsys):
     assert scores[["p", "p_holm"]].isna().all(axis=None) and scores["difference_low"].notna().all()
     said = "no verdict with 5/9 seeds, which would be wrong too often, over 1 of 1 test condition"
     assert capsys.readouterr().out.count(said) == 2
-    write_tests(tmp_path / "one", {("", 0.0): returns}, "Hopper-v5", range(1, 10))
-    write_tests(tmp_path / "one", {(SENSOR, 0.2): noisy}, "Hopper-v5", [1])
-    run(tmp_path, "one")
-    assert "too few seeds for a test of robustness over 1 of 1" in capsys.readouterr().out
 
 
 def test_environments_without_any_difference_are_not_averaged(tmp_path, capsys):
@@ -237,21 +233,12 @@ def test_damaged_and_unfinished_runs(tmp_path, capsys):
 
 
 def test_policies_that_nothing_is_compared_with_are_told(tmp_path):
-    """Where no baseline was tested, and where the training's own noise is the only test."""
     write_tests(tmp_path, HOPPER, "Hopper-v5")
-    write_tests(tmp_path, {config: HOPPER[config] for config in (("", 0.0), (PUSH, 1.0))}, "A-v0")
-    for path in tmp_path.glob("A-v0*/robustness.csv"):
-        lines = path.read_text().splitlines(keepends=True)
-        path.write_text("".join(line for line in lines if SENSOR not in line))
-    _, sentences = tables_of(tmp_path)
-    assert "PPO on A-v0: 1 training configuration not" in sentences[-1] and len(sentences) == 3
-    write_tests(tmp_path, HOPPER, "B-v0")
-    write_tests(tmp_path, HOPPER, "C-v0")
-    for path in tmp_path.glob("Hopper*baseline*/robustness.csv"):
+    write_tests(tmp_path, HOPPER, "A-v0")
+    for path in tmp_path.glob("A-v0*baseline*/robustness.csv"):
         path.unlink()
-    _, [together, *_, untested] = tables_of(tmp_path)
-    assert together.startswith("PPO on 2 of 4 environments together")
-    assert "on A-v0 and Hopper-v5: 3 training configurations not" in untested
+    _, sentences = tables_of(tmp_path)
+    assert "PPO on A-v0: 2 training configurations not compared" in sentences[-1]
 
 
 def tables_of(runs_dir):

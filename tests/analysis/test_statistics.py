@@ -109,12 +109,6 @@ def test_random_divisions_where_there_are_too_many(monkeypatch):
     assert far[1:] == (2e-5, 2e-5)  # the actual one and its opposite, never zero
 
 
-def test_infinite_ts_of_two_environments_cancel():
-    x, y = stacked([1, 1, 1], [0, 0, 0]), stacked([0, 0, 0], [1, 1, 1])
-    found = statistics.compare(x, y)
-    assert found.t == pytest.approx(0) and found.p == 1 and np.isnan(found.effect_size)
-
-
 # ------------------------------------------------------------------------------------- comparisons
 
 
@@ -330,18 +324,8 @@ def test_holm_by_hand():
 # -------------------------------------------------------------------- simulations of the comparison
 
 
-def lognormal(rng, shape):
-    returns = rng.lognormal(0, 0.5, shape)
-    mean = np.exp(0.125)
-    return (returns - mean) / (mean * np.sqrt(np.exp(0.25) - 1))
-
-
-RETURNS = {  # all with mean 0 and standard deviation 1
-    "normal": simulate_choose.normal,
-    "lognormal": lognormal,
-    "high peak": simulate_choose.high_peak,
-    "low peak": simulate_choose.failing,
-}
+# Both with mean 0 and standard deviation 1
+RETURNS = {"normal": simulate_choose.normal, "low peak": simulate_choose.failing}
 
 
 def simulated(n, m, draw, spread, draws=2000):
@@ -360,8 +344,7 @@ def simulated(n, m, draw, spread, draws=2000):
 def test_level_and_coverage_are_those_that_the_page_says():
     page = DOCS.read_text()
     for name, draw in RETURNS.items():
-        for spread in (1, 0.5, 2):
-            assert simulated(3, 3, draw, spread)[0] == 0  # no p is below 0.1
+        for spread in (1, 2):
             found = [simulated(n, n, draw, spread) for n in (5, 10, 25)]
             levels, coverages = zip(*found, strict=True)
             said = cells_of(page, f"{name} \\| x {spread}")
@@ -382,9 +365,7 @@ def test_levels_of_unequal_numbers_of_seeds_are_those_that_the_page_says():
     """And no verdict is given on a single rate where they are highest."""
     page = DOCS.read_text()
     for name, draw in (RETURNS | {"rare peak": rare_peak}).items():
-        for spread in (1, 2):
-            found = [simulated(n, m, draw, spread)[0] for n, m in UNEQUAL]
-            said = cells_of(page, f"{name} \\| x {spread} unequal")
-            assert said == pytest.approx(found, abs=1), (name, spread)
+        found = [simulated(n, m, draw, spread=2)[0] for n, m in UNEQUAL]
+        assert cells_of(page, f"{name} \\| x 2 unequal") == pytest.approx(found, abs=1), name
     judged = [pair for pair in UNEQUAL if not is_lopsided(*pair, MOST_RATIO_OF_RATES)]
     assert judged == [(5, 8), (30, 50)]

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import tyro
-from sweeps import SCALE, row, run, write_run
+from sweeps import SCALE, main, row, run, write_run
 
 import analyze
 import evaluate
@@ -63,9 +63,9 @@ def test_success_is_beside_the_return(runs_dir):
     assert found["p"] == pytest.approx(12 / 252)  # all four of 100 % on one side
 
 
-@pytest.mark.parametrize("env_id", ["toy_envs:IsSuccess-v0", "toy_envs:Success-v0"])
-def test_evaluate_stores_success(env_id, tmp_path, capsys):
+def test_evaluate_stores_success(tmp_path, capsys):
     """And analyze.py judges by what the scripts and evaluate.py have written."""
+    env_id = "toy_envs:Success-v0"
     words = ["--env-id", env_id, "--runs-dir", str(tmp_path), "--no-compile"]
     words += ["--total-timesteps", "24", "--num-steps", "12", "--num-minibatches", "3"]
     assert ppo.train(tyro.cli(ppo.Args, args=words))
@@ -78,7 +78,7 @@ def test_evaluate_stores_success(env_id, tmp_path, capsys):
         expected.append(int(env.unwrapped.solved))
     assert solved == expected and 0 < sum(solved) < 6
     assert f", {100 * sum(solved) / 6:.0f} % solved" in capsys.readouterr().out
-    analyze.main(analyze.Args(tmp_path, metric="success_rate"))
+    main(analyze.Args(tmp_path, metric="success_rate"))
     table = pd.read_csv(tmp_path / "results/robustness.csv")
     assert table["mean"].item() == pytest.approx(100 * np.mean(solved))
 
@@ -117,13 +117,12 @@ def test_robustness_is_judged_by_success(tmp_path, capsys):
                 text += "".join(f"{PUSH},1.0,{i},-50.0,9,{told}\n" for i, told in enumerate(rows))
                 text += f"{OTHER},1.0,0,-50.0,9,\n"  # there the environment told nothing
                 (folder / "robustness.csv").write_text(header + text)
-    analyze.main(analyze.Args(root, tmp_path / "out", metric="success_rate"))
+    tables = run(tmp_path, metric="success_rate")
     said = capsys.readouterr().out
     assert "returns more under noise over 1 of 1 test condition (+40 [" in said
     assert "] percentage points of success, p = 0.0079" in said
     assert "no test of robustness tells success in 1 test condition\n" in said
-    scores = pd.read_csv(tmp_path / "out/robustness_score.csv")
+    scores = tables["robustness_score"]
     assert scores["difference"].tolist() == [40] and scores["conditions"].tolist() == [1]
     assert scores.filter(regex="percent$").isna().all(axis=None)
-    table = pd.read_csv(tmp_path / "out/robustness.csv")
-    assert table["mean"].tolist() == [100, 44, 100, 84]
+    assert tables["robustness"]["mean"].tolist() == [100, 44, 100, 84]

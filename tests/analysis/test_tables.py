@@ -78,11 +78,6 @@ def test_over_environments_single_rates_have_no_verdict_where_one_of_them_has_no
     assert set(alone["verdict"]) == {"better"}
     said = capsys.readouterr().out
     assert "Pusher-v5: with 5/20 runs" in said and "there and over several environments" in said
-    more = {"algorithm": "PPO", "env": "Pusher-v5"}  # a study of one environment
-    write_pairs(tmp_path / "runs", range(101, 121), range(201, 206), **more)
-    write_pairs(tmp_path / "runs", [], range(201, 206), rate=0.2, **more)
-    run(tmp_path)
-    assert capsys.readouterr().out.count("there and over several environments") == 1
 
 
 def test_a_note_on_lopsided_seeds_needs_a_verdict(tmp_path, capsys):
@@ -96,8 +91,6 @@ def test_a_note_on_lopsided_seeds_needs_a_verdict(tmp_path, capsys):
     run(tmp_path)
     said = "with 5/14 runs with and without noise a verdict may be wrong more often than in 5 %"
     assert said in capsys.readouterr().out
-    page = (tmp_path / "results/report.html").read_text()
-    assert "No percentage" not in page  # on Maze-v0 there is none for another reason
 
 
 def test_best(sweep):
@@ -150,16 +143,6 @@ def test_early_performance(sweep):
     assert early["mean"] == pytest.approx(-25 * 1.4) and early["n"] == 4
     assert early["std"] == pytest.approx(1.4 * np.sqrt(100 / 3))
     assert row(table, noise_rate="0.00", **where)["mean"] == pytest.approx(-40 * 1.4)
-
-
-def test_early_performance_is_in_the_order_of_the_steps(tmp_path):
-    """And not of their texts, in which 10 comes before 2."""
-    for noise, rate in (((), ()), (SCALE, 0.5)):
-        write_run(tmp_path / "runs", range(1, 13), noise=noise, rate=rate, every=1_000_000)
-    run(tmp_path)
-    lines = (tmp_path / "results/early_performance.md").read_text().splitlines()
-    steps = [float(line.split("|")[4]) for line in lines if line.startswith("| SAC")]
-    assert steps == sorted(steps) and steps[-1] == 12
 
 
 def test_early_performance_of_long_runs_is_every_200_000_steps_and_needs_noise(tmp_path):
@@ -219,15 +202,6 @@ def test_an_environment_whose_baseline_is_nearly_zero_is_in_every_table(tmp_path
     zero = row(sparse["statistics"], environment="Maze-v0", noise=ENDING)
     assert zero["verdict"] == "worse" and zero["difference"] == pytest.approx(-1.3)
     assert np.isnan(zero["iqm_change_percent"]) and zero["probability_of_improvement"] == 0
-    for seed, noisy in enumerate((95, 96, 97, 98, 99), start=1):  # alone it has percentages
-        config = {"noise": SCALE, "env": "Span-v0", "seed": seed}
-        write_run(tmp_path / "runs", [10 + seed / 10], env="Span-v0", seed=seed)
-        write_run(tmp_path / "runs", [noisy], rate=0.1, **config)
-        write_run(tmp_path / "runs", [-noisy + 35], rate=0.5, **config)
-    tables = run(tmp_path)
-    assert row(tables["statistics"], environment="Span-v0", noise_rate="0.10")["percent_low"] > 0
-    assert np.isnan(row(tables["noises"], environment="Span-v0")["difference_percent"])
-    assert "Span-v0: the mean" in (tmp_path / "results/noises.md").read_text()
     note = (tmp_path / "results/best.md").read_text()
     assert "No percentage, or not for every noise, on Car-v0 and Maze-v0: " in note
 

@@ -1,5 +1,6 @@
 """What the tests of the wrappers share: noises with their formulas, and environments."""
 
+import itertools
 import zlib
 
 import gymnasium as gym
@@ -7,7 +8,7 @@ import mujoco
 import numpy as np
 from gymnasium.utils.env_checker import data_equivalence
 
-from noisy_wrappers import WRAPPERS
+from noisy_wrappers import parse_noise
 
 # A noise, and its formula(noise generator, o_t, o_(t-1)) for three numbers; a recursive one has
 # what was seen at t-1 instead.
@@ -94,13 +95,12 @@ class GenericEnv(gym.Env):
 
     action_space = gym.spaces.Box(-1.0, 1.0, (1,))
 
-    def __init__(self, observation_space=None, reset=None, step=None):
+    def __init__(self, observation_space=None, observe=None, reward=None, step=None):
         self.observation_space = observation_space or gym.spaces.Box(-10, 10, (3,), np.float64)
         self.model = mujoco.MjModel.from_xml_string(MODEL)  # which nothing here simulates
-        self._reset = reset or (lambda env: (env.draw(), {}))
-        self._step = step or (
-            lambda env, action: (env.draw(), float(env.np_random.normal()), False, False, {})
-        )
+        self._observe = observe or GenericEnv.draw
+        self._reward = reward or (lambda env: float(env.np_random.normal()))
+        self._step = step
 
     def draw(self):
         space = self.observation_space
@@ -108,10 +108,12 @@ class GenericEnv(gym.Env):
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        return self._reset(self)
+        return self._observe(self), {}
 
     def step(self, action):
-        return self._step(self, action)
+        if self._step:
+            return self._step(self, action)
+        return self._observe(self), self._reward(self), False, False, {}
 
 
 class Cart(gym.Env):
@@ -144,17 +146,11 @@ gym.register("Cart-v0", "cases:Cart", max_episode_steps=40)
 
 def constant_env(value=2.0, shape=(3,)):
     space = gym.spaces.Box(-np.inf, np.inf, shape, np.float64)
-    return GenericEnv(
-        space,
-        reset=lambda env: (np.full(shape, value), {}),
-        step=lambda env, action: (np.full(shape, value), value, False, False, {}),
-    )
+    return GenericEnv(space, lambda env: np.full(shape, value), lambda env: value)
 
 
 def build(text, env, rate):
-    """Build a wrapper from the notation, without the module's parser."""
-    name, arguments = text.split("(", 1)
-    return eval(f"wrapper(env, rate, {arguments}", {"wrapper": WRAPPERS[name]} | locals())
+    return parse_noise(text)(env, rate)
 
 
 def registered(text):
@@ -190,21 +186,15 @@ def same(first, second):
     return data_equivalence(first, second, exact=True)
 
 
-def numbered_env(reuse=False):
-    """Observations 1, 2, 3, ... from the first reset on; with ``reuse`` all in one array."""
-    buffer = np.zeros(3)
+def numbered_env():
+    """Observations 1, 2, 3, ... from the first reset on, all in one array."""
+    numbers, array = itertools.count(1), np.zeros(3)
 
     def observe(env):
-        env.count = getattr(env, "count", 0) + 1
-        if not reuse:
-            return np.full(3, float(env.count))
-        buffer[:] = env.count
-        return buffer
+        array[:] = next(numbers)
+        return array
 
-    return GenericEnv(
-        reset=lambda env: (observe(env), {}),
-        step=lambda env, action: (observe(env), 0.0, False, False, {}),
-    )
+    return GenericEnv(observe=observe)
 
 
 A = "RandomNormalNoisyReward(1)"

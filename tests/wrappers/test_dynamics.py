@@ -1,5 +1,6 @@
 """Random masses and frictions of a MuJoCo model."""
 
+import itertools
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -8,7 +9,13 @@ import numpy as np
 import pytest
 from cases import MODEL, Cart, GenericEnv, streams
 
-from noisy_wrappers import RandomDynamics, RandomNormalNoisyReward, SpaceError, make_noisy
+from noisy_wrappers import (
+    RandomDynamics,
+    RandomNormalNoisyReward,
+    SpaceError,
+    make_noisy,
+    noise_wrappers,
+)
 
 
 def values(model):
@@ -29,27 +36,35 @@ def changed(before, model):
 
 
 def test_factors_golden():
-    env = Cart()
-    model, nominal = env.model, values(env.model)
-    noisy = RandomDynamics(env, 0.5, 0.5, 1.5, fields=("body_mass", "geom_friction"))
-    gate, noise = streams(RandomDynamics, seed=3)
-    chosen = 0
+    """Of two wrappers: equal ones draw different noise, because positions are part of the seed."""
+    joints = "RandomDynamics(0.5, 2.0, fields=('dof_damping', 'dof_armature'))"
+    env = make_noisy(Cart(), ["RandomDynamics(0.8, 1.2)", joints], [0.6])
+    model, nominal = env.unwrapped.model, values(env.unwrapped.model)
+    gates = [streams(RandomDynamics, 4, position) for position in (0, 1)]
+    seen = []
     for episode in range(40):
-        _, info = noisy.reset(seed=3 if episode == 0 else None)
-        mass, friction = noise.uniform(0.5, 1.5, 4), noise.uniform(0.5, 1.5)
-        if gate.random() >= 0.5:
+        info = env.reset(seed=4 if episode == 0 else None)[1]
+        mass, friction = gates[0][1].uniform(0.8, 1.2, 4), gates[0][1].uniform(0.8, 1.2)
+        damping, armature = gates[1][1].uniform(0.5, 2, (2, 8))
+        first, second = (gate.random() < 0.6 for gate, _ in gates)
+        seen.append((first, second))
+        factors = {"body_mass": mass, "geom_friction": friction} if first else {}
+        factors |= {"dof_damping": damping, "dof_armature": armature} if second else {}
+        for name in ("body_mass", "geom_friction", "dof_damping", "dof_armature"):
+            expected = nominal[name] * factors.get(name, 1)
+            np.testing.assert_array_equal(getattr(model, name), expected)
+        inertia = nominal["body_inertia"].T * factors.get("body_mass", 1)
+        np.testing.assert_array_equal(model.body_inertia.T, inertia)
+        if not factors:
             assert info == {} and changed(nominal, model) == set()
-            assert noisy.step(np.zeros(2))[4] == {}
             continue
-        chosen += 1
-        np.testing.assert_array_equal(model.body_mass, nominal["body_mass"] * mass)
-        inertia = nominal["body_inertia"] * mass[:, None]
-        np.testing.assert_array_equal(model.body_inertia, inertia)
-        np.testing.assert_array_equal(model.geom_friction, nominal["geom_friction"] * friction)
-        assert info["noise"] == ("RandomDynamics",) == noisy.step(np.zeros(2))[4]["noise"]
-        assert info["dynamics"].keys() == {"body_mass", "geom_friction"}
-        np.testing.assert_array_equal(info["dynamics"]["body_mass"], mass)
-    assert (noisy.times_applied, noisy.opportunities) == (chosen, 40)
+        np.testing.assert_equal(info["dynamics"].get("body_mass", mass), mass)
+        assert info["dynamics"].keys() == factors.keys()
+        told = ("RandomDynamics",) * (first + second)
+        assert info["noise"] == told == env.step(np.zeros(2))[4]["noise"]
+    assert len({*seen}) == 4
+    counted = [wrapper.times_applied for wrapper in noise_wrappers(env).values()]
+    assert counted == np.sum(seen, axis=0).tolist()
 
 
 def test_derived_constants_are_those_of_a_model_with_the_changed_mass():
@@ -72,13 +87,11 @@ class Choosing(Cart):
     """An environment with one or several models, which builds one anew for each episode."""
 
     def __init__(self, *worlds):
-        self.worlds, self.episode = worlds, -1
+        self.worlds = itertools.cycle(worlds)
         self.choose()
 
     def choose(self):
-        self.episode += 1
-        text = self.worlds[self.episode % len(self.worlds)]
-        self.model = mujoco.MjModel.from_xml_string(text)
+        self.model = mujoco.MjModel.from_xml_string(next(self.worlds))
         self.data = mujoco.MjData(self.model)
 
     def reset(self, **kwargs):
@@ -87,8 +100,9 @@ class Choosing(Cart):
 
 
 def test_models_that_reset_builds_anew():
-    env = Choosing(MODEL, MODEL.replace('size="0.1"', 'size="0.3"'))
-    masses = [mujoco.MjModel.from_xml_string(text).body_mass for text in env.worlds]
+    worlds = MODEL, MODEL.replace('size="0.1"', 'size="0.3"')
+    env = Choosing(*worlds)
+    masses = [mujoco.MjModel.from_xml_string(text).body_mass for text in worlds]
     noisy = RandomDynamics(env, 1.0, 0.5, 1.5)
     for chosen in (1, 0, 1):
         factors = noisy.reset(seed=1)[1]["dynamics"]["body_mass"]
@@ -105,72 +119,24 @@ def test_an_environment_may_be_wrapped_again():
     assert changed(nominal, env.model) == set()
 
 
-ACTUATORS = {
-    "motor": '<motor joint="arm" gear="3"/>',
-    "position": '<position joint="arm" kp="30" kv="5"/>',
-    "velocity": '<velocity joint="arm" kv="30"/>',
-    "muscle": '<muscle joint="arm" force="30" lengthrange="0 1"/>',
-}
-ARM = """
-<mujoco>
-  <worldbody>
-    <body>
-      <joint name="arm" axis="0 -1 0" damping="2"/>
-      <geom type="capsule" fromto="0 0 0 0.5 0 0" size="0.05" density="300"/>
-    </body>
-  </worldbody>
-  <actuator>{}</actuator>
-</mujoco>
-"""
-
-
-class Arm(Cart):
-    """Holds an arm against gravity."""
-
-    def __init__(self, actuator):
-        self.model = mujoco.MjModel.from_xml_string(ARM.format(ACTUATORS[actuator]))
-        self.data = mujoco.MjData(self.model)
-
-    def reset(self, *, seed=None, options=None):
-        gym.Env.reset(self, seed=seed)
-        return self.data.qpos, {}
-
-
-def driven(actuator, factor, steps=50):
-    """Return an arm whose actuator has `factor` times its strength, after steps of control 1."""
-    arm = Arm(actuator)
-    RandomDynamics(arm, 1.0, factor, factor, fields=("actuator_gainprm",)).reset(seed=0)
-    arm.data.ctrl[:] = 1
-    mujoco.mj_step(arm.model, arm.data, steps)
-    return arm
-
-
-def test_a_position_servo_with_half_its_strength_settles_lower_on_the_same_target():
-    arms = {gain: driven("position", gain / 30, steps=10_000) for gain in (30, 15)}
-    np.testing.assert_array_equal(arms[15].model.actuator_gainprm[0, :3], [15, 0, 0])
-    np.testing.assert_array_equal(arms[15].model.actuator_biasprm[0, :3], [0, -15, -2.5])
-    load = 9.81 * arms[30].model.body_mass[1] * 0.25  # times the cosine of the angle
-    angles = {gain: float(arm.data.qpos[0]) for gain, arm in arms.items()}
-    for gain, angle in angles.items():
-        assert gain * (1 - angle) == pytest.approx(load * np.cos(angle), rel=1e-3)
-    assert 0 < angles[15] < angles[30] < 1
-
-
 @pytest.mark.parametrize(
-    ("actuator", "gain", "bias"), [("motor", 0.5, [0, 0, 0]), ("velocity", 15, [0, 0, -15])]
+    ("actuator", "gain", "bias"),  # which of their parameters are the strength
+    [
+        ('motor joint="slide"', [0], []),
+        ('position joint="slide" kp="30" kv="5"', [0], [1, 2]),  # kp (control - q) - kv dq/dt
+        ('velocity joint="slide" kv="30"', [0], [2]),  # kv (control - dq/dt)
+        ('muscle joint="slide" force="30" lengthrange="0 1"', [2, 3], [2, 3]),
+    ],
 )
-def test_a_motor_and_a_velocity_servo_with_half_their_strength_are_slower(actuator, gain, bias):
-    weak = driven(actuator, 0.5)
-    np.testing.assert_array_equal(weak.model.actuator_gainprm[0, :3], [gain, 0, 0])
-    np.testing.assert_array_equal(weak.model.actuator_biasprm[0, :3], bias)
-    assert weak.data.qvel[0] < driven(actuator, 1.0).data.qvel[0]
-
-
-def test_the_strength_of_a_muscle_is_its_force_and_scale():
-    weak, nominal = driven("muscle", 0.5).model, Arm("muscle").model
-    for parameters in ("actuator_gainprm", "actuator_biasprm"):
-        factor = getattr(weak, parameters)[0, :9] / getattr(nominal, parameters)[0, :9]
-        np.testing.assert_array_equal(factor, [1, 1, 0.5, 0.5, 1, 1, 1, 1, 1])
+def test_half_the_strength_of_an_actuator(actuator, gain, bias):
+    env = Choosing(MODEL.replace('motor joint="slide" gear="50"', actuator))
+    nominal = values(env.model)
+    RandomDynamics(env, 1.0, 0.5, 0.5, fields=("actuator_gainprm",)).reset(seed=0)
+    for name, halved in (("actuator_gainprm", gain), ("actuator_biasprm", bias)):
+        expected = nominal[name][0].copy()
+        assert expected[halved].all()
+        expected[halved] *= 0.5
+        np.testing.assert_array_equal(getattr(env.model, name)[0], expected)
 
 
 def test_the_range_of_forces_is_a_field_of_its_own():
@@ -196,22 +162,14 @@ class Randomizing(Cart):
         return found
 
 
-MASS_AND_FRICTION = ("body_mass", "geom_friction")
-OTHERS = ("dof_damping", "dof_armature", "jnt_stiffness", "actuator_gear", "actuator_gainprm")
+OWN = ("actuator_gainprm", "actuator_biasprm", "cam_pos0")
+SCALED = ("body_mass", "geom_friction", "dof_damping", "dof_armature", "jnt_stiffness")
 
 
-@pytest.mark.parametrize(
-    ("own", "scaled"),
-    [
-        (("actuator_gainprm", "actuator_biasprm"), MASS_AND_FRICTION),
-        (("cam_pos0",), MASS_AND_FRICTION + OTHERS),
-    ],
-    ids=["servos", "cameras"],
-)
-def test_other_episodes_are_those_of_an_environment_that_randomizes_itself(own, scaled):
+def test_other_episodes_are_those_of_an_environment_that_randomizes_itself():
     """Bit for bit: nothing piles up, nothing is left of chosen episodes."""
-    bare, env = Randomizing(*own), Randomizing(*own)
-    noisy = RandomDynamics(env, 0.5, 0.5, 1.5, fields=scaled)
+    bare, env = Randomizing(*OWN), Randomizing(*OWN)
+    noisy = RandomDynamics(env, 0.5, 0.5, 1.5, fields=SCALED)
     chosen = 0
     for episode in range(24):
         seed = 3 if episode == 0 else None
@@ -224,52 +182,9 @@ def test_other_episodes_are_those_of_an_environment_that_randomizes_itself(own, 
         chosen += 1
         mass = info["dynamics"]["body_mass"]
         np.testing.assert_array_equal(env.model.body_mass, mass * bare.model.body_mass)
-        assert {*scaled, "body_inertia", "body_subtreemass"} <= different
-        assert not different & {*own}
+        assert {*SCALED, "body_inertia", "body_subtreemass"} <= different
+        assert not different & {*OWN}
     assert 5 < chosen < 20
-
-
-def test_several_at_once_with_other_fields():
-    """Equal wrappers in a stack draw different noise: positions are part of the seed."""
-    names = ["RandomDynamics(0.8, 1.2, fields=('body_mass',))"]
-    names += ["RandomDynamics(0.5, 2.0, fields=('dof_damping', 'dof_armature'))"]
-    env = make_noisy(Cart(), names, [0.6])
-    model, nominal = env.unwrapped.model, values(env.unwrapped.model)
-    gates = [streams(RandomDynamics, 4, position) for position in (0, 1)]
-    seen = set()
-    for episode in range(40):
-        info = env.reset(seed=4 if episode == 0 else None)[1]
-        drawn = [gates[0][1].uniform(0.8, 1.2, 4), gates[1][1].uniform(0.5, 2, (2, 8))]
-        chosen = tuple(gate.random() < 0.6 for gate, _ in gates)
-        seen.add(chosen)
-        assert info.get("noise", ()) == ("RandomDynamics",) * sum(chosen)
-        mass = drawn[0] if chosen[0] else 1
-        damping, armature = drawn[1] if chosen[1] else (1, 1)
-        factors = {"body_mass": mass, "dof_damping": damping, "dof_armature": armature}
-        for name, factor in factors.items():
-            np.testing.assert_array_equal(getattr(model, name), nominal[name] * factor)
-        if chosen == (True, True):
-            assert info["dynamics"].keys() == factors.keys()
-        if chosen == (False, False):
-            assert changed(nominal, model) == set()
-    assert len(seen) == 4
-
-
-def test_a_wrapper_between_two_may_reset_twice():
-    """As one does that begins anew until a start is good."""
-
-    class Twice(gym.Wrapper):
-        def reset(self, **given):
-            self.env.reset(**given)
-            return self.env.reset()
-
-    inner = RandomDynamics(Cart(), 1, 0.5, 0.5, fields=("dof_damping",))
-    env = RandomDynamics(Twice(inner), 1, 2, 2, fields=("body_mass",))
-    model, nominal = env.unwrapped.model, values(env.unwrapped.model)
-    for _ in range(2):
-        env.reset(seed=0)
-        np.testing.assert_array_equal(model.body_mass, 2 * nominal["body_mass"])
-        np.testing.assert_array_equal(model.dof_damping, 0.5 * nominal["dof_damping"])
 
 
 def test_fields_that_reset_sets_itself_are_refused():
@@ -288,24 +203,19 @@ def test_dm_control_keeps_its_model_in_its_physics():
 
 
 def test_environments_that_it_cannot_change():
-    with pytest.raises(ValueError, match="needs a MuJoCo model"):
-        RandomDynamics(gym.make("CartPole-v1"), 0.1, 0.5, 1.5)
-    with pytest.raises(ValueError, match="has no tendon_damping, or zeros only"):
-        RandomDynamics(gym.make("Hopper-v5"), 0.1, 0.5, 1.5, fields=("tendon_damping",))
-    with pytest.raises(ValueError, match="body_mass takes body_inertia along"):
-        RandomDynamics(Cart(), 0.1, 0.5, 1.5, fields=("body_inertia", "body_mass"))
-    for other in (
-        '<dcmotor joint="slide" motorconst="1" resistance="1"/>',
-        '<cylinder joint="slide" area="2" bias="1 -3 -1"/>',  # its constant force would stay
-    ):
-        env = Choosing(MODEL.replace('<motor joint="slide" gear="50"/>', other))
-        with pytest.raises(ValueError, match="actuators of other kinds, or with a constant bias"):
-            RandomDynamics(env, 0.1, 0.5, 1.5, fields=("actuator_gainprm",))
-    env = Cart()
-    env.model.dof_dampingpoly[0] = 2  # beside the linear damping
-    with pytest.raises(ValueError, match="dof_damping of this environment's model is a polynomial"):
-        RandomDynamics(env, 0.1, 0.5, 1.5, fields=("dof_damping",))
+    motor, polynomial = '<motor joint="slide" gear="50"/>', Cart()
+    polynomial.model.dof_dampingpoly[0] = 2  # beside the linear damping
     once = RandomNormalNoisyReward(RandomDynamics(Cart(), 0.1, 0.5, 1.5), 0.1, 1)
-    for field in ("body_mass", "body_inertia"):
-        with pytest.raises(ValueError, match="another RandomDynamics .* scales body_"):
-            RandomDynamics(once, 0.1, 0.5, 1.5, fields=(field,))
+    dc = '<dcmotor joint="slide" motorconst="1" resistance="1"/>'
+    constant = '<cylinder joint="slide" area="2" bias="1 -3 -1"/>'  # its constant force would stay
+    for env, field, problem in (
+        (gym.make("CartPole-v1"), "body_mass", "needs a MuJoCo model"),
+        (gym.make("Hopper-v5"), "tendon_damping", "has no tendon_damping, or zeros only"),
+        (Choosing(MODEL.replace(motor, dc)), "actuator_gainprm", "actuators of other kinds"),
+        (Choosing(MODEL.replace(motor, constant)), "actuator_gainprm", "with a constant bias"),
+        (polynomial, "dof_damping", "dof_damping of this environment's model is a polynomial"),
+        (once, "body_mass", "another RandomDynamics .* scales body_"),
+        (once, "body_inertia", "another RandomDynamics .* scales body_"),
+    ):
+        with pytest.raises(ValueError, match=problem):
+            RandomDynamics(env, 0.1, 0.5, 1.5, fields=(field,))

@@ -1,7 +1,6 @@
 """Names of runs and of environments."""
 
 import re
-import sys
 
 import pytest
 from cases import NOISES, A, B, C
@@ -82,12 +81,3 @@ def test_unknown_environments():
             canonical_env_id(env_id)
         message = str(error.value)
         assert repr(env_id) in message and reason in message and "\n" not in message
-
-
-def test_what_a_module_raises_passes_through(tmp_path, monkeypatch):
-    (tmp_path / "buggy_module.py").write_text("import no_such_dependency")
-    monkeypatch.syspath_prepend(tmp_path)
-    path = sys.path[:]
-    with pytest.raises(ModuleNotFoundError, match="no_such_dependency"):
-        canonical_env_id("buggy_module:Env-v0")
-    assert sys.path == path

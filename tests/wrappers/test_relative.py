@@ -14,14 +14,10 @@ SPACE = gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)
 
 def units_env():
     """Observations in millimetres, and in other units; rewards in dollars."""
-
-    def observe(env):
-        return 7 * UNITS + UNITS * env.np_random.normal(size=3)
-
     return GenericEnv(
         SPACE,
-        reset=lambda env: (observe(env), {}),
-        step=lambda env, a: (observe(env), 1e4 * env.np_random.random(), False, False, {}),
+        observe=lambda env: 7 * UNITS + UNITS * env.np_random.normal(size=3),
+        reward=lambda env: 1e4 * env.np_random.random(),
     )
 
 

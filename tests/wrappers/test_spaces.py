@@ -22,7 +22,7 @@ from gymnasium.wrappers import RecordEpisodeStatistics
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from noisy_wrappers import RandomNormalNoisyObservation, make_flat, make_noisy
+from noisy_wrappers import RandomNormalNoisyObservation, make_noisy
 
 
 def spaces(draw):
@@ -60,13 +60,8 @@ def test_observations_stay_in_the_space(data, text, interval):
         env.count = getattr(env, "count", -1) + 1
         return np.array((low, high, high, rng.uniform(low, high))[env.count % 4], space.dtype)
 
-    env = GenericEnv(
-        space,
-        reset=lambda env: (observe(env), {}),
-        step=lambda env, action: (observe(env), 0.0, False, False, {}),
-    )
     text = text.format(*interval)
-    noisy = build(text, build(text, env, 0.5), 0.5)
+    noisy = build(text, build(text, GenericEnv(space, observe), 0.5), 0.5)
     for observation, *_, info in rollout(noisy, seed=0, steps=16):
         assert isinstance(observation, np.ndarray)
         assert (observation.dtype, observation.shape) == (space.dtype, space.shape)
@@ -77,17 +72,13 @@ def test_observations_stay_in_the_space(data, text, interval):
 
 def test_integer_observations_are_rounded_and_clipped():
     values = np.array([0, 3, 100, 255], np.uint8)
-    space = gym.spaces.Box(0, 255, (4,), np.uint8)
-    env = GenericEnv(space, reset=lambda env: (values, {}))
+    env = GenericEnv(gym.spaces.Box(0, 255, (4,), np.uint8), lambda env: values)
     env = RandomNormalNoisyObservation(env, 1.0, 40.0)
     _, noise = streams(RandomNormalNoisyObservation, 2)
-    env.reset(seed=2)
-    noise.normal(0, 40, 4)
-    got = np.array([env.reset()[0] for _ in range(50)])
-    expected = np.clip(np.rint(values + noise.normal(0, 40, (50, 4))), 0, 255)
+    got = np.array([env.reset(seed=2)[0], *(env.reset()[0] for _ in range(50))])
+    expected = np.clip(np.rint(values + noise.normal(0, 40, (51, 4))), 0, 255)
     assert got.dtype == np.uint8
     np.testing.assert_array_equal(got, expected)
-    assert 0 in got[:, 1] and 255 in got[:, 2:] and len(np.unique(got)) > 50
 
 
 def test_a_record_below_other_wrappers_is_refused():
@@ -96,9 +87,6 @@ def test_a_record_below_other_wrappers_is_refused():
     with pytest.raises(ValueError, match="this environment records its returns"):
         make_noisy(env, [], [])
     assert make_noisy(env, [], [], record_statistics=False) is env
-    with pytest.raises(ValueError, match="this environment records its returns"):
-        recorded = RecordEpisodeStatistics(make_flat(gym.make("Pendulum-v1")))
-        make_noisy(gym.wrappers.TimeLimit(recorded, 5), [], [])
 
 
 def test_a_record_of_the_true_return_that_there_is_is_kept():
@@ -124,7 +112,7 @@ def test_check_env(text):
 def test_observations_without_numbers():
     category = gym.spaces.Tuple((gym.spaces.Dict(kind=gym.spaces.MultiDiscrete([2, 3])),))
     for space in (category, gym.spaces.Box(0, 1, (3,), np.bool_), gym.spaces.Sequence(BOX)):
-        env = GenericEnv(space, reset=lambda env, space=space: (space.sample(), {}))
+        env = GenericEnv(space, lambda env, space=space: space.sample())
         with pytest.raises(ValueError, match="needs observations of floats or integers"):
             RandomNormalNoisyObservation(env, 0.1, 1.0)
         make_noisy(env, [A, C], [1.0]).reset(seed=0)

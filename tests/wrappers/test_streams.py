@@ -1,7 +1,6 @@
 """Seeds: who draws what, and in which order; copies, specs and states continue alike."""
 
 import copy
-import pickle
 
 import gymnasium as gym
 import numpy as np
@@ -12,11 +11,6 @@ from cases import BASES, GenericEnv, build, constant_env, registered, rollout, s
 from noisy_wrappers import EnvState, RandomNormalNoisyReward
 
 
-def pattern(steps):
-    """Which steps were perturbed."""
-    return ["noise" in info for *_, info in steps]
-
-
 @pytest.mark.parametrize("text", BASES)
 def test_same_seed_same_noise(text):
     env = build(text, gym.wrappers.TimeLimit(GenericEnv(), 12), 0.5)
@@ -24,8 +18,8 @@ def test_same_seed_same_noise(text):
     first = rollout(env, seed=1)
     assert same(first, rollout(env, seed=1))
     assert same(first, rollout(build(text, gym.wrappers.TimeLimit(GenericEnv(), 12), 0.5), seed=1))
-    patterns = [pattern(steps) for steps in (first, rollout(env, seed=2), rollout(env))]
-    assert patterns[0] != patterns[1] != patterns[2] != patterns[0]
+    episodes = first, rollout(env, seed=2), rollout(env)
+    assert len({tuple("noise" in info for *_, info in steps) for steps in episodes}) == 3
     assert np.random.get_state()[1].tobytes() == before
 
 
@@ -59,13 +53,12 @@ def test_spec_round_trip(text):
 
 
 @pytest.mark.parametrize("text", BASES)
-@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
-def test_copies_continue_alike(text, duplicate):
+def test_copies_continue_alike(text):
     env_id, action = registered(text)
     env = build(text, gym.make(env_id), 0.5)
     env.reset(seed=2)
     env.step(action)
-    twin = duplicate(env)
+    twin = copy.deepcopy(env)
     ours = [env.step(action), *rollout(env, action=action)]
     assert same(ours, [twin.step(action), *rollout(twin, action=action)])
     assert (twin.times_applied, twin.opportunities) == (env.times_applied, env.opportunities)
