@@ -127,10 +127,6 @@ class Agent(nn.Module):
         entropy = (self.actor_logstd + 0.5 + 0.5 * math.log(2 * math.pi)).sum()
         return log_prob, entropy, self.critic(observations).squeeze(1)
 
-    def acting(self):
-        """Return what acting needs: the policy's mean, NumPy to NumPy, and its std (A,)."""
-        return in_numpy(self.actor_mean), self.actor_logstd.exp().cpu().numpy()
-
 
 class Saved:
     """Base class: state_dict() holds every attribute, numbers and arrays."""
@@ -145,14 +141,14 @@ class Saved:
 
 
 class Normalizer(Saved):
-    """Running mean and variance of observations, as in Gymnasium's NormalizeObservation."""
+    """Running mean and variance, as in Gymnasium's NormalizeObservation and NormalizeReward."""
 
-    def __init__(self, shape):
-        self.mean, self.var, self.count = np.zeros(shape), np.ones(shape), 1e-4
+    def __init__(self, mean, var):
+        self.mean, self.var, self.count = mean, var, 1e-4
 
-    def update(self, observation):
-        """Take one observation into account, as a batch of one in Gymnasium's wrapper."""
-        delta, total = observation - self.mean, self.count + 1
+    def update(self, x):
+        """Take one observation or return into account, as a batch of one in Gymnasium."""
+        delta, total = x - self.mean, self.count + 1
         self.mean += delta / total
         self.var += (delta * delta * (self.count / total) - self.var) / total
         self.count = total
@@ -163,28 +159,16 @@ class Normalizer(Saved):
         return scaled.clip(-10, 10).astype(np.float32)
 
 
-class RewardScaler(Normalizer):
-    """Running variance of the discounted return, as in NormalizeReward; it needs update() only."""
-
-    def __init__(self):
-        self.discounted_return, self.mean, self.var, self.count = 0.0, 0.0, 1.0, 1e-4
-
-    def scale(self, reward, terminated, gamma):
-        """Take a reward into account; return it in standard deviations, at most 10 of them."""
-        # as in Gymnasium: the past is dropped at the last step of an episode, not after it
-        self.discounted_return = self.discounted_return * gamma * (1 - terminated) + reward
-        self.update(self.discounted_return)
-        scaled = reward / math.sqrt(self.var + 1e-8)
-        return max(min(scaled, 10.0), -10.0)  # in this order NaN stays, and ends the run
-
-
 class Rollout(Saved):
     """T steps, and the observation after them."""
 
     def __init__(self, steps, env):
         self.observations = np.zeros((steps + 1, *env.observation_space.shape), np.float32)
-        self.eps, self.actions = np.zeros((2, steps, *env.action_space.shape), np.float32)
-        self.rewards, self.dones = np.zeros((2, steps), np.float32)  # done: terminated or truncated
+        self.eps = np.zeros((steps, *env.action_space.shape), np.float32)  # the policy's noise
+        self.actions = np.zeros_like(self.eps)
+        self.rewards = np.zeros(steps, np.float32)
+        self.dones = np.zeros(steps, np.float32)  # terminated or truncated
+        self.discounted_return = 0.0  # it goes on in the next rollout
 
 
 def compute_gae(rewards, values, dones, args):
@@ -201,12 +185,8 @@ def compute_gae(rewards, values, dones, args):
     return torch.tensor(advantages)
 
 
-# LOSS. It returns (loss, {curve: value}). updater() differentiates it with respect to the
-# parameters of the first argument.
-
-
 def ppo_loss(agent, minibatch, args):
-    """Clipped surrogate, clipped value loss and entropy."""
+    """Clipped surrogate, clipped value loss and entropy; updater() learns the first argument."""
     observations, actions, old_log_probs, advantages, returns, old_values = minibatch
     if args.norm_adv:
         advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
@@ -246,7 +226,8 @@ def learn(args, env, test_env, stop):
     observation, _ = env.reset(seed=args.seed)
     total_steps = args.total_timesteps // args.num_steps * args.num_steps  # of whole rollouts
     rollout = Rollout(args.num_steps, env)
-    observation_stats, reward_scaler = Normalizer(observation.shape), RewardScaler()
+    observation_stats = Normalizer(np.zeros(observation.shape), np.ones(observation.shape))
+    return_stats = Normalizer(0.0, 1.0)
     agent = Agent(env).to(device)
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     learning_rates = [group["lr"] for group in optimizer.param_groups]
@@ -256,19 +237,20 @@ def learn(args, env, test_env, stop):
     # run is resumed, without a warning: tools/check_script.py finds it. Random numbers are drawn on
     # the CPU, because the generator of a GPU is not saved.
     state = {"agent": agent, "optimizer": optimizer, "rollout": rollout}
-    state |= {"observation_stats": observation_stats, "reward_scaler": reward_scaler}
+    state |= {"observation_stats": observation_stats, "return_stats": return_stats}
     start = run.resume(state | {"env": noisy.EnvState(env, rng)})
     if start > 0:  # the checkpoint was written between two episodes
         noisy.set_progress(env, start / total_steps)  # for rates that change
         observation, _ = env.reset()
 
-    act, std = agent.acting()
     observation_stats.update(observation)
     # one loop over steps and not two, over rollouts and steps: a run may resume within a rollout
     for global_step in range(start + 1, total_steps + 1):
         step = (global_step - 1) % args.num_steps
         if step == 0:
-            rollout.eps[:] = torch.randn(rollout.eps.shape)  # the policy's noise
+            rollout.eps[:] = torch.randn(rollout.eps.shape)
+        if step == 0 or global_step == start + 1:  # there is a new policy
+            act, std = in_numpy(agent.actor_mean), agent.actor_logstd.exp().cpu().numpy()
 
         # ACT: log-probabilities and values are computed later, for whole rollouts
         rollout.observations[step] = observation_stats.normalize(observation)
@@ -279,8 +261,13 @@ def learn(args, env, test_env, stop):
         observation, reward, terminated, truncated, info = env.step(action)
         observation_stats.update(observation)
 
-        # STORE
-        rollout.rewards[step] = reward_scaler.scale(reward, terminated, args.gamma)
+        # STORE: rewards in standard deviations of the discounted return, at most 10 of them. As in
+        # Gymnasium, that drops the past at the last step of an episode, not after it.
+        rollout.discounted_return *= args.gamma * (1 - terminated)
+        rollout.discounted_return += reward
+        return_stats.update(rollout.discounted_return)
+        scaled = reward / math.sqrt(return_stats.var + 1e-8)
+        rollout.rewards[step] = max(min(scaled, 10.0), -10.0)  # in this order NaN stays
         rollout.dones[step] = terminated or truncated
         if args.bootstrap_truncated and truncated and not terminated:
             value = in_numpy(agent.critic)(observation_stats.normalize(observation))
@@ -314,7 +301,6 @@ def learn(args, env, test_env, stop):
                     clipfracs.append(curves["clipfrac"])
                 if args.target_kl is not None and curves["approx_kl"] > args.target_kl:
                     break
-            act, std = agent.acting()
 
             curves["clipfrac"] = torch.stack(clipfracs).mean()
             curves["explained_variance"] = 1 - (returns - values).var() / returns.var().clamp(1e-8)
@@ -350,7 +336,7 @@ def learn(args, env, test_env, stop):
 
 
 def check_agent(agent, observations, log_probs, values, rollout, std):
-    """Exit where forward() is not what acts, by acting(), or what bootstraps, by critic()."""
+    """Exit where forward() is not what acts in learn(), or what bootstraps, by critic()."""
     value = agent.critic(observations[0])
     if value.shape != (1,) or (value - values[0]).abs() > 1e-3 * (1 + value.abs()):
         fail("the agent learns other values than those of critic(), which bootstraps", 1)
@@ -358,7 +344,7 @@ def check_agent(agent, observations, log_probs, values, rollout, std):
     expected = (-0.5 * rollout.eps**2 - np.log(std) - 0.5 * math.log(2 * math.pi)).sum(1)
     rounding = 1e-3 * (1 + np.abs(rollout.actions / std).sum(1))
     if (np.abs(log_probs.cpu().numpy() - expected) > rounding).any():
-        fail("the agent acts with one policy and learns another: see acting() and forward()", 1)
+        fail("the agent acts with one policy and learns another: see ACT and forward()", 1)
 
 
 def make_policy(agent, observation_stats, env):
@@ -371,7 +357,7 @@ def load_policy(run_dir, env=None):
     """Return the policy of a run's last test; `env` is for runs of this project's version 0.3."""
     config = json.loads(Path(run_dir, "config.json").read_text())
     env = env or noisy.Spaces(config)
-    agent, observation_stats = Agent(env), Normalizer(env.observation_space.shape)
+    agent, observation_stats = Agent(env), Normalizer(0.0, 1.0)
     saved = read_state(Path(run_dir, "policy.pt"))
     agent.load_state_dict(saved["agent"])
     # version 0.3 saved tensors
@@ -384,9 +370,10 @@ def updater(loss, network, optimizer, args):
     """Return update(*inputs) -> curves: one step of the optimizer on loss(network, *inputs).
 
     Numbers among the inputs may change from one update to the next. The optimizer may be any whose
-    step() needs no closure. Loss and gradient in one compiled graph are faster than backward().
+    step() needs no closure.
     """
-    # the loss as forward() of a module, because functional_call() swaps parameters only in there
+    # Loss and gradient in one compiled graph are faster than backward(). functional_call() swaps
+    # the parameters of a module while its forward() runs: here that is the loss.
     module = nn.ModuleList([network])
     module.forward = functools.partial(loss, network)
     parameters = dict(module.named_parameters())
@@ -423,25 +410,22 @@ def updater(loss, network, optimizer, args):
 def in_numpy(network):
     """Return a network as a function of one observation, NumPy to NumPy.
 
-    Linear, Tanh and ReLU are computed in NumPy, several times faster than in PyTorch; any other
-    network is called as it is. Call this again after an update: weights from a GPU are copies.
+    A Sequential of Linear, Tanh and ReLU is computed in NumPy, several times faster than in
+    PyTorch; any other network is called as it is. Call this again after an update.
     """
-    activations = {nn.Tanh: np.tanh, nn.ReLU: lambda x: np.maximum(x, 0)}
-    functions = []
-    for layer in network if type(network) is nn.Sequential else [network]:
-        has_hooks = layer._forward_hooks or layer._forward_pre_hooks  # as of spectral_norm()
-        if type(layer) is nn.Linear and layer.bias is not None and not has_hooks:
-            weight, bias = layer.weight.numpy(force=True), layer.bias.numpy(force=True)
-            functions.append(lambda x, weight=weight, bias=bias: weight @ x + bias)
-        elif type(layer) in activations and not has_hooks:
-            functions.append(activations[type(layer)])
-        else:
-            device = next(network.parameters()).device
-            return lambda x: network(torch.from_numpy(x).to(device)).numpy(force=True)
+    layers = [*network] if type(network) is nn.Sequential else [network]
+    has_hooks = any(x._forward_hooks or x._forward_pre_hooks for x in layers)  # spectral_norm()
+    if has_hooks or not {type(x) for x in layers} <= {nn.Linear, nn.Tanh, nn.ReLU}:
+        device = next(network.parameters()).device
+        return lambda x: network(torch.from_numpy(x).to(device)).numpy(force=True)
+    arrays = [{name: p.numpy(force=True) for name, p in x.named_parameters()} for x in layers]
 
     def call(x):
-        for function in functions:
-            x = function(x)
+        for layer, array in zip(layers, arrays, strict=True):
+            if isinstance(layer, nn.Linear):
+                x = array["weight"] @ x + array.get("bias", 0.0)
+            else:
+                x = np.tanh(x) if isinstance(layer, nn.Tanh) else np.maximum(x, 0)
         return x
 
     return call
@@ -477,12 +461,11 @@ def say(text):
 def compiled(function):
     """Compile a function as one graph; where that fails, say why and go on without."""
     graph = torch.compile(function, fullgraph=True, dynamic=False, isolate_recompiles=True)
-    is_new = True
 
     def call(*inputs):
-        nonlocal graph, is_new
-        if is_new:  # Ctrl-C reaches the compiler, too, which must not end by it
-            signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
+        nonlocal graph
+        # Ctrl-C would reach the compiler, too, and end it
+        allowed = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
         try:
             return graph(*inputs)
         except torch._dynamo.exc.FailOnRecompileLimitHit:
@@ -494,9 +477,7 @@ def compiled(function):
             graph = function
             return function(*inputs)
         finally:
-            if is_new:
-                is_new = False
-                signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)
+            signal.pthread_sigmask(signal.SIG_SETMASK, allowed)
 
     return call
 
@@ -530,10 +511,6 @@ def train(args, stop=lambda: 0):
 class Run:
     """The run's folder: what is written into it, and read again to resume."""
 
-    # in the order in which --overwrite deletes them: without result.json a run is not finished
-    FILES = ["result.json", "checkpoint.pt", "policy.pt", "policy_*.pt", "eval.csv", "config.json"]
-    FILES += ["robustness.csv", "robustness.csv.gz", "events.out.tfevents.*"]
-
     def __init__(self, args, env):
         """Open the folder; exit if another process uses it, or if it holds a different run."""
         self.args, self.env = args, env
@@ -545,8 +522,10 @@ class Run:
             self.lock = (self.folder / ".lock").open("a")
         with fail_on(BlockingIOError, f"another process trains in {self.folder}: wait for it", 1):
             fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # as long as it is open
-        if args.overwrite:
-            self._delete(*self.FILES, *(f"{name}.tmp" for name in self.FILES))
+        if args.overwrite:  # in this order: without result.json a run is not finished
+            self._delete("result.json", "checkpoint.pt", "policy.pt", "policy_*.pt", "eval.csv")
+            self._delete("config.json", "robustness.csv", "robustness.csv.gz")
+            self._delete("events.out.tfevents.*")
         new = noisy.describe_run(__file__, asdict(args), asdict(Args()), env)
         new["versions"]["torch"] = torch.__version__
         new["matmul_precision"] = torch.get_float32_matmul_precision()
@@ -557,12 +536,13 @@ class Run:
         if self.config["script_sha256"] != new["script_sha256"]:
             say("the script has changed since the run began; if it matters, use --exp-name")
         self.is_finished = (self.folder / "result.json").exists()
-        begun = "compiling, which takes a while, then training" if args.compile else "training"
+        begun = "training (the first updates wait for the compiler)" if args.compile else "training"
         say(f"{self.folder} is finished" if self.is_finished else f"{begun}: {self.folder}")
 
     def resume(self, state):
         """Restore {name: part with state_dict()} from a checkpoint; return its step, or 0."""
-        self.state, self.eval_csv = state, "step,episode,episodic_return,episodic_length,success\n"
+        self.state = state
+        self.eval_csv = "step,episode,episodic_return,episodic_length,success\n"  # all of the file
         step, processor_seconds = 0, 0.0
         path = self.folder / "checkpoint.pt"
         if path.exists():
@@ -593,6 +573,7 @@ class Run:
         if step == 0:
             self._log_hyperparameters()
         total = self.args.total_timesteps
+        # disable=None: a bar on a terminal alone
         self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None, smoothing=0)
         self.first_step = self.saved_step = step
         self.last_test, self.begun, self.printed = "", time.monotonic(), -math.inf
@@ -627,10 +608,7 @@ class Run:
         speed = (step - self.first_step) / (now - self.begun)
         tags = {"charts/SPS": speed}
         for group, values in groups.items():
-            for name, value in values.items():
-                if torch.is_tensor(value) and value.numel() != 1:
-                    fail(f"{group}/{name} is no number: take its mean()", 1)
-                tags[f"{group}/{name}"] = float(value)
+            tags |= {f"{group}/{name}": float(value) for name, value in values.items()}
         if not all(map(math.isfinite, tags.values())):
             raise noisy.NotFiniteError(f"step {step}: training diverged: {tags}")
         for tag, value in tags.items():
@@ -683,12 +661,12 @@ class Run:
             "noise_applied": {name: [w.times_applied, w.opportunities] for name, w in noises},
         }
         self._write("result.json", json.dumps(self.result, indent=2) + "\n")
-        self._delete("checkpoint.pt", "checkpoint.pt.tmp")
+        self._delete("checkpoint.pt")
         say(f"{self.folder} is finished after {step} steps: {self.last_test}")
 
     def _delete(self, *patterns):
         for pattern in patterns:
-            for path in self.folder.glob(pattern):
+            for path in [*self.folder.glob(pattern), *self.folder.glob(f"{pattern}.tmp")]:
                 path.unlink()
 
     def _write(self, name, content):

@@ -353,9 +353,10 @@ def updater(loss, network, optimizer, args):
     """Return update(*inputs) -> curves: one step of the optimizer on loss(network, *inputs).
 
     Numbers among the inputs may change from one update to the next. The optimizer may be any whose
-    step() needs no closure. Loss and gradient in one compiled graph are faster than backward().
+    step() needs no closure.
     """
-    # the loss as forward() of a module, because functional_call() swaps parameters only in there
+    # Loss and gradient in one compiled graph are faster than backward(). functional_call() swaps
+    # the parameters of a module while its forward() runs: here that is the loss.
     module = nn.ModuleList([network])
     module.forward = functools.partial(loss, network)
     parameters = dict(module.named_parameters())
@@ -419,12 +420,11 @@ def say(text):
 def compiled(function):
     """Compile a function as one graph; where that fails, say why and go on without."""
     graph = torch.compile(function, fullgraph=True, dynamic=False, isolate_recompiles=True)
-    is_new = True
 
     def call(*inputs):
-        nonlocal graph, is_new
-        if is_new:  # Ctrl-C reaches the compiler, too, which must not end by it
-            signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
+        nonlocal graph
+        # Ctrl-C would reach the compiler, too, and end it
+        allowed = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
         try:
             return graph(*inputs)
         except torch._dynamo.exc.FailOnRecompileLimitHit:
@@ -436,9 +436,7 @@ def compiled(function):
             graph = function
             return function(*inputs)
         finally:
-            if is_new:
-                is_new = False
-                signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)
+            signal.pthread_sigmask(signal.SIG_SETMASK, allowed)
 
     return call
 
@@ -472,10 +470,6 @@ def train(args, stop=lambda: 0):
 class Run:
     """The run's folder: what is written into it, and read again to resume."""
 
-    # in the order in which --overwrite deletes them: without result.json a run is not finished
-    FILES = ["result.json", "checkpoint.pt", "policy.pt", "policy_*.pt", "eval.csv", "config.json"]
-    FILES += ["robustness.csv", "robustness.csv.gz", "events.out.tfevents.*"]
-
     def __init__(self, args, env):
         """Open the folder; exit if another process uses it, or if it holds a different run."""
         self.args, self.env = args, env
@@ -487,8 +481,10 @@ class Run:
             self.lock = (self.folder / ".lock").open("a")
         with fail_on(BlockingIOError, f"another process trains in {self.folder}: wait for it", 1):
             fcntl.lockf(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # as long as it is open
-        if args.overwrite:
-            self._delete(*self.FILES, *(f"{name}.tmp" for name in self.FILES))
+        if args.overwrite:  # in this order: without result.json a run is not finished
+            self._delete("result.json", "checkpoint.pt", "policy.pt", "policy_*.pt", "eval.csv")
+            self._delete("config.json", "robustness.csv", "robustness.csv.gz")
+            self._delete("events.out.tfevents.*")
         new = noisy.describe_run(__file__, asdict(args), asdict(Args()), env)
         new["versions"]["torch"] = torch.__version__
         new["matmul_precision"] = torch.get_float32_matmul_precision()
@@ -499,12 +495,13 @@ class Run:
         if self.config["script_sha256"] != new["script_sha256"]:
             say("the script has changed since the run began; if it matters, use --exp-name")
         self.is_finished = (self.folder / "result.json").exists()
-        begun = "compiling, which takes a while, then training" if args.compile else "training"
+        begun = "training (the first updates wait for the compiler)" if args.compile else "training"
         say(f"{self.folder} is finished" if self.is_finished else f"{begun}: {self.folder}")
 
     def resume(self, state):
         """Restore {name: part with state_dict()} from a checkpoint; return its step, or 0."""
-        self.state, self.eval_csv = state, "step,episode,episodic_return,episodic_length,success\n"
+        self.state = state
+        self.eval_csv = "step,episode,episodic_return,episodic_length,success\n"  # all of the file
         step, processor_seconds = 0, 0.0
         path = self.folder / "checkpoint.pt"
         if path.exists():
@@ -535,6 +532,7 @@ class Run:
         if step == 0:
             self._log_hyperparameters()
         total = self.args.total_timesteps
+        # disable=None: a bar on a terminal alone
         self.bar = tqdm(total=total, initial=step, file=sys.stdout, disable=None, smoothing=0)
         self.first_step = self.saved_step = step
         self.last_test, self.begun, self.printed = "", time.monotonic(), -math.inf
@@ -569,10 +567,7 @@ class Run:
         speed = (step - self.first_step) / (now - self.begun)
         tags = {"charts/SPS": speed}
         for group, values in groups.items():
-            for name, value in values.items():
-                if torch.is_tensor(value) and value.numel() != 1:
-                    fail(f"{group}/{name} is no number: take its mean()", 1)
-                tags[f"{group}/{name}"] = float(value)
+            tags |= {f"{group}/{name}": float(value) for name, value in values.items()}
         if not all(map(math.isfinite, tags.values())):
             raise noisy.NotFiniteError(f"step {step}: training diverged: {tags}")
         for tag, value in tags.items():
@@ -625,12 +620,12 @@ class Run:
             "noise_applied": {name: [w.times_applied, w.opportunities] for name, w in noises},
         }
         self._write("result.json", json.dumps(self.result, indent=2) + "\n")
-        self._delete("checkpoint.pt", "checkpoint.pt.tmp")
+        self._delete("checkpoint.pt")
         say(f"{self.folder} is finished after {step} steps: {self.last_test}")
 
     def _delete(self, *patterns):
         for pattern in patterns:
-            for path in self.folder.glob(pattern):
+            for path in [*self.folder.glob(pattern), *self.folder.glob(f"{pattern}.tmp")]:
                 path.unlink()
 
     def _write(self, name, content):

@@ -55,7 +55,7 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
     ("trains", "ppo", "and learns another"): [  # acts with a copy that was right at the start
         IMPORT,
         before("        self.actor_logstd = nn.", "self.first = copy.deepcopy(self.actor_mean)"),
-        ("in_numpy(self.actor_mean), self", "in_numpy(self.first), self"),
+        ("in_numpy(agent.actor_mean), agent", "in_numpy(agent.first), agent"),
     ],
     ("acts", "td3", "actions in training are"): [
         IMPORT,
@@ -74,9 +74,6 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
     ("trains", "td3", "makes (16, 16) of (16, 1) and (16,)"): [(".squeeze(1) for", " for")],
     ("trains", "td3", "critic_loss() learns a layer that was replaced"): [
         before("            curves |= update_critic(", "critic.networks[0][4] = nn.Linear(256, 1)")
-    ],
-    ("trains", "sac", "losses/alpha is no number: take its mean()"): [
-        ('"alpha": alpha}', '"alpha": log_prob}')
     ],
     ("trains", "sac", "takes a time limit for an end"): [
         (

@@ -307,7 +307,7 @@ def test_actions_at_the_bounds_are_inside_the_space(algorithm, dtype, tmp_path):
             if algorithm == "PPO":
                 agent = ppo.Agent(env).requires_grad_(False)
                 agent.actor_mean[-1].bias += sign * 100
-                action = ppo.make_policy(agent, ppo.Normalizer((2,)), env)(observation)
+                action = ppo.make_policy(agent, ppo.Normalizer(0.0, 1.0), env)(observation)
             else:
                 actor = script.Actor(env).requires_grad_(False)
                 action = actor.policy(observation, torch.tensor([sign * 1000.0]))

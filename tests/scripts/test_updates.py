@@ -739,8 +739,9 @@ def test_signals_that_end_the_compiler_wait_until_it_is_done(monkeypatch):
     monkeypatch.setattr(torch, "compile", lambda function, **kwargs: function)
     update = sac.compiled(function)
     update()
-    update()
-    assert masks == [set(sac.STOPPING), set()]
+    update()  # it may be compiled again, for other sizes
+    assert masks == [set(sac.STOPPING)] * 2
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == set()
 
 
 # PARTS
@@ -777,7 +778,7 @@ def hooked(layer):
         ([nn.Linear(3, 4), nn.Tanh(), nn.Linear(4, 4), nn.ReLU(), nn.Linear(4, 2)], True),
         ([nn.Linear(3, 4), nn.GELU(), nn.Linear(4, 2)], False),
         ([Derived(3, 2)], False),
-        ([nn.Linear(3, 2, bias=False)], False),
+        ([nn.Linear(3, 2, bias=False)], True),
         ([nn.utils.parametrizations.spectral_norm(nn.Linear(3, 2))], False),
         ([nn.utils.spectral_norm(nn.Linear(3, 2))], False),  # the old one, by a hook
         ([nn.Linear(3, 2), hooked(nn.Tanh())], False),
@@ -796,9 +797,7 @@ def test_a_network_acts_in_numpy_as_in_pytorch(layers, translated):
 
 def test_normalized_numbers_are_clipped():
     """Otherwise they are Gymnasium's: test_ppo_trains_as_a_plain_implementation."""
-    assert ppo.Normalizer((2,)).normalize(np.array([1e6, -1e6])).tolist() == [10, -10]
-    assert [ppo.RewardScaler().scale(x, False, 0.9) for x in (1e9, -1e9)] == [10, -10]
-    assert np.isnan(ppo.RewardScaler().scale(np.nan, False, 0.9))  # so that the run ends
+    assert ppo.Normalizer(0.0, 1.0).normalize(np.array([1e6, -1e6])).tolist() == [10, -10]
 
 
 def play(lengths):
