@@ -161,9 +161,12 @@ def find_players(paths):
 
 
 def step_of(player):
-    """Return the step of an unfinished run's latest test, which policy.pt is of."""
-    lines = (player.folder / "eval.csv").read_text("utf-8").splitlines()
-    return int(lines[-1].partition(",")[0])
+    """Return the step that a run's policy.pt is of.
+
+    The last test in eval.csv may be an earlier one, where a run was resumed and stopped again.
+    """
+    script, _ = import_script(player)
+    return script.read_state(player.folder / "policy.pt")["step"]
 
 
 def read_conditions(args):
@@ -179,7 +182,7 @@ def read_conditions(args):
 
 
 def import_script(player):
-    """Return the script that trained a policy, as a module, and whether its text is the same.
+    """Return the script that trained a policy, as a module, and whether its text is another now.
 
     Raises ValueError if it is not there.
     """
@@ -195,7 +198,7 @@ def import_script(player):
                 spec.loader.exec_module(script)
                 SCRIPTS[path] = script, hashlib.sha256(path.read_bytes()).hexdigest()
             script, sha256 = SCRIPTS[path]
-            return script, sha256 in player.run.config.get("script_sha256", sha256)
+            return script, player.run.is_of_another_text(sha256)
     raise ValueError(f"its script {name} is neither in the current folder nor in {PROJECT}")
 
 
@@ -285,7 +288,7 @@ def check_players(players, conditions, bad, args):
     for player in players:
         try:
             refuse_foreign_module(player, player.run.environment)
-            if not import_script(player)[1]:
+            if import_script(player)[1]:
                 changed.add(player.run.script)
             with load(player) as (env, _):
                 modes = env.metadata.get("render_modes", [])

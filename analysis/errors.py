@@ -37,6 +37,7 @@ def with_place(error, plain=()):
         return " ".join(str(error).split()) or type(error).__name__
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if not any(part in frame.filename for part in LIBRARIES)]
+    own = own or frames  # where the project itself is installed among the libraries
     place = frames[-1] if Path(own[-1].filename).resolve() in PROGRAMS else own[-1]
     return f"{in_words(error)} ({place.filename}, line {place.lineno})"
 

@@ -93,6 +93,10 @@ class Run:
         more["script"] = ", ".join(script[:10] for script in scripts)
         return {**self.config.get("versions", {}), **more}
 
+    def is_of_another_text(self, sha256):
+        """Tell whether another text of its script than this one made it, or a part of it."""
+        return self.config.get("script_sha256", sha256) != sha256
+
     @property
     def idle_noises(self):
         """The names of the noises that changed nothing in the training of a finished run."""

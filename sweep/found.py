@@ -30,7 +30,7 @@ class Found(NamedTuple):
     run: Run | None = None
     differences: tuple[str, ...] = ()  # of its arguments from those that the sweep wants
     other_release: str = ""  # that made it
-    other_text: bool = False  # of the script made it
+    other_text: bool = False  # of the script made it, or a part of it
 
 
 def look(planned, with_curve=False):
@@ -44,8 +44,7 @@ def look(planned, with_curve=False):
     if run.release != NOW:
         return Found(run=run, other_release=run.release, finished=run.finished)
     differences = tuple(differences_of(run, planned)) if planned.args is not None else ()
-    sha256 = run.config.get("script_sha256")
-    other_text = bool(planned.script and sha256) and sha256 != planned.script.sha256
+    other_text = bool(planned.script) and run.is_of_another_text(planned.script.sha256)
     finished = run.finished and not differences
     return Found(finished=finished, run=run, differences=differences, other_text=other_text)
 

@@ -313,6 +313,8 @@ def parse(argv):
     add("--blocks", type=Path, metavar="FILE", help="a csv file for the speed of every block")
     end = argv.index("--") if "--" in argv else len(argv)
     options = parser.parse_args(argv[:end])
+    if options.pairs < 1:
+        parser.error("argument --pairs: it must be at least 1")
     options.flags = argv[end + 1 :]
     options.cores = sorted(os.sched_getaffinity(0), reverse=True)
     return options

@@ -152,10 +152,11 @@ def main():
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
     parser.add_argument("--trials", type=int, default=2000)
-    parser.add_argument("--tables", nargs="+", type=int, default=[1, 2, 3, 4])
+    tables = dict(enumerate((power_of_a_confirmation, false_claims, whole_choices, levels), 1))
+    parser.add_argument("--tables", nargs="+", type=int, choices=tables, default=tables)
     args = parser.parse_args()
     for number in args.tables:
-        (power_of_a_confirmation, false_claims, whole_choices, levels)[number - 1](args.trials)
+        tables[number](args.trials)
 
 
 def power_of_a_confirmation(trials):

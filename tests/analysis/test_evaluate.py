@@ -239,9 +239,11 @@ def test_a_full_disk_leaves_the_previous_file(runs, monkeypatch, capsys):
 
 def test_a_script_that_is_not_there_or_has_changed_is_told(runs, capsys):
     run_dir = one(runs, "PPO")
-    edit_config(run_dir, script_sha256=64 * "0")
-    assert main(Args((run_dir,), episodes=1)) == 0
-    assert "ppo_continuous_noisy.py has changed" in capsys.readouterr().err
+    sha256 = json.loads((run_dir / "config.json").read_text())["script_sha256"]
+    for others in (64 * "0", f"{64 * '0'}, {sha256}"):  # which resumed it
+        edit_config(run_dir, script_sha256=others)
+        assert main(Args((run_dir,), episodes=1)) == 0
+        assert "ppo_continuous_noisy.py has changed" in capsys.readouterr().err
     edit_config(run_dir, script="wide_continuous_noisy.py")
     assert main(Args((run_dir,), episodes=1)) == 2
     assert "its script wide_continuous_noisy.py is neither" in capsys.readouterr().err
@@ -250,6 +252,8 @@ def test_a_script_that_is_not_there_or_has_changed_is_told(runs, capsys):
 def test_an_unfinished_run_plays_only_if_it_is_named_and_stores_nothing(runs, capsys):
     run_dir = one(runs, "PPO")
     (run_dir / "result.json").unlink()
+    header, _ = (run_dir / "eval.csv").read_text().split("\n", 1)
+    (run_dir / "eval.csv").write_text(header + "\n")  # it has been resumed from before its tests
     before = files(run_dir)
     assert main(Args((run_dir,), episodes=2)) == 0
     assert "its policy of step 256 is tested" in capsys.readouterr().out
@@ -294,7 +298,7 @@ def test_the_table_of_known_returns(capsys):
 
 def test_what_is_never_pooled_is_a_row_of_its_own(tmp_path):
     """Releases and other settings; and a policy of step 10 is not one of the end."""
-    (tmp_path / "eval.csv").write_text("step\n10,0,1.0,1,\n")
+    torch.save({"step": 10}, tmp_path / "policy.pt")
     names = "PPO", "ppo_continuous_noisy.py", "E", "ppo_continuous_noisy", BASELINE, BASELINE, 1, 99
 
     def named(*runs):

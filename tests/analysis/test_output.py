@@ -39,11 +39,13 @@ def test_a_reader_that_leaves_stops_nothing():
     ("caller", "place"),
     [("/my/env.py", r"\(/my/env\.py, line 2"), (evaluate.__file__, "linalg.py")],
 )
-def test_an_error_is_placed_in_the_code_of_a_user(caller, place):
+def test_an_error_is_placed_in_the_code_of_a_user(caller, place, monkeypatch):
     """Where nothing of a user's is on the way, in the package that raised it."""
     with pytest.raises(np.linalg.LinAlgError) as raised:
         exec(compile("import numpy\nnumpy.linalg.inv(numpy.zeros((2, 2)))", caller, "exec"))
     assert re.match(f"LinAlgError: Singular matrix .*{place}", with_place(raised.value))
+    monkeypatch.setattr("analysis.errors.LIBRARIES", [""])  # also the project is among them
+    assert "linalg.py" in with_place(raised.value)
 
 
 @pytest.mark.slow
