@@ -13,6 +13,7 @@ import zlib
 from collections.abc import Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from operator import index
 from pathlib import Path
 from typing import Any
 
@@ -198,52 +199,37 @@ def read_run(folder, phase="", *, with_curve=True):
 def read_identity(folder, phase=""):
     """Read config.json: what a run is, finished or not. Raises DamageError."""
     config = read_json(folder / "config.json")
-
-    def get(values, name, is_good, default=None):
-        value = values.get(name, default)
-        if not is_good(value):
-            raise DamageError(f"config.json: {name} is {shortened(value)}")
-        return value
-
-    def number(least):
-        return lambda value: type(value) is int and value >= least
-
-    def text(is_good):
-        return lambda value: isinstance(value, str) and is_good(value)
-
-    def is_list_of_text(value):
-        return isinstance(value, list) and all(isinstance(item, str) for item in value)
-
-    def configuration(noise, noise_rate, default=None):
-        noises, rates = args.get(noise, default), args.get(noise_rate, default)
-        try:
-            return Configuration.read(noises, rates, stored=True)
-        except (ValueError, TypeError, KeyError) as error:
-            reason = str(error).partition("\n")[0]
-            named = f"{noise} {shortened(noises)} at {shortened(rates)}"
-            raise DamageError(f"config.json: {named}: {reason}") from None
-
-    args = get(config, "args", lambda value: isinstance(value, dict))
-    get(config, "defaults", lambda value: isinstance(value, dict), default={})
-    get(config, "versions", lambda value: isinstance(value, dict), default={})
-    get(args, "max_episode_steps", lambda value: value is None or number(1)(value))
-    get(args, "eval_episodes", number(1))
-    get(args, "env_kwargs", is_list_of_text, default=[])
-    algorithm = get(config, "algorithm", text(ALGORITHM.fullmatch))
-    return Run(
-        folder=folder,
-        phase=phase,
-        config=config,
-        algorithm=algorithm,
-        script=get(config, "script", text(str.isprintable), default=f"{script_name(algorithm)}.py"),
-        environment=get(args, "env_id", text(ENV_ID.fullmatch)),
-        exp_name=get(args, "exp_name", text(str.isprintable)),
-        configuration=configuration("noise", "noise_rate"),
-        tested_under=configuration("test_noise", "test_noise_rate", default=[]),
-        seed=get(args, "seed", number(0)),
-        total_timesteps=get(args, "total_timesteps", number(1)),
-        release=release(config),
-    )
+    try:
+        args, algorithm = config["args"], config["algorithm"]
+        noise, test_noise = (
+            Configuration.read(args.get(name, none), args.get(f"{name}_rate", none), stored=True)
+            for name, none in (("noise", None), ("test_noise", []))
+        )
+        run = Run(
+            folder=folder,
+            phase=phase,
+            config=config,
+            algorithm=algorithm,
+            script=config.get("script", f"{script_name(algorithm)}.py"),
+            environment=args["env_id"],
+            exp_name=args["exp_name"],
+            configuration=noise,
+            tested_under=test_noise,
+            seed=index(args["seed"]),
+            total_timesteps=index(args["total_timesteps"]),
+            release=release(config),
+        )
+        index(args["eval_episodes"])
+        if not isinstance(config.get("defaults", {}), dict):
+            raise TypeError("defaults is no object")
+        names = algorithm, run.environment, run.script, run.exp_name, run.tested
+        are_names = ALGORITHM.fullmatch(algorithm) and ENV_ID.fullmatch(run.environment)
+        if not are_names or not all(map(str.isprintable, names)):
+            raise ValueError(f"not all of {names} are names")
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        reason = str(error).partition("\n")[0]
+        raise DamageError(f"config.json: {type(error).__name__}: {reason}") from None
+    return run
 
 
 def script_name(algorithm):
@@ -260,7 +246,7 @@ def read_result_of(run):
     mean = result.get("final_return_mean")
     with naming(path):  # an integer may be too large
         if type(mean) not in (int, float) or not math.isfinite(mean):
-            raise ValueError(f"final_return_mean is {shortened(mean)}")
+            raise ValueError(f"final_return_mean is {mean!r}")
     return result
 
 
@@ -273,42 +259,27 @@ def read_curve(run):
     episodes = run.args["eval_episodes"]
     path = run.folder / "eval.csv"
     with naming(path):
-        text = path.read_text("utf-8")
-        header, _, body = text.partition("\n")
-        names = header.rstrip("\r").split(",")
-        tells_success = names == [*EVAL_COLUMNS, "success"]
-        if not tells_success and names != EVAL_COLUMNS:
-            raise ValueError("unexpected header")
-        if not text.endswith("\n"):
-            raise ValueError("the last line is half-written")
-        if not body:
-            raise ValueError("no evaluation")
-        if tells_success:  # empty cells where the environment tells nothing
-            body = body.replace("\r\n", "\n").replace(",\n", ",nan\n")
-        numbers = np.loadtxt(body.splitlines(), delimiter=",", ndmin=2, comments=None)
-        whole = numbers.shape[1] == len(names) and len(numbers) % episodes == 0
-        if not whole or not np.isfinite(numbers[:, :4]).all():
-            raise ValueError("incomplete or non-numeric lines")
+        header, *lines = path.read_text("utf-8").splitlines()
+        names = header.split(",")
+        if names not in (EVAL_COLUMNS, [*EVAL_COLUMNS, "success"]) or not lines:
+            raise ValueError("unexpected header, or no evaluation")
+        # the cell of success is empty where the environment tells nothing
+        lines = [f"{line}nan" if line.endswith(",") else line for line in lines]
+        numbers = np.loadtxt(lines, delimiter=",", ndmin=2, comments=None)
         tests = numbers.reshape(-1, episodes, len(names))
         step, episode, returns = tests[..., 0], tests[..., 1], tests[..., 2]
-        if (episode != np.arange(episodes)).any() or (step != step[:, :1]).any():
-            raise ValueError("an evaluation is incomplete")
-        if (np.diff(step[:, 0]) <= 0).any():
-            raise ValueError("steps do not ascend")
+        is_whole = (episode == np.arange(episodes)).all() and (step == step[:, :1]).all()
+        is_whole &= np.isfinite(tests[..., :4]).all()
+        if not is_whole or (np.diff(step[:, 0]) <= 0).any():
+            raise ValueError("an evaluation is incomplete or not in its place")
     returns = returns.mean(axis=1)
     last = run.result["final_return_mean"]
     if not math.isclose(returns[-1], last, rel_tol=1e-3, abs_tol=1e-3):
         raise DamageError("eval.csv and result.json disagree on the final return")
     rates = None
-    if tells_success and not np.isnan(tests[..., 4]).all():
+    if len(names) > 4 and not np.isnan(tests[..., 4]).all():
         rates = 100 * np.nan_to_num(tests[..., 4]).mean(axis=1)  # what is not told was no success
     return Curve(step[:, 0].astype(int), returns, rates)
-
-
-def shortened(value):
-    """Return a value of a damaged file as a part of a line."""
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 @contextmanager

@@ -135,20 +135,16 @@ def usual_config(configs):
     """Return what most runs of a study have, as a config with "args" and "defaults".
 
     An argument that a config lacks, because a script has it since then, had the default that the
-    others name, or, of runs of version 0.3, the value that most have. Of equally frequent sets of
-    arguments, that of the longest runs is taken.
+    others name, or, of runs of version 0.3, their value: where these differ, that of the longest.
+    Of equally frequent sets of arguments, that of the longest runs is taken.
     """
     longest_first = sorted(configs, key=lambda c: -c["args"].get("total_timesteps", 0))
-    values, defaults = defaultdict(Counter), defaultdict(Counter)
-    for config in longest_first:
-        for name, value in settings_of(config).items():
-            values[name][json.dumps(value)] += 1
-        for name, value in config.get("defaults", {}).items():
-            defaults[name][json.dumps(value)] += 1
-    lacking = {name: json.loads(counts.most_common(1)[0][0]) for name, counts in values.items()}
-    for name, counts in defaults.items():
-        lacking[name] = json.loads(counts.most_common(1)[0][0])
-    named = {name: lacking[name] for name in values}
+    named, defaults = {}, {}
+    for config in reversed(longest_first):
+        named |= settings_of(config)
+        defaults |= config.get("defaults", {})
+    lacking = named | defaults
+    named = {name: lacking[name] for name in named}
     complete = Counter(json.dumps(named | settings_of(config)) for config in longest_first)
     args = json.loads(complete.most_common(1)[0][0])  # of equals, the first one counted
     return {"args": args, "defaults": lacking}

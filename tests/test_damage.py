@@ -53,20 +53,26 @@ def text(name, change):
 
 A = "RandomNormalNoisyReward(1.0)"
 DAMAGE = {  # and what is said of it
-    "args that are no object": (config(args=["--seed", 1]), r"args is ['--seed', 1]"),
-    "no versions": (config(versions=None), "versions is None"),
-    "a seed that is true": (config(seed=True), "seed is True"),
-    "a time limit as text": (config(max_episode_steps="100"), "max_episode_steps is '100'"),
-    "an escape sequence": (config(exp_name="\x1b[31m"), r"exp_name is '\x1b[31m'"),
+    "args that are no object": (config(args=["--seed", 1]), "config.json: "),
+    "no versions": (config(versions=None), "config.json: "),
+    "no defaults": (
+        text("config.json", lambda text: text.replace("{", '{"defaults": 1, ', 1)),
+        "defaults is no object",
+    ),
+    "a seed as text": (config(seed="1"), "'str' object"),
+    "tests of no number": (config(eval_episodes=None), "'NoneType' object"),
+    "arguments of other types": (config(env_kwargs=[1, "a:2"]), "config.json: TypeError: "),
+    "a list as name": (config(exp_name=["a"]), "config.json: TypeError: "),
+    "an escape sequence": (config(exp_name="\x1b[31m"), r"'\x1b[31m'"),
     "an unknown noise": (config(noise=["RandomX(1)"], noise_rate=[1.0]), "RandomX"),
     "a rate of 5": (config(noise_rate=[5.0], noise=[A]), "5.0"),
-    "a noise without a rate": (config(noise=[A], noise_rate=[]), "noise ["),
-    "a path as algorithm": (config(algorithm="x/../../ESCAPED"), "algorithm is 'x/../../ESCAPED'"),
+    "a noise without a rate": (config(noise=[A], noise_rate=[]), "without a noise rate"),
+    "a path as algorithm": (config(algorithm="x/../../ESCAPED"), "'x/../../ESCAPED'"),
     "an infinite result": (
         text("result.json", lambda text: re.sub(r'_mean": [^,}]*', '_mean": 1e999', text)),
         "final_return_mean is inf",
     ),
-    "half a line": (text("eval.csv", lambda text: text[:-5]), "half-written"),
+    "half a line": (text("eval.csv", lambda text: text[:-5]), "columns"),
     "no text": (lambda folder: (folder / "eval.csv").write_bytes(b"\xff\n"), "eval.csv: "),
 }
 
@@ -160,17 +166,13 @@ def test_what_is_no_run_is_left_alone(case, capsys):
     assert "delete" not in out + err and not err
 
 
-def test_one_phase_of_a_choice_is_not_analysed_alone(case, tmp_path, capsys):
+def test_one_phase_of_a_choice_is_not_analysed_alone(case, capsys):
     """There fewer comparisons would be corrected for."""
     shutil.copytree(case.choice / "search", case.choice / "confirmation")
     with pytest.raises(SystemExit) as end:
         analyze.main(analyze.Args(case.choice / "confirmation"))
     assert end.value.code == 2
     assert f"all of it with --runs-dir {case.choice}\n" in capsys.readouterr().err
-    shutil.rmtree(case.runs)
-    with pytest.raises(SystemExit):
-        analyze.main(analyze.Args(tmp_path))
-    assert f"there are some in {case.choice}: name it" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -57,7 +57,5 @@ def test_damaged_evaluations_are_told(name, tmp_path):
     text = path.read_text()
     path.write_text(DAMAGED[name](text))
     assert path.read_text() != text
-    with pytest.raises(DamageError, match="^eval.csv") as told:
+    with pytest.raises(DamageError, match="^eval.csv"):
         read_run(path.parent)
-    is_mixed = "an evaluation is incomplete" in str(told.value)
-    assert is_mixed == (name == "an episode of each of two tests")
