@@ -35,7 +35,7 @@ from analysis.formatting import WHOLE_WORDS, in_markdown, listed, shown, text_ta
 from analysis.latex import latex_table
 from analysis.report import Results, write_report
 from analysis.robustness import analyse_robustness, read_robustness
-from analysis.runs import MORE_TO_COME, few, finished, in_short, left_out, read_runs
+from analysis.runs import MORE_TO_COME, finished, in_short, left_out, read_runs
 from analysis.studies import make_studies, version_notes
 from analysis.style import COLUMN, PAGE
 from analysis.tables import in_words, lopsided_notes, make_tables, success_table, table_of
@@ -68,17 +68,6 @@ class Args:
     smallest_gain: float | None = None
     """the smallest gain that matters, in percent (of success: in percentage points): a noise whose
     interval excludes it has the verdict "no such gain\""""
-
-
-def no_finished_run(runs_dir):
-    """End with an error that says where there are finished runs, if that is near `runs_dir`."""
-    if is_run(runs_dir):
-        fail(f"{runs_dir} is a run itself: name the folder that it is in")
-    results = runs_dir.glob("*/*/**/result.json")  # runs_dir itself has damaged ones at most
-    folders = {path.parents[1] for path in results if is_run(path.parent)}
-    folders = sorted({str(path.parent if is_phase(path) else path) for path in folders})
-    where = f"; there are some in {', '.join(folders)}: name it with --runs-dir" if folders else ""
-    fail(f"no finished run in {runs_dir}{where}")
 
 
 def verdicts_in_short(results):
@@ -120,16 +109,14 @@ def write_table(out, table, latex, inches):
 
 
 def write_results(out, results, args):
-    """Write all tables, all figures and the report; return the names of files from before."""
+    """Write all tables, all figures and the report."""
     out.mkdir(parents=True, exist_ok=True)
-    before = {path: path.stat().st_mtime_ns for path in out.iterdir() if path.is_file()}
     for table in results.tables.values():
         write_table(out, table, args.latex, args.figure_width)
     drawn = figures(results.studies, results.tables, args.band)
     for drawing in drawn:
         write_figure(out, drawing, args.latex, args.figure_width)
     write_report(out, results, drawn)
-    return sorted(path.name for path, time in before.items() if path.stat().st_mtime_ns == time)
 
 
 def terminal_width():
@@ -142,11 +129,8 @@ def print_left_out(missing, width):
     print(text_table(replace(missing, view=missing.view[MISSING_IN_SHORT][:20]), width))
 
 
-def print_results(out, results, older):
-    """Print the verdicts, what to know about them, and where the report is.
-
-    older: names of files in the same folder that were there before.
-    """
+def print_results(out, results):
+    """Print the verdicts, what to know about them, and where the report is."""
     width, tables = terminal_width(), results.tables
     of_success = results.studies[0].metric == SUCCESS
     unit = " (rates of success in percent, differences in percentage points)" if of_success else ""
@@ -168,9 +152,6 @@ def print_results(out, results, older):
     say(results.overview)
     for note in results.notes + results.versions:
         say(f"note: {note}")
-    if older:
-        names = few(pd.Series(older))
-        say(f"note: {counted(len(older), 'file')} in {out} not of this analysis: {names}")
     if results.problems:
         print()
         say(f"WARNING: {results.problems}")
@@ -190,7 +171,7 @@ def analyse(args, entries, choice):
     if not studies:
         if len(missing.frame):
             print_left_out(missing, terminal_width())
-        no_finished_run(args.runs_dir)
+        fail(f"no finished run in {args.runs_dir}: name the folder of your runs with --runs-dir")
     compared = as_chosen(compare_all(studies, args.smallest_gain), choice)
     tests, unreadable = read_robustness(finished(entries), metric)
     robustness_tables, robustness = analyse_robustness(tests, metric)
@@ -292,10 +273,10 @@ def main(args):
     entries = read_runs(args.runs_dir)
     results = analyse(args, entries, choice)
     try:
-        older = write_results(out, results, args)
+        write_results(out, results, args)
     except OSError as error:
         fail(f"--out: {error}")
-    print_results(out, results, older)
+    print_results(out, results)
     return int(any(entry.status == "corrupt" for entry in entries))
 
 

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import jinja2
 import pandas as pd
-from markupsafe import Markup, escape
 
 from analysis.comparisons import are_in
 from analysis.figures import COLUMN_END
@@ -111,17 +110,6 @@ def is_number(text):
     return bool(re.match("(< )?[-+]?([0-9]|inf)", text))
 
 
-def breakable(text):
-    """Mark where a browser may break a cell: a noise between its words, but never a number."""
-    if is_number(text):
-        for sign in (" \u00b1 ", ", ", "< "):
-            text = text.replace(sign, sign.replace(" ", "\u00a0"))
-        whole = Markup('<span class="whole">{}</span>')  # a browser would break "1e-05"
-        parts = [whole.format(part) if "e-" in part else part for part in text.split(" ")]
-        return Markup(" ").join(parts)
-    return Markup(re.sub("(?<=[a-z0-9])(?=[A-Z(])", "<wbr>", str(escape(text))))
-
-
 def write_report(out, results, drawn):
     """Write report.html: the effects and the verdicts first, then everything else.
 
@@ -148,7 +136,7 @@ def write_report(out, results, drawn):
     pages = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True
     )
-    pages.filters |= {"breakable": breakable, "embedded": embedded, "tally": tally}
+    pages.filters |= {"embedded": embedded, "tally": tally}
     pages.tests["numeric"] = is_number
     used = {name for texts in tables.values() for _, text in texts for name in text}
     used |= {title(name) for table in results.tables.values() for name in table.frame}

@@ -43,30 +43,14 @@ def test_nothing_to_read_or_no_place_to_write_is_an_error(case, tmp_path, capsys
     assert ("--metric" in printed.err) == (case == "no success")
 
 
-def test_results_go_beside_the_runs(tmp_path, monkeypatch, capsys):
+def test_results_go_beside_the_runs(tmp_path, monkeypatch):
     write_run(tmp_path / "runs", [1])
-    for _ in range(2):  # its own results are renewed
-        main(analyze.Args(runs_dir=tmp_path / "runs"))
-    assert "not of this analysis" not in capsys.readouterr().out
-    (tmp_path / "runs/results/curves_of_runs_deleted_since.svg").touch()
     main(analyze.Args(runs_dir=tmp_path / "runs"))
-    assert "not of this analysis: curves_of_runs_deleted_since.svg\n" in capsys.readouterr().out
     monkeypatch.chdir(tmp_path)
     for out in (Path("results/../runs"), Path("")):
         with pytest.raises(SystemExit):
             main(analyze.Args(runs_dir=tmp_path / "runs", out=out))
     assert list(tmp_path.rglob("report.html")) == [tmp_path / "runs/results/report.html"]
-
-
-def test_a_run_is_no_folder_of_runs(tmp_path, capsys):
-    folder = write_run(tmp_path, [1])
-    with pytest.raises(SystemExit):
-        main(analyze.Args(runs_dir=folder))
-    assert capsys.readouterr().err.endswith("is a run itself: name the folder that it is in\n")
-    (folder / "eval.csv").write_text("damaged")
-    with pytest.raises(SystemExit):  # the folder is named once: it has no other finished runs
-        main(analyze.Args(runs_dir=tmp_path))
-    assert capsys.readouterr().err == f"error: no finished run in {tmp_path}\n"
 
 
 @pytest.mark.parametrize(
