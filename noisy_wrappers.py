@@ -1276,11 +1276,13 @@ class Configuration:
         """Read two cells of a csv file, :attr:`columns` or :attr:`noise` and :attr:`noise_rate`."""
         if not noise:
             return cls()
-        schedules = []
+        noises, schedules = split_noises(noise), []
         for rate in str(noise_rate).split(" + "):
             ends = [float(end) for end in re.split(":| to ", rate)]
             schedules.append((ends[0], ends[-1]))  # of a single number, twice
-        return cls(tuple(split_noises(noise)), tuple(schedules))
+        if len(schedules) != len(noises):
+            raise ValueError(f"{noise!r} needs a rate for each noise, got {noise_rate!r}")
+        return cls(tuple(noises), tuple(schedules))
 
     def for_tests(self) -> Self:
         """Return it, or raise ValueError if no policy can be tested under it.
@@ -1321,11 +1323,6 @@ class Configuration:
 
         ends = self.rates or [(0.0, 0.0)]
         return " + ".join(text(a) if a == b else f"{text(a)} to {text(b)}" for a, b in ends)
-
-    @property
-    def wrappers(self) -> list[str]:
-        """The names of the wrappers, in order, as they are written: perhaps with a module."""
-        return [noise.partition("(")[0] for noise in self.noises]
 
     @property
     def slug(self) -> str:
@@ -1371,11 +1368,6 @@ BASELINE = Configuration()
 def read_test_noise(noises: Sequence[str], rates: Sequence[Rate]) -> Configuration:
     """Read the noises of a run's tests, whose rate is 1 if none is given."""
     return Configuration.read(noises, [1.0] if len(noises) and not len(rates) else rates)
-
-
-def rate_order(noise_rate: str) -> tuple[tuple[float, float], ...]:
-    """Return the key that sorts rates of tables (:attr:`Configuration.noise_rate`) as numbers."""
-    return Configuration.parse("any noise", noise_rate).rates
 
 
 def split_noises(text: str) -> list[str]:
@@ -1549,16 +1541,15 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return f"step {self._steps} of an episode: the environment"
 
 
-def make_flat(env: Env, step_limit: int | None = None) -> Env:
-    """Prepare an environment for networks, whose inputs and outputs are vectors.
+def make_flat(env: Env, step_limit: int = 10_000) -> Env:
+    """Prepare an environment for networks: :class:`FiniteNumbers`, then observations are flattened.
 
-    :class:`FiniteNumbers` makes rewards floats and stops at NaN and infinity; dictionaries, tuples,
-    arrays and categories are then flattened. An environment whose spec has no time limit is cut
-    after ``step_limit`` steps, if that is given. Apply noise to the result: it goes in between, so
-    it knows the parts. SpaceError if there are no vectors; then the environment has been closed.
+    ``step_limit`` is the time limit of episodes, in steps, if neither the environment nor the user
+    sets one; an environment without a spec gets none. :func:`make_noisy` puts noise beneath
+    flattening. SpaceError if there are no vectors; then the environment has been closed.
     """
     name = env.spec.id if env.spec else str(env)
-    if step_limit and env.spec and env.spec.max_episode_steps is None:
+    if env.spec and env.spec.max_episode_steps is None:
         env = gym.wrappers.TimeLimit(env, step_limit)
     env = FiniteNumbers(env)
     space = env.observation_space
@@ -1599,15 +1590,18 @@ def make_environments(
         if not any(text in str(error) for text in known):
             raise
         raise SpaceError(str(error)) from error
-    seed_globals(args["seed"])
-    env = make_env(args["env_id"], **kwargs)
-    try:
-        noisy_env = make_noisy(env, args["noise"], args["noise_rate"])
-        return noisy_env, make_noisy(test_env, args["test_noise"], args["test_noise_rate"])
-    except ValueError as error:
-        env.close()
-        test_env.close()
-        raise SpaceError(str(error)) from error
+    with contextlib.ExitStack() as stack:  # closes them if anything is raised
+        stack.callback(test_env.close)
+        seed_globals(args["seed"])
+        env = make_env(args["env_id"], **kwargs)
+        stack.callback(env.close)
+        try:
+            noisy_env = make_noisy(env, args["noise"], args["noise_rate"])
+            noisy_test_env = make_noisy(test_env, args["test_noise"], args["test_noise_rate"])
+        except ValueError as error:
+            raise SpaceError(str(error)) from error
+        stack.pop_all()
+    return noisy_env, noisy_test_env
 
 
 def is_bounded(space: gym.spaces.Box) -> bool:
@@ -1799,8 +1793,9 @@ def play(
     ``env`` records its returns (:func:`make_noisy`); ``policy`` gives the action for an
     observation. If it has a method ``begin_episode()``, that is called after each reset: a policy
     with memory forgets there. Returns an array (episodes, 3): the true return of each, its length,
-    and its :func:`outcome`. The global generators are seeded for each episode, and restored
-    afterwards; those of ``env`` go on from the last test, so do not train in it.
+    and its :func:`outcome`. The global generators are seeded for each episode. They are restored
+    afterwards, and so are the generators of ``env`` that ``reset(seed=seed)`` keeps, as those of
+    its spaces; those that it makes anew go on from the last test, so do not train in ``env``.
     """
     results = np.zeros((episodes, 3))
     with kept_generators(env):
@@ -1942,9 +1937,6 @@ def safe_name(text: str) -> str:
 # others, and a finished one counts as done whatever it had.
 MAY_DIFFER_IN_A_RUN = {"runs_dir", "overwrite", "torch_threads", "compile"}
 MAY_DIFFER_IN_A_RUN |= {"checkpoint_frequency", "keep_policies"}
-# Runs with other values of these may stand in one row of a table, too: a GPU rounds otherwise, and
-# tests do not touch training. But a run keeps to the ones that it began with.
-MAY_DIFFER_IN_A_TABLE = MAY_DIFFER_IN_A_RUN | {"cuda", "eval_frequency"}
 
 
 def different_arguments(

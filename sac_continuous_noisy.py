@@ -38,7 +38,6 @@ from tqdm import tqdm
 import noisy_wrappers as noisy
 
 TEST_SEED = 1_000_000  # seed of the first test episode, in every test of every run
-STEP_LIMIT = 10_000  # time limit of episodes, if neither the environment nor the user sets one
 STOPPING = signal.SIGTERM, signal.SIGINT, signal.SIGHUP  # a checkpoint, then the end
 EVAL_FREQUENCY = 10_000  # default of --eval-frequency, or a tenth of the run if that is less
 LOG_STD_MIN, LOG_STD_MAX = -5, 2
@@ -94,7 +93,7 @@ class Args:
 def make_env(env_id, **kwargs):
     """Make an environment of vectors, still without noise: make_environments() adds that."""
     env = gym.make(env_id, disable_env_checker=True, **kwargs)  # make_flat() checks every step
-    return noisy.make_flat(env, STEP_LIMIT)
+    return noisy.make_flat(env)
 
 
 def mlp(inputs, outputs):

@@ -9,11 +9,11 @@ from matplotlib.patches import Patch
 
 from analysis import style
 from analysis.folders import SUCCESS
-from analysis.formatting import seeds_between
+from analysis.formatting import rate_order, seeds_between
 from analysis.power import CONFIDENCE
 from analysis.statistics import SEEDS_FOR_INTERVAL
 from analysis.verdicts import BETTER, UNCLEAR, WORSE
-from noisy_wrappers import BASELINE, rate_order
+from noisy_wrappers import BASELINE
 
 MOST_RATES = 25  # lines of a figure; of more, each noise has its rates together
 LABELS = 2.0  # inches for the names of noises, at most; in a narrow figure a part of its width

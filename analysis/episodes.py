@@ -36,11 +36,16 @@ def read_episodes(folder):
                 raise ValueError(f"a return under {condition} is not finite")
             if rows["episode"].tolist() != list(range(len(rows))):  # i begins alike everywhere
                 raise ValueError(f"episodes under {condition} are lost, repeated or out of order")
-            for name in condition.wrappers:
+            for name in wrapper_names(condition):
                 if name not in WRAPPERS and ":" not in name:  # nor one of the user's own
                     raise ValueError(f"unknown noise {name!r}")
             found[condition, environment] = episodes
     return found
+
+
+def wrapper_names(configuration):
+    """Return the names of a configuration's wrappers, in order: perhaps with a module."""
+    return [noise.partition("(")[0] for noise in configuration.noises]
 
 
 def store_episodes(folder, key, episodes):

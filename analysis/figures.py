@@ -12,14 +12,15 @@ from matplotlib.lines import Line2D
 from scipy import special
 
 from analysis import effects, style
+from analysis.episodes import wrapper_names
 from analysis.folders import RETURN, SUCCESS
-from analysis.formatting import seeds_between, seeds_of
+from analysis.formatting import rate_order, seeds_between, seeds_of
 from analysis.heatmap import heatmaps
 from analysis.power import CONFIDENCE, LEVEL
 from analysis.runs import KEYS, rows_of
 from analysis.statistics import SEEDS_FOR_INTERVAL, least_variance
 from analysis.words import slug
-from noisy_wrappers import BASELINE, rate_order
+from noisy_wrappers import BASELINE
 
 COLUMN_END = "_column"  # of the name of a figure that is as wide as a column
 INTERVAL, STD = "interval", "std"  # what a band shows
@@ -212,7 +213,7 @@ def parameter_figures(study, band):
     """Yield a Drawing for every wrapper that a study has with several parameters."""
     dotted = "" if not np.isfinite(study.finals[BASELINE]).any() else "; dotted: no noise"
     single = [config for config in study.finals if len(config.noises) == 1]  # sorted by noise
-    for wrapper, configs in groupby(single, lambda config: config.wrappers[0]):
+    for wrapper, configs in groupby(single, lambda config: wrapper_names(config)[0]):
         configs = list(configs)
         if len({config.noise for config in configs}) > 1:
             caption = (

@@ -20,10 +20,13 @@ from typing import Any
 import numpy as np
 
 from analysis.errors import fail
-from noisy_wrappers import BASELINE, MAY_DIFFER_IN_A_TABLE, Configuration, release
+from noisy_wrappers import BASELINE, MAY_DIFFER_IN_A_RUN, Configuration, release
 
 SEARCH, CONFIRMATION = PHASES = ("search", "confirmation")  # the folders of a choice
 RETURN, SUCCESS = "return", "success rate"  # the metrics: what runs are compared by
+# Runs with other values of these may stand in one row of a table, too: a GPU rounds otherwise, and
+# tests do not touch training. But a run keeps to the ones that it began with.
+MAY_DIFFER_IN_A_TABLE = MAY_DIFFER_IN_A_RUN | {"cuda", "eval_frequency"}
 # Arguments that have a column of their own in tables, or may differ there
 NOT_SETTINGS = {"env_id", "exp_name", "seed", "noise", "noise_rate"} | MAY_DIFFER_IN_A_TABLE
 ENV_ID = re.compile(r"(?:\w+(?:\.\w+)*:)?[\w./-]+")  # a module, and what Gymnasium takes for an id

@@ -16,7 +16,7 @@ import pandas as pd
 
 from analysis import verdicts
 from analysis.comparisons import are_in
-from analysis.episodes import read_episodes
+from analysis.episodes import read_episodes, wrapper_names
 from analysis.folders import RETURN, SEARCH, SUCCESS, DamageError
 from analysis.formatting import listed, p_value, percent, seeds_of
 from analysis.runs import KEYS, STUDY, study_name, study_of, where_tested
@@ -115,7 +115,7 @@ def tested_on(condition, config):
         return "clean"
     if condition == config:
         return "the same noise"
-    if set(condition.wrappers) & set(config.wrappers):
+    if set(wrapper_names(condition)) & set(wrapper_names(config)):
         return "the same wrapper"
     return "new noise"
 
@@ -233,7 +233,7 @@ def environment_score(runs, config, metric=RETURN, has_rates=False):
 
 def is_clean(condition):
     """Tell whether a test is the clean one: noise on rewards leaves returns as they are."""
-    kinds = {getattr(WRAPPERS.get(name), "kind", "own") for name in condition.wrappers}
+    kinds = {getattr(WRAPPERS.get(name), "kind", "own") for name in wrapper_names(condition)}
     return kinds <= {"reward"}
 
 

@@ -28,7 +28,6 @@ from sweep.scripts import number
 LEARNING = {"sac": (6.8e-3, 22e-6), "td3": (5.1e-3, 13e-6), "ppo": (0.103e-3, 0.2e-6)}
 START_UP = 10  # seconds, with compilation
 STEPS, SECONDS = 200, 1  # an environment is timed for at least so many steps, and so long
-STEP_LIMIT = 10_000  # of an episode, where neither the environment nor the user sets one
 MANY = 10  # different rewards: with fewer, noise on them is mostly larger than what they tell
 
 
@@ -55,7 +54,7 @@ def ask(env_id, configurations=(), max_episode_steps=None, env_kwargs=()):
         options = noisy.parse_env_kwargs(env_kwargs) | {"max_episode_steps": max_episode_steps}
         made = gym.make(env_id, disable_env_checker=True, **options)
         declared = made.spec.max_episode_steps
-        with noisy.make_flat(made, STEP_LIMIT) as env:
+        with noisy.make_flat(made) as env:
             seconds, length, rewards = time_steps(env)
             return Environment(
                 step_seconds=seconds,

@@ -9,6 +9,11 @@ import analysis.formatting
 from analysis.tables import COLUMNS, split_consistency
 
 
+def test_rates_are_ordered_as_numbers():
+    rates = ["0.05", "0.10 to 0.00", "0.10", "0.1234", "1.00", "1.00 + 0.05", "1.00 + 0.50 to 1.00"]
+    assert sorted(rates[::-1], key=analysis.formatting.rate_order) == rates
+
+
 @pytest.fixture(scope="module")
 def sweep(tmp_path_factory):
     path = tmp_path_factory.mktemp("sweep")

@@ -19,6 +19,7 @@ from noisy_wrappers import (
     NotFiniteError,
     SpaceError,
     kept_generators,
+    make_environments,
     make_flat,
     make_noisy,
     outcome,
@@ -93,6 +94,25 @@ def test_make_flat_refuses_what_networks_cannot_take():
     for actions in (gym.spaces.Discrete(3), ints, gym.spaces.Box(-1, 1, (2, 2))):
         with pytest.raises(SpaceError, match="needs Box actions of floats in one dimension"):
             make_flat(Given(BOX, actions))
+
+
+@pytest.mark.parametrize("broken", [0, 1])
+def test_what_was_made_is_closed_where_the_rest_cannot_be_made(broken):
+    """Whether the second environment, or a noise, is at fault."""
+    made = []
+
+    def make_env(env_id, **kwargs):
+        if len(made) == 2 - broken:
+            raise RuntimeError("no simulator is free")
+        made.append(mock.Mock(wraps=Given(BOX), spec=Given))
+        return made[-1]
+
+    args = {"env_id": "Given", "seed": 1, "env_kwargs": (), "max_episode_steps": None}
+    args |= {"noise": ["RandomDynamics(1, 2)"], "noise_rate": [1]}
+    args |= {"test_noise": (), "test_noise_rate": ()}
+    with pytest.raises((RuntimeError, SpaceError)):
+        make_environments(make_env, args, test_seed=1)
+    assert len(made) == 2 - broken and all(env.close.call_count == 1 for env in made)
 
 
 @pytest.mark.parametrize("reward", [2, np.float32(2), np.array([2.0]), torch.tensor([2])])
