@@ -267,7 +267,8 @@ def refuse_foreign_module(player, name):
     """
     module, colon, _ = name.partition("(")[0].rpartition(":")
     first, *rest = module.strip().split(".")
-    spec = PathFinder.find_spec(first, noisy.module_path()) if colon else None  # executes nothing
+    path = [os.getcwd(), *sys.path]  # as noisy_wrappers.py imports them
+    spec = PathFinder.find_spec(first, path) if colon else None  # executes nothing
     for found in (spec.submodule_search_locations or [spec.origin]) if spec else ():
         top = Path(found).resolve()
         place = Path(top, *rest).resolve()

@@ -513,7 +513,7 @@ class Run:
     def __init__(self, args, env):
         """Open the folder; exit if another process uses it, or if it holds a different run."""
         self.args, self.env = args, env
-        self.folder = noisy.run_folder(asdict(args))
+        self.folder = Path(args.runs_dir, noisy.run_name(asdict(args)))
         if self.folder.is_symlink():  # --overwrite would delete what is elsewhere
             fail(f"{self.folder} is a link: remove it, or use another --exp-name or --runs-dir", 1)
         with fail_on(OSError, f"--runs-dir {args.runs_dir}"):

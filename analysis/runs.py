@@ -216,10 +216,10 @@ def missing_runs(entries):
 
 def folder_of(run):
     """Return the name that a run's script gives its folder."""
-    noise, rate = run.tested_under.texts
-    more = {"env_kwargs": run.args.get("env_kwargs", ()), "test_noise": noise}
-    identity = run.environment, run.exp_name, *run.configuration.texts, run.seed
-    return run_name(*identity, **more, test_noise_rate=rate)
+    own = {"env_id": run.environment, "exp_name": run.exp_name, "seed": run.seed}
+    own["noise"], own["noise_rate"] = run.configuration.texts
+    own["test_noise"], own["test_noise_rate"] = run.tested_under.texts
+    return run_name(run.args | own)
 
 
 def left_out(entries):

@@ -10,7 +10,6 @@ import json
 import math
 import sys
 import time
-import warnings
 from pathlib import Path
 from statistics import fmean, median
 from typing import NamedTuple
@@ -100,8 +99,7 @@ def time_steps(env):
 def why_unfit(env, configuration):
     """Return why noises cannot act in an environment, or ""."""
     try:
-        with warnings.catch_warnings(action="ignore"):  # of what is said below
-            noisy_env = configuration.wrap(env)
+        noisy_env = configuration.wrap(env)
     except Exception as error:
         return with_place(error, ValueError)
     limit = env.spec.max_episode_steps

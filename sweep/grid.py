@@ -171,10 +171,11 @@ def make_run(args, algorithm, env_id, configuration, seed, phase=""):
 
 def name_of(args, algorithm, env_id, configuration, seed):
     """Return the name of a run's folder."""
-    named = ("env_kwargs", "test_noise", "test_noise_rate")
-    given = {name: args.given_words[algorithm].get(name, []) for name in named}
+    noises, rates = configuration.texts
+    own = {"env_id": env_id, "exp_name": args.exp_names[algorithm], "seed": seed}
+    own |= {"noise": noises, "noise_rate": rates}
     try:
-        return run_name(env_id, args.exp_names[algorithm], *configuration.texts, seed, **given)
+        return run_name(args.given_words[algorithm] | own)
     except ValueError as error:
         return fail(f"after the --: {error}")
 

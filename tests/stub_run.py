@@ -92,8 +92,7 @@ def train(argv):
     script = ROOT / args.script
     algorithm = script.name.removesuffix("_continuous_noisy.py")
     exp_name = args.exp_name or script.stem
-    configuration = (args.env_id, exp_name, args.noise, args.noise_rate, args.seed)
-    folder = Path(args.runs_dir, run_name(*configuration))
+    folder = Path(args.runs_dir, run_name(vars(args) | {"exp_name": exp_name}))
     folder.mkdir(parents=True, exist_ok=True)
     lock = open(folder / ".lock", "w")  # noqa: SIM115
     fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # as the scripts do

@@ -392,7 +392,7 @@ def watch_environment(learn, seen):
     """
 
     def watched_learn(args, env, *others):
-        seen.folder = noisy.run_folder(asdict(args))
+        seen.folder = Path(args.runs_dir, noisy.run_name(asdict(args)))
         reset, step, policy_pt, written = env.reset, env.step, seen.folder / "policy.pt", 0
         episode = steps = 0
         observation = given = None

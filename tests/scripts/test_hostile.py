@@ -321,7 +321,8 @@ def test_actions_at_the_bounds_are_inside_the_space(algorithm, dtype, tmp_path):
 
 
 def test_a_folder_that_is_a_link_is_refused(tmp_path, capsys):
-    run_dir = noisy_wrappers.run_folder(asdict(arguments("PPO", tmp_path / "runs", **ALONE)))
+    args = asdict(arguments("PPO", tmp_path / "runs", **ALONE))
+    run_dir = tmp_path / "runs" / noisy_wrappers.run_name(args)
     run_dir.parent.mkdir()
     other = tmp_path / "other"
     other.mkdir()

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from gymnasium.utils.env_checker import data_equivalence
 
-from noisy_wrappers import parse_noise
+from noisy_wrappers import parse_noise, run_name
 
 # A noise, and its formula(noise generator, o_t, o_(t-1)) for three numbers; a recursive one has
 # what was seen at t-1 instead.
@@ -142,6 +142,12 @@ class Cart(gym.Env):
 
 
 gym.register("Cart-v0", "cases:Cart", max_episode_steps=40)
+
+
+def named(noise=(), noise_rate=(), **others):
+    """Return the name of a run's folder, by the arguments that it does not share with the rest."""
+    usual = {"env_id": "E", "exp_name": "x", "seed": 1}
+    return run_name(usual | {"noise": noise, "noise_rate": noise_rate} | others)
 
 
 def constant_env(value=2.0, shape=(3,)):

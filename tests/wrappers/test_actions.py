@@ -51,7 +51,7 @@ def test_action_golden(rate, loc, dtype):
 
 def test_action_noise_needs_a_box_of_floats():
     for space in (gym.spaces.Discrete(3), gym.spaces.Box(-1, 1, (2,), np.int32)):
-        with pytest.raises(ValueError, match="needs a Box action space of floats"):
+        with pytest.raises(ValueError, match="needs Box actions of floats"):
             RandomNormalNoisyAction(actions_env(space), 0.1, 1.0)
 
 

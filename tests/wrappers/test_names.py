@@ -3,20 +3,18 @@
 import re
 
 import pytest
-from cases import NOISES, A, B, C
+from cases import NOISES, A, B, C, named
 
-from noisy_wrappers import canonical_env_id, parse_env_kwargs, run_name
+from noisy_wrappers import canonical_env_id, parse_env_kwargs
 
 
 def test_run_names():
-    assert run_name("Hopper-v5", "sac", [], [], 1) == "baseline_s1__Hopper-v5__sac"
-    assert run_name("Hopper-v5", "sac", [A], [0], 1) == "baseline_s1__Hopper-v5__sac"
-    assert run_name("ALE/Pong-v5", "my exp", [], [], 2) == "baseline_s2__ALE-Pong-v5__my--exp"
-    assert run_name("module:Env-v0", "x", [], [], 2) != run_name("module/Env-v0", "x", [], [], 2)
-    name = run_name(
-        "E", "x", [A, C, "RandomMixupObservation(0, recursive=True)"], ["1:0", 0.5, 1], 3
-    )
-    assert name == (
+    assert named() == named([A], [0]) == "baseline_s1__E__x"
+    name = named(env_id="ALE/Pong-v5", exp_name="my exp", seed=2)
+    assert name == "baseline_s2__ALE-Pong-v5__my--exp"
+    assert named(env_id="module:Env-v0") != named(env_id="module/Env-v0")
+    noises = [A, C, "RandomMixupObservation(0, recursive=True)"]
+    assert named(noises, ["1:0", 0.5, 1], seed=3) == (
         "p0.5+1.0to0.0+1.0_s3_EarlyTermination_9+NormalNoisyReward_1.0"
         "+MixupObservation_0.0_recursive=True__E__x"
     )
@@ -28,8 +26,8 @@ def test_other_configurations_have_other_names():
     scales = [f"RandomNormalNoisyObservation({scale})" for scale in ("(0.1, 0.2)", "(0.1, 0.3)")]
     noises = [*NOISES, *keys, relative, *scales]
     rates = [1.0, 0.5, "1:0.5", "0.5:1"]
-    names = {run_name("E", "x", [noise], [rate], 1) for noise in noises for rate in rates}
-    names |= {run_name("E", "x", pair, [0.5], 1) for pair in ([A, B], [B, A], [A, A])}
+    names = {named([noise], [rate]) for noise in noises for rate in rates}
+    names |= {named(pair, [0.5]) for pair in ([A, B], [B, A], [A, A])}
     assert len(names) == len(noises) * len(rates) + 3
     assert all(re.fullmatch(r"[A-Za-z0-9._=+-]+", name) for name in names)
 
@@ -37,26 +35,25 @@ def test_other_configurations_have_other_names():
 def test_long_run_names_fit_into_a_file_system():
     def name(last, exp_name="sac"):
         scale = tuple(i / 1000 for i in range(1, 60)) + (last,)
-        return run_name("Humanoid-v5", exp_name, [f"RandomNormalNoisyObservation({scale})"], [1], 3)
+        return named([f"RandomNormalNoisyObservation({scale})"], [1], exp_name=exp_name)
 
     assert name(0.5) == name(0.50) != name(0.6)
-    assert name(0.5).startswith("p1.0_s3_NormalNoisyObservation_0.001_0.002_")
-    assert name(0.5).endswith("__Humanoid-v5__sac")
+    assert name(0.5).startswith("p1.0_s1_NormalNoisyObservation_0.001_0.002_")
     long = {name(0.5), name(0.5, "x" * 200), name(0.6, "x" * 200), name(0.5, "x" * 201)}
     assert len(long) == 4 and max(map(len, long)) <= 240
 
 
 def test_the_environments_arguments_and_the_tests_are_part_of_the_name():
     heavy = {"test_noise": ["RandomDynamics(1.30, high=1.3)"], "test_noise_rate": ["1:1"]}
-    plain = run_name("E", "x", [A], [0.5], 1)
-    assert plain == run_name("E", "x", [A], [0.5], 1, env_kwargs=(), test_noise=[])
+    plain = named([A], [0.5])
+    assert plain == named([A], [0.5], env_kwargs=(), test_noise=[])
     kwargs = ["reward_type:dense", "mass:2.00"]
-    name = run_name("E", "x", [A], [0.5], 1, env_kwargs=kwargs, **heavy)
+    name = named([A], [0.5], env_kwargs=kwargs, **heavy)
     first, _, exp_name = plain.rpartition("__")
     tests = "tests_p1.0_Dynamics_1.3_1.3"
     assert name == f"{first}_mass=2.0_reward_type=dense__{exp_name}__{tests}"
     values = ["2", "2.0", "two", "(2, 3)", "a b", "a/b", "None"]
-    names = {run_name("E", "x", [], [], 1, env_kwargs=[f"a:{value}"]) for value in values}
+    names = {named(env_kwargs=[f"a:{value}"]) for value in values}
     assert len(names) == len(values) and not any(re.search(r"[/ ]", name) for name in names)
 
 

@@ -79,10 +79,10 @@ def test_finite_numbers_look_into_dictionaries():
     first = env.reset()[0]
     inner.observation["a"][1][2] = np.nan
     assert not np.isnan(first).any()  # a copy
-    with pytest.raises(NotFiniteError, match=r"step 1 .*the observation\['a'\]\[1\] \[.*nan\]"):
+    with pytest.raises(NotFiniteError, match=r"step 1 .*the observation \[.*nan\]"):
         env.step(None)
     inner.observation["a"] = (np.zeros(3), np.zeros(4))
-    with pytest.raises(SpaceError, match=r"an observation\['a'\]\[1\] of shape \(4,\)"):
+    with pytest.raises(SpaceError, match=r"observation of shape \(4,\), not \(3,\) as"):
         env.step(None)
 
 

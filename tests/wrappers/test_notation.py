@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from cases import NOISES, A, B, C, constant_env, layers
+from cases import NOISES, A, B, C, constant_env, layers, named
 
 from noisy_wrappers import (
     BASELINE,
@@ -13,7 +13,6 @@ from noisy_wrappers import (
     noise_statistics,
     noise_wrappers,
     parse_noise,
-    run_name,
     signatures,
     split_noises,
 )
@@ -41,7 +40,7 @@ RandomNormalNoisyObservation((0.1, 0.0)) | RandomNormalNoisyObservation(loc=0, s
 def test_canonical_spelling(line):
     canonical, text = line.split(" | ")
     assert str(parse_noise(text)) == canonical == str(parse_noise(canonical))
-    assert run_name("E", "x", [text], [0.1], 1) == run_name("E", "x", [canonical], [0.10], 1)
+    assert named([text], [0.1]) == named([canonical], [0.10])
 
 
 ARGUMENTS = ["", "1, 2", "-1", "1, sigma=2", "1, noise_rate=0.5", "'1'", "2 * 3", "1e999", "x"]

@@ -13,7 +13,7 @@ import commands
 import gymnasium as gym
 import numpy as np
 import pytest
-from cases import GenericEnv
+from cases import GenericEnv, named
 from gymnasium.utils.env_checker import check_env
 
 from noisy_wrappers import (
@@ -22,7 +22,6 @@ from noisy_wrappers import (
     ObservationNoise,
     RewardNoise,
     parse_noise,
-    run_name,
 )
 
 ROOT = Path(__file__).parents[2]
@@ -47,7 +46,7 @@ def test_it_is_a_wrapper_like_the_others(folder):
     config = Configuration.read([TEXT, "RandomEarlyTermination(9)"], ["1:0"])
     assert config.texts[0] == ["RandomEarlyTermination(9)", TEXT]  # an action noise
     assert Configuration.parse(*config.columns) == config
-    assert run_name("E", "x", [TEXT], [0.5], 1) == "p0.5_s1_my_noises--StickyAction_3__E__x"
+    assert named([TEXT], [0.5]) == "p0.5_s1_my_noises--StickyAction_3__E__x"
     env = config.wrap(gym.make("Pendulum-v1"))
     check_env(env, skip_render_check=True)
     assert env.spec.make().spec == env.spec
@@ -62,10 +61,6 @@ class Strict(NoiseWrapper):
         raise ValueError("x is bad")
 
 class Vague(NoiseWrapper): pass
-
-class Degrees(StickyAction):
-    def __init__(self, env, noise_rate, longest):
-        super().__init__(env, noise_rate, longest / 2)
 """
 
 
@@ -77,7 +72,6 @@ class Degrees(StickyAction):
         ("my_noises:StickyAction()", "missing a required argument: 'longest'"),
         ("my_noises:Strict(1)", "x is bad"),
         ("my_noises:Vague(1)", "Vague.kind must be one of"),
-        ("my_noises:Degrees(90)", "pass them on as they came; my_noises:Degrees(45.0) would"),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line(folder, text, message):
