@@ -203,7 +203,10 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if not self._counted:
             self._counted = True
             self.times_applied += 1
-        return {**info, "noise": (*info.get("noise", ()), type(self).__name__)}
+        below = info.get("noise")
+        if not isinstance(below, tuple):  # nothing, or the environment's own
+            below = ()
+        return {**info, "noise": (*below, type(self).__name__)}
 
     def state_dict(self) -> dict[str, Any]:
         """Return counters, rates and estimates; :class:`EnvState` keeps the streams, too."""
@@ -238,7 +241,8 @@ class _Spread:
 
     def add(self, sample: Any) -> None:
         """Take in an array or a number."""
-        if np.isfinite(sample).all():
+        total = sample if isinstance(sample, float) else np.add.reduce(sample, axis=None)
+        if math.isfinite(total):
             self.count += 1
             difference = sample - self.mean
             self.mean = self.mean + difference / self.count
@@ -735,7 +739,8 @@ class RandomActionDelay(NoiseWrapper):
         if not self._delay:
             return self.env.step(action)
         self._actions.append(copy.deepcopy(action))  # the caller may reuse an array
-        observation, reward, terminated, truncated, info = self.env.step(self._actions[0])
+        delayed = copy.deepcopy(self._actions[0])
+        observation, reward, terminated, truncated, info = self.env.step(delayed)
         if len(self._actions) > 1:  # so this step's action waits
             info = self.mark(info)
         return observation, reward, terminated, truncated, info
@@ -889,7 +894,8 @@ class RandomDynamics(NoiseWrapper):
             model = getattr(model, "ptr", model)  # dm_control wraps it
             if mujoco and isinstance(model, mujoco.MjModel):
                 return model
-        raise ValueError(f"RandomDynamics needs a MuJoCo model, and {base} has none")
+        where = "as its .model or .physics.model"
+        raise ValueError(f"RandomDynamics needs a MuJoCo model, {where}, and {base} has none")
 
     def _reset_scaled(self, seed: int | None, options: Info | None) -> tuple[Any, Info]:
         """Scale the model by the factors of this wrapper and the outer ones, and reset."""
@@ -1002,6 +1008,8 @@ def _check_fields(model: Any, fields: tuple[str, ...]) -> None:
         if not getattr(model, field).any():
             problem = f"this environment's model has no {field}, or zeros only"
             raise ValueError(f"fields: {problem}: name other fields")
+        if np.any(getattr(model, f"{field}poly", 0)):  # of stiffness and damping
+            raise ValueError(f"fields: {field} of this environment's model is a polynomial")
     types = {*model.actuator_gaintype.tolist(), *model.actuator_biastype.tolist()}
     constant = model.actuator_biasprm[model.actuator_biastype == 1, 0]  # of affine ones
     if "actuator_gainprm" in fields and (constant.any() or not types <= _STRENGTH_IN_GAIN.keys()):
@@ -1078,7 +1086,14 @@ def _read_noise(text: str, wrapper: type[NoiseWrapper] | None) -> Noise:
     written = [repr(values[p.name]) for p in positional]
     written += [f"{p.name}={values[p.name]!r}" for p in keywords]
     owner = "" if wrapper is WRAPPERS.get(name) else f"{module}:"
-    return Noise(wrapper, f"{owner}{wrapper.__name__}({', '.join(written)})")
+    noise = Noise(wrapper, f"{owner}{wrapper.__name__}({', '.join(written)})")
+    if owner:
+        with contextlib.suppress(TypeError, ValueError):
+            if noise(_ProbeEnv(), 1.0).parameters == recorded:
+                return noise
+        wanted = "name its arguments (no *args or **kwargs) and pass them on as they came"
+        raise _bad_noise(text, f"its constructor must {wanted}; {noise} would be another noise")
+    return noise
 
 
 def _read_call(text: str) -> tuple[str, str, list[Any], dict[str, Any]]:
@@ -1438,7 +1453,8 @@ def make_environments(
     try:
         test_env = make_env(args["env_id"], **kwargs)
     except TypeError as error:  # Gymnasium's words for what the user can mend on the command line
-        known = ("unexpected keyword argument", "multiple values for", "must inherit from the gym")
+        known = ("unexpected keyword argument", "multiple values for", "takes no arguments")
+        known += ("must inherit from the gym",)
         if not any(text in str(error) for text in known):
             raise
         raise SpaceError(str(error)) from error

@@ -203,7 +203,8 @@ def test_dm_control_keeps_its_model_in_its_physics():
 
 
 def test_environments_that_it_cannot_change():
-    motor = '<motor joint="slide" gear="50"/>'
+    motor, polynomial = '<motor joint="slide" gear="50"/>', Cart()
+    polynomial.model.dof_dampingpoly[0] = 2  # beside the linear damping
     once = RandomNormalNoisyReward(RandomDynamics(Cart(), 0.1, 0.5, 1.5), 0.1, 1)
     dc = '<dcmotor joint="slide" motorconst="1" resistance="1"/>'
     constant = '<cylinder joint="slide" area="2" bias="1 -3 -1"/>'  # its constant force would stay
@@ -212,6 +213,7 @@ def test_environments_that_it_cannot_change():
         (gym.make("Hopper-v5"), "tendon_damping", "has no tendon_damping, or zeros only"),
         (Choosing(MODEL.replace(motor, dc)), "actuator_gainprm", "gainprm needs .* motors"),
         (Choosing(MODEL.replace(motor, constant)), "actuator_gainprm", "without a constant bias"),
+        (polynomial, "dof_damping", "dof_damping of this environment's model is a polynomial"),
         (once, "body_mass", "another RandomDynamics .* scales body_"),
         (once, "body_inertia", "another RandomDynamics .* scales body_"),
     ):

@@ -17,6 +17,7 @@ from noisy_wrappers import (
     EnvState,
     FiniteNumbers,
     NotFiniteError,
+    RandomNormalNoisyReward,
     SpaceError,
     kept_generators,
     make_environments,
@@ -113,6 +114,14 @@ def test_what_was_made_is_closed_where_the_rest_cannot_be_made(broken):
     with pytest.raises((RuntimeError, SpaceError)):
         make_environments(make_env, args, test_seed=1)
     assert len(made) == 2 - broken and all(env.close.call_count == 1 for env in made)
+
+
+@pytest.mark.parametrize("own", [0.3, "rain"])
+def test_an_environment_may_tell_of_a_noise_of_its_own(own):
+    inner = Given(BOX)
+    with mock.patch.object(inner, "step", return_value=(0, 1.0, False, False, {"noise": own})):
+        env = RandomNormalNoisyReward(inner, 1, 1)
+        assert env.step(None)[-1]["noise"] == ("RandomNormalNoisyReward",)
 
 
 @pytest.mark.parametrize("reward", [2, np.float32(2), np.array([2.0]), torch.tensor([2])])

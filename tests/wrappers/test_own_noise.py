@@ -61,6 +61,10 @@ class Strict(NoiseWrapper):
         raise ValueError("x is bad")
 
 class Vague(NoiseWrapper): pass
+
+class Degrees(StickyAction):
+    def __init__(self, env, noise_rate, longest):
+        super().__init__(env, noise_rate, longest / 2)
 """
 
 
@@ -72,6 +76,7 @@ class Vague(NoiseWrapper): pass
         ("my_noises:StickyAction()", "missing a required argument: 'longest'"),
         ("my_noises:Strict(1)", "x is bad"),
         ("my_noises:Vague(1)", "Vague.kind must be one of"),
+        ("my_noises:Degrees(90)", "pass them on as they came; my_noises:Degrees(45.0) would"),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line(folder, text, message):
