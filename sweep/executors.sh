@@ -66,15 +66,14 @@ run_one() {
 # LINES OFFSET: one task of a job array, requeued if it was stopped by USR1. The SLURM_JOB_ID of the
 # array's last task is the id of the whole array, which would be requeued by it.
 slurm_task() {
-  local folder command sweep status=0 job=$SLURM_JOB_ID logged=1
-  [ -z "${SLURM_ARRAY_JOB_ID:-}" ] || job=${SLURM_ARRAY_JOB_ID}_$SLURM_ARRAY_TASK_ID
+  local folder command sweep status=0 logged=1
   IFS=$'\t' read -r folder command < <(sed -n "$(($2 + SLURM_ARRAY_TASK_ID + 1))p" "$1")
   sweep=${1##*/lines-} # its id stands in the name of the list
   run_one "${sweep%.tsv}" "$folder" "$command" || status=$?
   # Without a checkpoint it would begin anew, time after time
   if [ -n "$asked" ] && [ "$status" -eq 143 ] && [ -e "$folder/checkpoint.pt" ]; then
     # SLURM_CLUSTERS came along from where it was submitted: the task is one of this cluster
-    env -u SLURM_CLUSTERS scontrol requeue "$job"
+    env -u SLURM_CLUSTERS scontrol requeue "${SLURM_ARRAY_JOB_ID}_$SLURM_ARRAY_TASK_ID"
   fi
   exit "$status"
 }

@@ -65,8 +65,6 @@ DAMAGE = {  # and what is said of it
     "a list as name": (config(exp_name=["a"]), "config.json: TypeError: "),
     "an escape sequence": (config(exp_name="\x1b[31m"), r"'\x1b[31m'"),
     "an unknown noise": (config(noise=["RandomX(1)"], noise_rate=[1.0]), "RandomX"),
-    "a rate of 5": (config(noise_rate=[5.0], noise=[A]), "5.0"),
-    "a noise without a rate": (config(noise=[A], noise_rate=[]), "without a noise rate"),
     "a path as algorithm": (config(algorithm="x/../../ESCAPED"), "'x/../../ESCAPED'"),
     "an infinite result": (
         text("result.json", lambda text: re.sub(r'_mean": [^,}]*', '_mean": 1e999', text)),

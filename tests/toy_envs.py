@@ -46,20 +46,13 @@ class Push(gym.Env):
 
 
 class Count(gym.Env):
-    """Observes the step; 1.0 is every reward. `breaks` gives NaN from step 70 of the run on."""
+    """Observes the step; 1.0 is every reward."""
 
     observation_space = Box(-np.inf, np.inf, (1,), np.float32)
     action_space = Box(-1.0, 1.0, (1,), np.float32)
 
-    def __init__(self, breaks=""):
-        self.breaks, self.total = breaks, 0
-
-    def value(self, name, whole):
-        return np.nan if self.breaks == name and self.total >= 70 else whole
-
     def observe(self):
-        value = self.value("observation", self.steps)
-        return np.full(self.observation_space.shape, value, np.float32)
+        return np.full(self.observation_space.shape, self.steps, np.float32)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -67,15 +60,22 @@ class Count(gym.Env):
         return self.observe(), {}
 
     def step(self, action):
-        self.steps, self.total = self.steps + 1, self.total + 1
-        return self.observe(), self.value("reward", 1.0), False, False, {}
+        self.steps += 1
+        return self.observe(), 1.0, False, False, {}
+
+
+class NanReward(Count):
+    """Its sixth reward is no number."""
+
+    def step(self, action):
+        observation, reward, *rest = super().step(action)
+        return observation, np.nan if self.steps == 6 else reward, *rest
 
 
 class Other(Count):
     """Count with other spaces."""
 
     def __init__(self, **spaces):
-        super().__init__()
         vars(self).update(spaces)
 
 
@@ -91,12 +91,7 @@ class Category(Other):
 
 
 class Buggy(Count):
-    """Its author made a mistake, in the constructor or in step."""
-
-    def __init__(self, where):
-        super().__init__()
-        if where == "constructor":
-            {}["missing"]
+    """Its author made a mistake in step."""
 
     def step(self, action):
         return {}["missing"]
@@ -106,7 +101,6 @@ class Endless(Count):
     """Ends its episodes after `length` steps, and never without; it declares no time limit."""
 
     def __init__(self, length=np.inf):
-        super().__init__()
         self.length = length
 
     def step(self, action):
@@ -131,7 +125,6 @@ class Solves(Count):
     resets = 0
 
     def __init__(self, key, kind, only=False):
-        super().__init__()
         self.key, self.kind, self.only = key, kind, only
 
     def reset(self, **kwargs):
@@ -154,8 +147,7 @@ def register(name, entry_point, steps, **kwargs):
 register("Tiny", Tiny, 8)
 register("Push", Push, 20)
 register("Count", Count, 8)
-register("NanReward", Count, 8, breaks="reward")
-register("NanObservation", Count, 8, breaks="observation")
+register("NanReward", NanReward, 8)
 register("CategoryObservation", Category, 8, observation_space=gym.spaces.Discrete(3))
 register("Endless", Endless, None)
 register("NoLimit", Endless, None, length=20)
@@ -164,8 +156,7 @@ register("Unbounded", Other, 8, action_space=Box(-np.inf, np.inf, (1,)))
 largest = float(np.finfo(np.float32).max)  # which stands for no bound
 register("FloatMax", Other, 8, action_space=Box(-largest, largest, (1,)))
 register("NoEnv", object, 8)
-register("BuggyConstructor", Buggy, 8, where="constructor")
-register("BuggyStep", Buggy, 8, where="step")
+register("Buggy", Buggy, 8)
 register("Slow", Slow, 100)
 register("IsSuccess", Solves, 8, key="is_success", kind=np.bool_)
 register("Success", Solves, 8, key="success", kind=int)

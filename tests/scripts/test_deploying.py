@@ -1,13 +1,11 @@
 """docs/deploying.md is right: its code runs, and plays every policy as load_policy does."""
 
-import importlib
 import json
 import os
 import re
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 from unittest import mock
 
 import gymnasium as gym
@@ -15,14 +13,11 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete
+from small_runs import ROOT, SCRIPTS, run
 
-ROOT = Path(__file__).parents[2]
+import ppo_continuous_noisy as ppo
+
 PAGE = ROOT / "docs" / "deploying.md"
-SMALL = {
-    "sac": {"learning_starts": 100, "batch_size": 32, "buffer_size": 1000},
-    "td3": {"learning_starts": 100, "batch_size": 32, "buffer_size": 1000},
-    "ppo": {"num_steps": 100, "num_minibatches": 4},
-}
 
 
 class Sensors(gym.Env):
@@ -57,18 +52,8 @@ for environment in (Sensors, HalfBounded):
     gym.register(f"{environment.__name__}-v0", environment, max_episode_steps=20)
 
 
-def train(algorithm, env_id, runs_dir):
-    """Train for a moment; return the script and the run's folder."""
-    script = importlib.import_module(f"{algorithm}_continuous_noisy")
-    args = {"env_id": env_id, "total_timesteps": 200, "eval_episodes": 1, "compile": False}
-    args |= {"eval_frequency": 0, "runs_dir": str(runs_dir)}
-    assert script.train(script.Args(**args, **SMALL[algorithm]))
-    [run_dir] = Path(runs_dir).iterdir()
-    return script, run_dir
-
-
 def test_config_json_tells_the_order_of_a_dictionary(tmp_path):
-    script, run_dir = train("ppo", "Sensors-v0", tmp_path)
+    run_dir = run("PPO", tmp_path, env_id="Sensors-v0")
     config = json.loads((run_dir / "config.json").read_text())
     keys = [["arm.angle", 1], ["arm.speed", 2], ["camera", 4], ["mode", 3]]
     assert config["observation_keys"] == keys
@@ -76,31 +61,32 @@ def test_config_json_tells_the_order_of_a_dictionary(tmp_path):
     observation, _ = gym.make("Sensors-v0").reset(seed=0)
     parts = [observation["arm"]["angle"], observation["arm"]["speed"], observation["camera"]]
     parts += [np.eye(3)[observation["mode"]]]
-    got, _ = script.make_env("Sensors-v0").reset(seed=0)
+    got, _ = ppo.make_env("Sensors-v0").reset(seed=0)
     np.testing.assert_array_equal(got, np.concatenate(parts, axis=None))
 
 
 def follow_page(algorithm, env_id, folder):
     """Do what the page says, but for ONNX; return its names and 50 observations."""
-    script, run_dir = train(algorithm, env_id, folder / "runs")
-    page = PAGE.read_text().replace("sac_continuous_noisy", f"{algorithm}_continuous_noisy")
+    run_dir = run(algorithm, folder / "runs", env_id=env_id)
+    name = f"{algorithm.lower()}_continuous_noisy"
+    page = PAGE.read_text().replace("sac_continuous_noisy", name)
     load, save, play, *onnx = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     assert len(onnx) == 2
-    names = {"onnx": onnx[algorithm == "ppo"]}
+    names = {"onnx": onnx[algorithm == "PPO"]}
     shutil.copy(run_dir / "config.json", folder)
     for block in (load, save, play):
         exec(block.replace("Pendulum-v1", env_id), names)
     assert folder / names["run_dir"] == run_dir
-    env = script.make_env(env_id)
+    env = SCRIPTS[algorithm].make_env(env_id)
     return names, [env.reset(seed=0)[0], *(env.reset()[0] for _ in range(49))]
 
 
 @pytest.mark.parametrize(
     ("algorithm", "env_id"),
     [
-        pytest.param("sac", "Sensors-v0", marks=pytest.mark.slow),
-        pytest.param("td3", "Sensors-v0", marks=pytest.mark.slow),
-        ("ppo", "HalfBounded-v0"),
+        pytest.param("SAC", "Sensors-v0", marks=pytest.mark.slow),
+        pytest.param("TD3", "Sensors-v0", marks=pytest.mark.slow),
+        ("PPO", "HalfBounded-v0"),
     ],
 )
 def test_numpy_alone_plays_a_policy(algorithm, env_id, tmp_path, monkeypatch):
@@ -116,7 +102,7 @@ def test_numpy_alone_plays_a_policy(algorithm, env_id, tmp_path, monkeypatch):
     network, inputs = export.call_args.args[:2]
     with torch.no_grad():
         result = network(*inputs)
-    if algorithm == "ppo":
+    if algorithm == "PPO":
         mean = result[0].numpy().clip(names["low"], names["high"])  # of normalized observations
         at_zero = names["saved"]["observation_stats"]["mean"]
     else:
@@ -130,17 +116,15 @@ def test_numpy_alone_plays_a_policy(algorithm, env_id, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_policy_of_a_gpu_needs_no_gpu_no_environment_and_no_tyro(tmp_path):
-    code, expected = "import sys, numpy\n", []
-    on_gpu = mock.patch("torch.serialization.location_tag", return_value="cuda:0")
-    for algorithm in SMALL:
-        with on_gpu:  # this is what a file of a GPU says of its tensors
-            script, run_dir = train(algorithm, "Sensors-v0", tmp_path / algorithm)
-        code += f"from {script.__name__} import load_policy\n"
-        code += f"print(load_policy({str(run_dir)!r})(numpy.ones(10)).tolist())\n"
-        expected.append(f"{script.load_policy(run_dir)(np.ones(10)).tolist()}\n")
+    # this is what a file of a GPU says of its tensors
+    with mock.patch("torch.serialization.location_tag", return_value="cuda:0"):
+        run_dir = run("PPO", tmp_path, env_id="Sensors-v0")
+    code = "import sys, numpy\nfrom ppo_continuous_noisy import load_policy\n"
+    code += f"print(load_policy({str(run_dir)!r})(numpy.ones(10)).tolist())\n"
+    expected = f"{ppo.load_policy(run_dir)(np.ones(10)).tolist()}\n"
     code += "print({'tyro', 'mujoco', 'pandas'} & {*sys.modules})"
     env = os.environ | {"PYTHONPATH": str(ROOT)}
     result = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, env=env, capture_output=True, text=True
     )
-    assert (result.stdout, result.returncode) == ("".join(expected) + "set()\n", 0), result.stderr
+    assert (result.stdout, result.returncode) == (f"{expected}set()\n", 0), result.stderr

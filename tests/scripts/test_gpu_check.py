@@ -6,7 +6,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import bench
 import pytest
 import torch
 
@@ -50,17 +49,3 @@ def test_what_fails_is_told(tmp_path):
     result = rehearse(tmp_path, ALGORITHMS="td3", ENVIRONMENTS="NoSuch-v0")
     assert result.returncode == 1 and result.stdout.count("| FAILED: see ") == 3
     assert "\nFAILED in " in result.stdout
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("flags", "seen"), [([], "''"), (["--cuda"], "'0'")])
-def test_bench_shows_the_gpu_only_to_programs_with_cuda(flags, seen, tmp_path, monkeypatch):
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
-    script = tmp_path / "script.py"
-    script.write_text("import os, sys; sys.exit(repr(os.environ['CUDA_VISIBLE_DEVICES']))")
-    core = min(os.sched_getaffinity(0))
-    with (
-        bench.Program("it", core, "_script", script, *flags) as program,
-        pytest.raises(SystemExit, match=f"^{seen}\n"),
-    ):
-        bench.advance(program)

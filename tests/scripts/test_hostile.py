@@ -3,11 +3,8 @@
 import functools
 import multiprocessing
 import os
-import pty
 import random
-import select
 import signal
-import termios
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -85,126 +82,79 @@ def test_what_breaks_is_closed(tmp_path, log):
 # SIGNALS
 
 
-def on_its_own(log, terminal=None, ignored=()):
-    """Be a process that may have children, with a process group and perhaps a terminal."""
+def on_its_own(log, ignored=()):
+    """Be a process that may have children, in a group of its own."""
     multiprocessing.current_process()._config["daemon"] = False
     os.environ["HOSTILE_LOG"] = log
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whatever these tests are started below
-    for number in ignored:
-        signal.signal(number, signal.SIG_IGN)
+    for number in (signal.SIGINT, signal.SIGHUP):  # whatever these tests are started below
+        signal.signal(number, signal.SIG_IGN if number in ignored else signal.SIG_DFL)
     os.setsid()
-    if terminal:
-        number = os.open(terminal, os.O_RDWR)  # the first that a session opens controls it
-        for stream in (0, 1, 2):
-            os.dup2(number, stream)
 
 
-def start(runs_dir, *moments, terminal=None, ignored=(), **kwargs):
+def start(runs_dir, *moments, ignored=(), **kwargs):
     args = arguments("PPO", runs_dir, **HOSTILE | {"total_timesteps": 100_000} | kwargs)
-    before = functools.partial(on_its_own, os.environ["HOSTILE_LOG"], terminal, ignored)
+    before = functools.partial(on_its_own, os.environ["HOSTILE_LOG"], ignored)
     return commands.start(ppo.__file__, flags(args), *moments, before=before)
 
 
-def terminate(*args):
-    for number in (signal.SIGTERM, signal.SIGHUP):  # of timeout, and of what it stops
-        os.kill(os.getpid(), number)
+def send(numbers, to_group, *args):
+    for number in numbers:
+        os.kill(0 if to_group else os.getpid(), number)
+        time.sleep(0.2)  # or two are one for a worker that is not running
 
 
-def terminate_group(*args):
-    os.kill(0, signal.SIGTERM)
-
-
-def hang_up(*args):
-    os.kill(os.getpid(), signal.SIGHUP)
+def sent(runs_dir, step, *numbers, to_group=False, **kwargs):
+    """Send signals to a run at a step of its environments; return how it ended."""
+    moment = STEP, step, functools.partial(send, numbers, to_group)
+    return commands.ended(start(runs_dir, moment, **kwargs))
 
 
 @pytest.mark.slow
-def test_a_signal_ends_the_episode_and_then_all_processes(tmp_path, log, capsys):
-    short = {"total_timesteps": 120}
-    result = commands.ended(start(tmp_path / "runs", (STEP, 50, terminate), **short))
-    assert (result.code, result.err) == (143, "")
-    assert result.out.count("stopping after this episode") == 2  # not of the workers, too
+@pytest.mark.parametrize(
+    ("numbers", "to_group", "code"),
+    [
+        ([signal.SIGTERM, signal.SIGHUP], False, 143),  # of timeout, and of what it stops
+        ([signal.SIGHUP], False, 129),  # the window of a terminal is closed
+        ([signal.SIGINT], True, 130),  # Ctrl-C on a terminal: the workers work to the end
+    ],
+)
+def test_a_signal_ends_the_episode_and_then_all_processes(numbers, to_group, code, tmp_path, log):
+    result = sent(tmp_path, 50, *numbers, to_group=to_group)
+    assert (result.code, result.err) == (code, "")
+    said = result.out.count("stopping after this episode")
+    assert said == len(numbers)  # not of the workers, too
     assert result.out.endswith("\nstopped; run the same command again to resume\n")
+    assert (folder(tmp_path) / "checkpoint.pt").exists()
     assert_closed(log())
-    stopped = run("PPO", tmp_path / "runs", **HOSTILE | short)
-    assert "resumed at step" in capsys.readouterr().out
-    alone = run("PPO", tmp_path / "alone", **HOSTILE | short)
-    assert (stopped / "eval.csv").read_bytes() == (alone / "eval.csv").read_bytes()
-    torch.testing.assert_close(policy(stopped), policy(alone), rtol=0, atol=0)
 
 
 @pytest.mark.slow
 def test_a_signal_to_the_group_ends_all_processes(tmp_path, log):
     """As a cluster sends it: the workers end at once, and the script with them or after them."""
-    result = commands.ended(start(tmp_path, (STEP, 90, terminate_group)))
+    result = sent(tmp_path, 90, signal.SIGTERM, to_group=True)
     assert result.code in (143, 1)  # 1: it asked a worker that had ended
     assert_closed(log())
 
 
-def interrupt_twice(*args):
-    for _ in range(2):
-        os.kill(0, signal.SIGINT)  # of the group, as a terminal does
-        time.sleep(0.2)  # or the two are one for a worker that is not running
-
-
 @pytest.mark.slow
 def test_a_second_ctrl_c_ends_the_workers_too(tmp_path, log):
-    assert commands.ended(start(tmp_path, (STEP, 50, interrupt_twice))).code == 128 + signal.SIGINT
+    twice = functools.partial(send, [signal.SIGINT] * 2, True)
+    process = start(tmp_path, (STEP, 50, twice))
+    process.join(commands.LIMIT)
     workers = [int(line.split()[1]) for line in log() if line.startswith("worker")]
     for _ in range(50):
         time.sleep(0.1 * any(map(is_alive, workers)))
-    assert not any(map(is_alive, workers))
-
-
-class Terminal:
-    """A terminal with a script in it, and what it shows."""
-
-    def __init__(self, runs_dir):
-        self.master, self.slave = pty.openpty()
-        termios.tcsetwinsize(self.slave, (24, 80))
-        self.process = start(runs_dir, terminal=os.ttyname(self.slave))
-        self.shown = b""
-        self.wait_for(b"eval_return=")
-
-    def wait_for(self, text):
-        limit = time.monotonic() + commands.LIMIT
-        while text not in self.shown:
-            if select.select([self.master], [], [], 1)[0]:
-                self.shown += os.read(self.master, 1000)
-            else:
-                lives = self.process.is_alive() and time.monotonic() < limit
-                assert lives, commands.kill(self.process) or f"{text} is not in {self.shown}"
-
-
-@pytest.mark.slow
-def test_ctrl_c_on_a_terminal_leaves_the_workers_at_work_until_the_checkpoint(tmp_path, log):
-    terminal = Terminal(tmp_path)
-    assert b"%|" in terminal.shown and b"step=" not in terminal.shown  # a bar, and no lines
-    os.write(terminal.master, b"\x03")
-    terminal.wait_for(b"again to resume")
-    assert commands.ended(terminal.process).code == 130
-    assert b"Traceback" not in terminal.shown
-    assert terminal.shown.count(b"stopping after this episode") == 1  # not of the workers, too
-    assert (folder(tmp_path) / "checkpoint.pt").exists()
-    assert_closed(log())
-    os.close(terminal.slave)
-    os.close(terminal.master)
-
-
-@pytest.mark.slow
-def test_the_window_of_a_terminal_is_closed(tmp_path, log):
-    terminal = Terminal(tmp_path)
-    os.close(terminal.slave)
-    os.close(terminal.master)
-    assert commands.ended(terminal.process).code == 129
-    assert (folder(tmp_path) / "checkpoint.pt").exists()
-    assert_closed(log())
+    left = [pid for pid in workers if is_alive(pid)]
+    for pid in left:
+        os.kill(pid, signal.SIGKILL)
+    assert (process.exitcode, len(workers), left) == (128 + signal.SIGINT, 4, [])
+    assert not list(tmp_path.glob("*/checkpoint.pt"))  # it did not wait for the episode's end
 
 
 @pytest.mark.slow
 def test_a_hangup_that_was_ignored_stays_ignored(tmp_path):
-    kwargs = {"total_timesteps": 60, "ignored": (signal.SIGHUP,)}  # as nohup does
-    result = commands.ended(start(tmp_path, (STEP, 50, hang_up), **kwargs))
+    """As nohup does it."""
+    result = sent(tmp_path, 50, signal.SIGHUP, ignored=[signal.SIGHUP], total_timesteps=60)
     assert (result.code, result.err) == (0, "")
 
 
@@ -213,6 +163,7 @@ def test_what_is_not_the_api_is_no_traceback(tmp_path):
     result = commands.ended(start(tmp_path, env_id="toy_envs:NanReward-v0"))
     assert result.code == 1
     assert one_line(result.err).startswith("error: training stopped: step 6 of an episode: ")
+    assert not list(tmp_path.glob("*/result.json"))
 
 
 # SEEDS

@@ -460,77 +460,26 @@ def test_slurm_with_several_clusters(no_slurm, tmp_path):
     assert all(re.match("squeue --clusters=big .* --format=%F$", line) for line in queues)
 
 
-@pytest.mark.parametrize(("array", "requeued"), [("7", "7_1"), ("", "7")])
-def test_a_task_is_requeued_alone(array, requeued, no_slurm, tmp_path):
-    env, asked = no_slurm
-    grid = ["baseline", *GRID[1:5], "--seeds", "1-2", *FOREVER, "--runs-dir", tmp_path / "runs"]
-    lines = tmp_path / "runs/logs/lines-host-1-2.tsv"
-    lines.parent.mkdir(parents=True)
-    listed = view("list", *grid).out.replace(sys.executable, env["PYTHON"])
-    lines.write_text(listed)
-    env = env | {"SLURM_JOB_ID": "7", "SLURM_ARRAY_JOB_ID": array, "SLURM_ARRAY_TASK_ID": "1"}
-    env["SLURM_CLUSTERS"] = "where,submitted"
-    task = start("slurm-task", lines, "0", env=env)
-    folder = Path(listed.splitlines()[1].split("\t")[0])
-    wait_for(lambda: is_training(folder), "the run")
-    task.send_signal(signal.SIGUSR1)
-    task.communicate(timeout=PATIENCE)
-    assert task.returncode == 143 and asked.read_text() == f"scontrol requeue {requeued}\n"
-
-
-def test_a_task_without_a_checkpoint_is_not_requeued(no_slurm, tmp_path):
-    """As a script that SIGTERM ends at once: it would begin anew for ever."""
+@pytest.mark.parametrize("left", ["checkpoint.pt", "eval.csv"])
+def test_a_task_is_requeued_alone_if_it_left_a_checkpoint(left, no_slurm, tmp_path):
+    """Without one, as of a script that SIGTERM ends at once, it would begin anew for ever."""
     env, asked = no_slurm
     folder, lines = tmp_path / "run", tmp_path / "logs/lines-host-1-2.tsv"
     lines.parent.mkdir()
-    lines.write_text(f"{folder}\tbash -c 'mkdir {folder}; sleep 1; exec sleep 1000'\n")
-    env |= {"SLURM_JOB_ID": "7", "SLURM_ARRAY_TASK_ID": "0"}
+    command = f"sleep 0.2; mkdir {folder}; touch {folder}/{left}; exec sleep 1000"
+    lines.write_text(f"another run\tfalse\n{folder}\tbash -c '{command}'\n")
+    env |= {"SLURM_JOB_ID": "7", "SLURM_ARRAY_JOB_ID": "7", "SLURM_ARRAY_TASK_ID": "1"}
+    env["SLURM_CLUSTERS"] = "where,submitted"
     task = start("slurm-task", lines, "0", env=env)
-    wait_for(folder.exists, "the run")
+    wait_for((folder / left).exists, "the run")
     task.send_signal(signal.SIGUSR1)
     task.communicate(timeout=PATIENCE)
-    assert task.returncode == 143 and not asked.exists()
-
-
-@pytest.mark.slow
-def test_ctrl_c_while_arrays_are_submitted(no_slurm, tmp_path):
-    """On a terminal Ctrl-C reaches sbatch, too: here its second call."""
-    env, asked = no_slurm
-    with open(tmp_path / "bin/sbatch", "a") as sbatch:
-        sbatch.write(f"[ $(grep -c sbatch {asked}) = 1 ] || exec sleep 100\n")
-    grid = ["baseline", *GRID[1:5], "--seeds", "1-6", "--runs-dir", tmp_path / "runs"]
-    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    sweep = start(*grid, "--executor", "slurm", env=env, start_new_session=True, **streams)
-    wait_for(lambda: asked.exists() and asked.read_text().count("sbatch") == 2, "the second call")
-    os.killpg(sweep.pid, signal.SIGINT)
-    _, err = sweep.communicate(timeout=PATIENCE)
-    assert sweep.returncode == 130 and "submitted" not in err and "error" not in err
-    assert set(asked.read_text().splitlines()[3:]) == {"scancel --clusters=big 12"}
+    said = asked.read_text() if asked.exists() else ""
+    assert task.returncode == 143
+    assert said == ("scontrol requeue 7_1\n" if left == "checkpoint.pt" else "")
 
 
 # THE COMMAND
-
-
-def test_a_clone_of_windows_runs(tmp_path):
-    """Git for Windows writes the ends of lines as Windows has them, unless it is told not to."""
-    subprocess.run(["git", "init", "-q", tmp_path], check=True)
-    shutil.copy(ROOT / ".gitattributes", tmp_path)
-    command = ["git", "-C", tmp_path, "check-attr", "eol", "benchmark.sh", "Makefile", "analyze.py"]
-    assert output(command, ENV).count(": eol: lf") == 3
-
-
-@pytest.mark.slow
-def test_a_list_needs_no_room_for_temporary_files(tmp_path):
-    mount = ["mount", "-t", "tmpfs", "-o", "size=300k", "none", tmp_path]
-    if subprocess.run(mount, capture_output=True).returncode:
-        pytest.skip("may not mount a file system")
-    try:
-        subprocess.run(f"dd if=/dev/zero of={tmp_path}/filler bs=1k 2>/dev/null", shell=True)
-        env = ENV | {"TMPDIR": str(tmp_path)}
-        result = run("paper", "--dry-run", "--runs-dir", ROOT / "none", env=env)
-    finally:
-        subprocess.run(["umount", "--recursive", "--lazy", tmp_path], check=True)
-    assert result.code == 0 and result.out.count("\n") == 9100, result.err
 
 
 # CHOOSE

@@ -422,7 +422,6 @@ def test_baselines_that_pay(noises, more, baselines):
         (f"{C} --looks 13", "--looks must be from 1 to half of --confirm, not 13"),
         ("best -- --exp-name mine", "--exp-name: several algorithms would write into the same"),
         ("demo --env-id Hopper-v5", "at the end, after --); did you mean --envs?"),
-        ("demo --gamma 0.9", "unknown option --gamma (those of the scripts come at the end, after"),
         ("demo --runs-dir=-x", "--runs-dir must be a path"),
         ("--algos sac demo", "a preset comes before --algos: one of demo"),
         ("demo -- --overwrite", "--overwrite would start interrupted runs afresh"),
