@@ -161,12 +161,12 @@ def find_players(paths):
 
 
 def step_of(player):
-    """Return the step that a run's policy.pt is of.
+    """Return the step that a run's policy.pt is of, or "?" of runs of version 0.3.
 
     The last test in eval.csv may be an earlier one, where a run was resumed and stopped again.
     """
     script, _ = import_script(player)
-    return script.read_state(player.folder / "policy.pt")["step"]
+    return script.read_state(player.folder / "policy.pt").get("step", "?")
 
 
 def read_conditions(args):

@@ -220,10 +220,10 @@ class NoiseWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a :meth:`state_dict`; the next call must be ``reset()``."""
+        """Take over what a :meth:`state_dict` holds; the next call must be ``reset()``."""
         self.opportunities = state["opportunities"]
         self.times_applied = state["times_applied"]
-        self.schedule = tuple(state.get("schedule", self.schedule))
+        self.schedule = tuple(state["schedule"])
         if self._spread is not None:
             self._spread = _Spread(**state["spread"])
 
@@ -609,9 +609,9 @@ class RewardNoise(NoiseWrapper):
         """Step the environment and perturb the reward with probability p."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         if self._spread is not None:
-            self._spread.add(np.asarray(reward, np.float64).item())
+            self._spread.add(float(_number_in(reward)))
         if self.acts():
-            given = np.asarray(reward, np.float64).item()
+            given = float(_number_in(reward))
             reward = self._perturb(given)
             if reward != given:
                 info = self.mark(info)
@@ -1030,7 +1030,9 @@ def signatures() -> list[str]:
     found = []
     for name, wrapper in WRAPPERS.items():
         parameters = [p.replace(annotation=p.empty) for p in _parameters(wrapper)]
-        found.append(f"{name}{inspect.Signature(parameters)}")
+        text = f"{name}{inspect.Signature(parameters)}"
+        # as early termination and the delays mean it
+        found.append(re.sub("low(=None)?, high=None", "low, high=low", text))
     return found
 
 
@@ -1054,8 +1056,8 @@ def parse_noise(text: str) -> Noise:
     """Read the paper's notation: only literals, nothing is evaluated.
 
     "my_noises:StickyAction(3)" is a wrapper of your own: the module is imported, and what it raises
-    passes through. Unknown names and bad arguments are a ValueError, which lists our wrappers below
-    its first line if the noise is one of ours.
+    passes through. Unknown modules and names and bad arguments are a ValueError, which lists our
+    wrappers below its first line if the noise is one of ours.
 
     >>> str(parse_noise("RandomUniformScaleReward(.50, high=1.5)"))
     'RandomUniformScaleReward(0.5, 1.5)'
@@ -1343,7 +1345,7 @@ def noise_statistics(env: Env) -> dict[str, float]:
 
 
 class NotFiniteError(FloatingPointError):
-    """A value that training cannot continue with: NaN, infinite, or not a number at all."""
+    """A value that training cannot continue with: NaN or infinite."""
 
 
 class SpaceError(ValueError):
@@ -1380,7 +1382,7 @@ class FiniteNumbers(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """Step the environment and check the observation and the reward."""
         self._steps += 1
         observation, reward, terminated, truncated, info = self.env.step(copy.copy(action))
-        number = reward if type(reward) is float else np.asarray(reward, np.float64).item()
+        number = reward if type(reward) is float else float(_number_in(reward))
         if not math.isfinite(number):
             self._blame("returned the reward", reward, action)
         observation, info = self._checked(observation, action), dict(info or {})
@@ -1422,8 +1424,9 @@ def make_flat(env: Env, step_limit: int = 10_000) -> Env:
     env = FiniteNumbers(env)
     space = env.observation_space
     is_vector = isinstance(space, gym.spaces.Box) and len(space.shape) == 1
-    if space.is_np_flattenable and not is_vector:
-        env = gym.wrappers.FlattenObservation(env)
+    with contextlib.suppress(NotImplementedError):  # a space of the user's own does not say it
+        if space.is_np_flattenable and not is_vector:
+            env = gym.wrappers.FlattenObservation(env)
     observations, actions = env.observation_space, env.action_space
     if not _is_box(observations, "fiu"):
         problem = f"needs Box observations of numbers; {name} has {observations}"
@@ -1745,19 +1748,24 @@ def run_name(args: Mapping[str, Any]) -> str:
     """
     slug = Configuration.read(args["noise"], args["noise_rate"]).slug or "baseline"
     rate, _, noise = slug.partition("_")
-    name = f"{rate}_s{args['seed']}_{noise}" if noise else f"{rate}_s{args['seed']}"
-    name += f"__{safe_name(args['env_id'])}"
+    first = f"{rate}_s{args['seed']}_{noise}" if noise else f"{rate}_s{args['seed']}"
+    end = f"__{safe_name(args['env_id'])}"
     for argument, value in sorted(parse_env_kwargs(args.get("env_kwargs", ())).items()):
         written, plain = str(value), safe_name(str(value))
-        name += f"_{argument}={plain if plain == written else _hashed(written)}"
-    name += f"__{safe_name(args['exp_name'])}"
+        end += f"_{argument}={plain if plain == written else _hashed(written)}"
+    end += f"__{safe_name(args['exp_name'])}"
     if test := read_test_noise(args.get("test_noise", ()), args.get("test_noise_rate", ())).slug:
-        name += f"__tests_{test}"
-    return name if len(name) <= 240 else f"{name[:230]}_{_hashed(name)}"  # files allow 255 bytes
+        end += f"__tests_{test}"
+    if len(first + end) > 240:  # a file's name has at most 255 bytes
+        first = f"{first[:100]}_{_hashed(first, 16)}"
+    if len(first + end) > 240:
+        room = 240 - len(first) - len("_") - 16
+        end = f"{end[:room]}_{_hashed(end, 16)}"
+    return first + end
 
 
-def _hashed(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()[:8]
+def _hashed(text: str, length: int = 8) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:length]
 
 
 def _words(noise: str) -> str:
@@ -2021,6 +2029,12 @@ def _cast(values: Array, dtype: np.dtype[Any]) -> Array:
         largest = info.max if info.bits < 64 else np.nextafter(float(info.max), 0.0)
         values = np.clip(np.rint(values), info.min, largest)
     return np.asarray(values, dtype)
+
+
+def _number_in(reward: Any) -> Any:
+    """Return a reward as a number; it may be an array of one element, of NumPy, PyTorch or JAX."""
+    is_array = hasattr(reward, "shape") and not isinstance(reward, np.generic)
+    return reward.item() if is_array else reward
 
 
 # ----------------------------------------------------------------------------- helpers: parameters

@@ -463,7 +463,7 @@ def compiled(function):
 
     def call(*inputs):
         nonlocal graph
-        # Ctrl-C would reach the compiler, too, and end it
+        # any call may compile, for other sizes: Ctrl-C would reach the compiler, too, and end it
         allowed = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
         try:
             return graph(*inputs)
@@ -665,7 +665,7 @@ class Run:
 
     def _delete(self, *patterns):
         for pattern in patterns:
-            for path in [*self.folder.glob(pattern), *self.folder.glob(f"{pattern}.tmp")]:
+            for path in {*self.folder.glob(pattern), *self.folder.glob(f"{pattern}.tmp")}:
                 path.unlink()
 
     def _write(self, name, content):

@@ -262,10 +262,13 @@ def read_curve(run):
     episodes = run.args["eval_episodes"]
     path = run.folder / "eval.csv"
     with naming(path):
-        header, *lines = path.read_text("utf-8").splitlines()
+        text = path.read_text("utf-8")
+        header, *lines = text.splitlines()
         names = header.split(",")
-        if names not in (EVAL_COLUMNS, [*EVAL_COLUMNS, "success"]) or not lines:
+        if names not in (EVAL_COLUMNS, [*EVAL_COLUMNS, "success"]) or not any(lines):
             raise ValueError("unexpected header, or no evaluation")
+        if not text.endswith("\n"):
+            raise ValueError("the last line is half-written")
         # the cell of success is empty where the environment tells nothing
         lines = [f"{line}nan" if line.endswith(",") else line for line in lines]
         numbers = np.loadtxt(lines, delimiter=",", ndmin=2, comments=None)

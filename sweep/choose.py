@@ -20,10 +20,11 @@ from analysis.words import counted
 from noisy_wrappers import BASELINE, Configuration, parse_noise
 from sweep import halving
 from sweep.environment import MANY, ask_all, mean_seconds, remember, remembered, run_seconds
-from sweep.found import look
+from sweep.found import look, remarks
 from sweep.grid import PlannedRun, configuration_of, configurations, make_run
 from sweep.looks import Plan, looks_after, nominal_levels
 from sweep.memory import choice_key, keep_plans, plan_of
+from sweep.options import from_caller
 
 
 class Choice(NamedTuple):
@@ -48,13 +49,14 @@ class Choice(NamedTuple):
 def choices(args):
     """Return the choices of one command, or exit if its numbers make no choice.
 
-    Where runs are listed, environments are made, timed and tried with noises: see untried.
+    Where runs are listed, environments are made, timed and tried with noises.
     """
     pairs = list(itertools.product(args.algos, args.envs))
     plans = {pair: plan_for(args, *pair, len(pairs)) for pair in pairs}
     known = {env_id: remembered(args, env_id) for env_id in args.envs}
     asked = {}
     if args.view in ("list", "dry-run"):
+        refuse_other_baselines(args, plans)
         asked = ask_about_untried(args, known)
         known |= asked
     found = [follow(args, *pair, known[pair[1]], plan) for pair, plan in plans.items()]
@@ -112,6 +114,18 @@ def is_enough(seeds, looks, level):
     """Tell whether a difference can be significant at the last look of so many seeds."""
     plan = Plan(looks_after(seeds, looks), level)
     return 2 / math.comb(2 * seeds, seeds) <= nominal_levels(plan)[-1]
+
+
+def refuse_other_baselines(args, plans):
+    """Exit if the fresh seeds have run without noise, in this folder, with other arguments."""
+    runs = [
+        make_run(args, *pair, BASELINE, seed, CONFIRMATION)
+        for pair, plan in plans.items()
+        for seed in halving.fresh_seeds(plan.looks[-1])
+    ]
+    hindrances, _ = remarks(map(look, runs), from_caller(args, args.runs_dir))
+    if hindrances:
+        fail("\nerror: ".join(hindrances))
 
 
 # --------------------------------------------------------------------------- which noises can act

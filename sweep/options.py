@@ -86,6 +86,9 @@ def parse_args(view, caller, argv):
 
     Exits with one line about the first argument that no run could be started with.
     """
+    for word in (caller, *argv):
+        if re.search("[\udc80-\udcff]", word):  # a byte that Python could not decode
+            fail(f"{os.fsencode(word)} is not valid UTF-8")
     given_only = {"argument_default": argparse.SUPPRESS}
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, **given_only)
     parser.error = lambda message: fail(message.removeprefix("argument "))

@@ -70,7 +70,7 @@ DAMAGE = {  # and what is said of it
         text("result.json", lambda text: re.sub(r'_mean": [^,}]*', '_mean": 1e999', text)),
         "final_return_mean is inf",
     ),
-    "half a line": (text("eval.csv", lambda text: text[:-5]), "columns"),
+    "half a line": (text("eval.csv", lambda text: text[:-5]), "half-written"),
     "no text": (lambda folder: (folder / "eval.csv").write_bytes(b"\xff\n"), "eval.csv: "),
 }
 

@@ -87,7 +87,7 @@ def command(*options):
 def test_clean_returns_are_those_of_the_last_evaluation(runs, algorithm):
     run_dir = one(runs, algorithm)
     [finished], _ = evaluate.find_players([run_dir])
-    torch.set_float32_matmul_precision("highest")  # as in a new process
+    torch.set_float32_matmul_precision("high")  # whatever it is in this process
     played = evaluate.play(finished, BASELINE, Args((run_dir,), episodes=10, seed=1_000_000))
     with open(run_dir / "eval.csv", newline="") as file:
         last = list(csv.DictReader(file))[-10:]
@@ -442,6 +442,7 @@ FOREIGN = {
     "in the run": ("runs/dl/{run}/evil.py", "runs.dl.{run}.evil:Mine-v0", "."),
     "a package": ("runs/dl/__init__.py", "runs.dl:Mine-v0", "."),
     "called from the run": ("runs/dl/{run}/evil.py", "evil:Mine-v0", "runs/dl/{run}"),
+    "through a link": ("runs/dl/evil.py", "link.evil:Mine-v0", "."),
     "not even a late import": ("runs/dl/my_physics.py", "InvertedPendulum-v5", "runs/dl"),
 }
 
@@ -452,6 +453,7 @@ def test_no_module_is_imported_from_a_folder_of_runs(place, trained, tmp_path, m
     file, env_id, cwd = (text.replace("{run}", "run") for text in FOREIGN[place])
     shutil.copytree(one(trained, "PPO"), tmp_path / "runs/dl/run")
     (tmp_path / file).write_text("raise SystemExit('imported')")
+    (tmp_path / "link").symlink_to("runs/dl")
     edit_args(tmp_path / "runs/dl/run", env_id=env_id)
     monkeypatch.chdir(tmp_path / cwd)
     monkeypatch.setattr(sys, "path", sys.path[:])

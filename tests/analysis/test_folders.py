@@ -47,7 +47,7 @@ DAMAGED = {
     "a missing evaluation at the end": lambda text: re.sub(r"(?m)^50000,.*\n", "", text),
     "steps out of order": lambda text: text.replace("\n30000,", "\n10000,"),
     "no header": lambda text: text.split("\n", 1)[1],
-    "only a header": lambda text: text.split("\n", 1)[0] + "\n",
+    "a header and an empty line": lambda text: text.split("\n", 1)[0] + "\n\n",
 }
 
 

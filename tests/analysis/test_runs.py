@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from sweeps import ENDING, SCALE, row, run, write_pairs, write_run
 
-from analysis.runs import finished, folder_of, in_short, left_out, missing_runs, read_runs
+from analysis.runs import finished, in_short, left_out, missing_runs, read_runs
 from analysis.studies import make_studies, version_notes
 from noisy_wrappers import BASELINE
 
@@ -103,14 +103,23 @@ def test_a_choice_that_stops_early_in_one_environment_is_complete(tmp_path, caps
     assert left_out(read_runs(tmp_path / "runs"))["status"].tolist() == 2 * ["unfinished"]
 
 
-def test_a_run_with_other_arguments_is_not_missing_besides(tmp_path):
-    for noise, rate in (((), ()), (SCALE, 0.5), (ENDING, 0.5)):
+@pytest.mark.parametrize("status", ["different", "corrupt"])
+def test_a_run_that_is_left_out_is_not_missing_besides(status, tmp_path):
+    """The name of its folder tells which run it is."""
+    more = {"test_noise": [ENDING], "test_noise_rate": [0.5], "env_kwargs": ["mode:1"]}
+    end = "__Hopper-v5_mode=1__sac_continuous_noisy__tests_p0.5_EarlyTermination_50"
+    begun = {(): "baseline_s{}", SCALE: "p0.5_s{}_UniformScaleReward_0.5_1.5"}
+    begun[ENDING] = "p0.5_s{}_EarlyTermination_50"
+    for noise, name in begun.items():
         for seed in (1, 2, 3):
-            gamma = 0.9 if (noise, seed) == (SCALE, 2) else 0.99
-            write_run(tmp_path, [10], seed=seed, noise=noise, rate=rate, gamma=gamma)
-    for entry in read_runs(tmp_path):  # as scripts name their folders
-        entry.run.folder.rename(tmp_path / folder_of(entry.run))
-    assert left_out(read_runs(tmp_path))["status"].tolist() == ["different"]
+            options = more | {"gamma": 0.9 if (noise, seed) == (SCALE, 2) else 0.99}
+            folder = tmp_path / f"{name.format(seed)}{end}"
+            rate = 0.5 if noise else ()
+            run_dir = write_run(tmp_path, [10], seed=seed, noise=noise, rate=rate, **options)
+            run_dir.rename(folder)
+            if status == "corrupt" and (noise, seed) == (SCALE, 2):
+                (folder / "config.json").write_text("{")
+    assert left_out(read_runs(tmp_path))["status"].tolist() == [status]
 
 
 # ------------------------------------------------------------------------------- what is one study
@@ -153,6 +162,18 @@ def test_the_most_frequent_arguments_of_an_exp_name_are_its_study(tmp_path, caps
     assert reason in set(run(tmp_path)["missing"]["reason"])
     said = capsys.readouterr().out
     assert "Runs that count: 7. SAC: 6 runs of" in said and "1 different" in said
+
+
+def test_an_argument_that_a_run_of_0_3_lacks_is_no_difference(tmp_path):
+    more = [{}, {}, {}, {"new": 1}, {"new": 1}, {"new": 2}]
+    more += [{"newer": None, "new": 1}, {"newer": 3}]
+    for seed, args in enumerate(more):
+        write_run(tmp_path, [10], seed=seed, **args)
+    found = status_of(read_runs(tmp_path), "different")
+    assert {seed: text.split(" as")[0] for seed, text in found.items()} == {
+        5: "new is 2, not 1",
+        7: "newer is 3, not None",
+    }
 
 
 def test_an_argument_that_a_run_lacks_had_the_default_that_others_name(tmp_path):

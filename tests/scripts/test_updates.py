@@ -489,6 +489,24 @@ def test_losses_of_sac_and_their_curves():
     assert_curves(curves, alpha_loss=expected(plain.alpha_loss, batch[0]))
 
 
+def test_losses_of_td3_and_their_curves():
+    torch.manual_seed(0)
+    env, batch, eps = gym.make(ENV), random_batch(64), 0.1 * torch.randn(64, 2)
+    actor, critic, target = td3.Actor(env), td3.Critic(env), td3.Critic(env)
+    y = batch[2] + 0.9 * (1 - batch[4]) * torch.stack(target(batch[3], actor(batch[3], eps))).amin(
+        0
+    )
+    q1, q2 = critic(*batch[:2])
+    losses = [nn.functional.mse_loss(q, y) for q in (q1, q2)]
+    loss, curves = td3.critic_loss(critic, target, actor, batch, eps, 0.9)
+    torch.testing.assert_close(loss, sum(losses))
+    assert_curves(curves, qf1_values=q1.mean(), qf2_values=q2.mean(), qf_loss=sum(losses) / 2)
+    assert_curves(curves, qf1_loss=losses[0], qf2_loss=losses[1])
+    loss, curves = td3.actor_loss(actor, critic, batch[0])
+    assert_curves(curves, actor_loss=-critic(batch[0], actor(batch[0]))[0].mean())
+    torch.testing.assert_close(loss, curves["actor_loss"])
+
+
 def test_the_loss_of_ppo_and_its_curves():
     torch.manual_seed(0)
     args, agent = ppo.Args(ent_coef=0.01), ppo.Agent(gym.make(ENV))

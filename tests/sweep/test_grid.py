@@ -423,6 +423,7 @@ def test_baselines_that_pay(noises, more, baselines):
         ("best -- --exp-name mine", "--exp-name: several algorithms would write into the same"),
         ("demo --env-id Hopper-v5", "at the end, after --); did you mean --envs?"),
         ("demo --runs-dir=-x", "--runs-dir must be a path"),
+        ("demo --runs-dir caf\udce9", r"b'caf\xe9' is not valid UTF-8"),
         ("--algos sac demo", "a preset comes before --algos: one of demo"),
         ("demo -- --overwrite", "--overwrite would start interrupted runs afresh"),
         ("demo -- --gama 0.9", "has no option --gama; did you mean --gamma?"),

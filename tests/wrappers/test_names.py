@@ -39,6 +39,7 @@ def test_long_run_names_fit_into_a_file_system():
 
     assert name(0.5) == name(0.50) != name(0.6)
     assert name(0.5).startswith("p1.0_s1_NormalNoisyObservation_0.001_0.002_")
+    assert name(0.5).endswith("__E__sac")
     long = {name(0.5), name(0.5, "x" * 200), name(0.6, "x" * 200), name(0.5, "x" * 201)}
     assert len(long) == 4 and max(map(len, long)) <= 240
 

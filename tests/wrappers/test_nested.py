@@ -8,6 +8,7 @@ from cases import OBSERVATION_CASES, GenericEnv, build, rollout, streams
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, Tuple
 
 from noisy_wrappers import (
+    ObservationNoise,
     RandomDropoutObservation,
     RandomNormalNoisyObservation,
     RandomUniformNoisyObservation,
@@ -103,3 +104,12 @@ def test_the_space_is_widened_in_its_entries():
     assert space["image"] == MIXED["image"]
     assert space["inner"][1] == Box(-3, 2, (2,), np.float32)
     assert space["inner"][0] == Discrete(3)
+
+
+def test_a_noise_must_return_as_many_numbers_as_it_gets():
+    class Other(ObservationNoise):
+        def _perturb(self, observation):
+            return np.ones(len(observation) + 1)
+
+    with pytest.raises(ValueError, match="must return an array of shape"):
+        Other(sampled(GOALS)[0], 1.0).reset(seed=0)

@@ -13,11 +13,18 @@ from noisy_wrappers import RandomEarlyTermination, parse_noise
 PAGE = Path(__file__).parents[2] / "docs" / "wrappers.md"
 
 
+@pytest.fixture(autouse=True)
+def one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # a small network is slower with more
+    yield
+    torch.set_num_threads(threads)
+
+
 @pytest.mark.slow
 def test_the_code_of_the_page():
     code = "\n".join(re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL))
     assert "model.learn(10_000," in code
-    torch.set_num_threads(1)  # a small network is slower with more
     code = code.replace("model.learn(10_000,", "model.learn(4096,")
     names = {"__name__": "page"}
     exec(compile(code, str(PAGE), "exec"), names)
