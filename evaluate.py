@@ -228,7 +228,8 @@ def load(player, render_mode=None):
         try:
             policy = script.load_policy(player.folder, env if run.release == "0.3" else None)
         except Exception as error:  # a damaged file may raise anything
-            text = f"policy.pt is not a policy for {player.environment}: {in_words(error)}"
+            text = f"policy.pt is damaged, or not a policy for {player.environment}"
+            text = f"{text}: {in_words(error)[:200]}"
             raise ValueError(text) from None
         yield env, policy
 

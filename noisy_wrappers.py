@@ -1854,10 +1854,12 @@ def canonical_arguments(args: Mapping[str, Any]) -> dict[str, Any]:
     imported.
 
     Raises:
-        ValueError: a number out of its range, a bad noise, rate or argument of the environment, or
-            an environment that does not exist.
+        ValueError: a number out of its range, a bad ``exp_name``, noise, rate or argument of the
+            environment, or an environment that does not exist.
     """
     _check_numbers(args)
+    if args["exp_name"] in ("", ".", ".."):
+        raise ValueError(f"--exp-name must be a name, not {args['exp_name']!r}")
     parse_env_kwargs(args["env_kwargs"])
     noises, rates = Configuration.read(args["noise"], args["noise_rate"]).texts
     tests = read_test_noise(args["test_noise"], args["test_noise_rate"]).for_tests()

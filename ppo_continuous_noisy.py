@@ -249,7 +249,7 @@ def learn(args, env, test_env, stop):
         if step == 0:
             rollout.eps[:] = torch.randn(rollout.eps.shape)
         if step == 0 or global_step == start + 1:  # there is a new policy
-            act, std = in_numpy(agent.actor_mean), agent.actor_logstd.exp().cpu().numpy()
+            act, std = in_numpy(agent.actor_mean, device), agent.actor_logstd.exp().cpu().numpy()
 
         # ACT: log-probabilities and values are computed later, for whole rollouts
         rollout.observations[step] = observation_stats.normalize(observation)
@@ -269,7 +269,7 @@ def learn(args, env, test_env, stop):
         rollout.rewards[step] = max(min(scaled, 10.0), -10.0)  # in this order NaN stays
         rollout.dones[step] = terminated or truncated
         if args.bootstrap_truncated and truncated and not terminated:
-            value = in_numpy(agent.critic)(observation_stats.normalize(observation))
+            value = in_numpy(agent.critic, device)(observation_stats.normalize(observation))
             rollout.rewards[step] += args.gamma * value[0]
 
         is_last = global_step == total_steps
@@ -348,7 +348,8 @@ def check_agent(agent, observations, log_probs, values, rollout, std):
 
 def make_policy(agent, observation_stats, env):
     """Return the test policy, NumPy to NumPy: mean actions; it leaves observation_stats as is."""
-    act, normalize = in_numpy(agent.actor_mean), observation_stats.normalize
+    act = in_numpy(agent.actor_mean, agent.actor_logstd.device)
+    normalize = observation_stats.normalize
     return lambda observation: noisy.into_space(act(normalize(observation)), env.action_space)
 
 
@@ -406,16 +407,15 @@ def updater(loss, network, optimizer, args):
     return update
 
 
-def in_numpy(network):
+def in_numpy(network, device):
     """Return a network as a function of one observation, NumPy to NumPy.
 
     A Sequential of Linear, Tanh and ReLU is computed in NumPy, several times faster than in
-    PyTorch; any other network is called as it is. Call this again after an update.
+    PyTorch; anything else, also a method, is called as it is. Call this again after an update.
     """
     layers = [*network] if type(network) is nn.Sequential else [network]
-    has_hooks = any(x._forward_hooks or x._forward_pre_hooks for x in layers)  # spectral_norm()
-    if has_hooks or not {type(x) for x in layers} <= {nn.Linear, nn.Tanh, nn.ReLU}:
-        device = next(network.parameters()).device
+    is_plain = {type(x) for x in layers} <= {nn.Linear, nn.Tanh, nn.ReLU}
+    if not is_plain or any(x._forward_hooks or x._forward_pre_hooks for x in layers):
         return lambda x: network(torch.from_numpy(x).to(device)).numpy(force=True)
     arrays = [{name: p.numpy(force=True) for name, p in x.named_parameters()} for x in layers]
 

@@ -240,6 +240,8 @@ def learn(args, env, test_env, stop):
         fail(f"SAC needs bounded actions; some actions of {args.env_id} are unbounded")
     if args.learning_starts >= args.total_timesteps:
         fail(f"--learning-starts must be below --total-timesteps, {args.total_timesteps}")
+    with fail_on(MemoryError, f"--buffer-size {args.buffer_size}"):
+        buffer = ReplayBuffer(args.buffer_size + 1, env)  # one for the next observation
     device = torch.device("cuda" if args.cuda else "cpu")
     run = Run(args, env)
     if run.is_finished:
@@ -250,8 +252,6 @@ def learn(args, env, test_env, stop):
     rng = np.random.default_rng(args.seed)
     env.action_space.seed(args.seed)
     observation, _ = env.reset(seed=args.seed)
-    with fail_on(MemoryError, f"--buffer-size {args.buffer_size}"):
-        buffer = ReplayBuffer(args.buffer_size + 1, env)  # one for the next observation
     actor, critic, target = Actor(env).to(device), Critic(env).to(device), Critic(env).to(device)
     target.load_state_dict(critic.state_dict())
     alpha = torch.tensor(1.0 if args.autotune else args.alpha)

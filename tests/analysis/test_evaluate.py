@@ -416,7 +416,7 @@ def edit_args(run_dir, **values):
 
 
 BAD_RUNS = {
-    "policy.pt is not a policy": lambda folder: (folder / "policy.pt").write_bytes(b"x"),
+    "policy.pt is damaged": lambda folder: (folder / "policy.pt").write_bytes(b"x"),
     "robustness.csv: ": lambda folder: (folder / "robustness.csv").write_text("a,b\n1,2\n"),
     "not today .*broken.py, line 2": lambda folder: edit_args(folder, env_id="broken:Mine-v0"),
     "SystemExit: no .*exits.py, line 1": lambda folder: edit_args(folder, env_id="exits:Mine-v0"),

@@ -53,7 +53,7 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
     ("trains", "ppo", "and learns another"): [  # acts with a copy that was right at the start
         IMPORT,
         before("        self.actor_logstd = nn.", "self.first = copy.deepcopy(self.actor_mean)"),
-        ("in_numpy(agent.actor_mean), agent", "in_numpy(agent.first), agent"),
+        ("in_numpy(agent.actor_mean, device), agent", "in_numpy(agent.first, device), agent"),
     ],
     ("acts", "td3", "actions in training are"): [
         IMPORT,

@@ -249,6 +249,7 @@ BAD = [  # arguments, what the line names
     ({"env_id": "toy_envs:Endless-v0", "env_kwargs": ("mass:2.0",)}, "unexpected keyword argument"),
     ({"env_id": "toy_envs:Count-v0", "env_kwargs": ("mass:2.0",)}, "takes no arguments"),
     ({"env_id": "toy_envs:Count-v0", "env_kwargs": ("id:2",)}, "multiple values for"),
+    ({"exp_name": ".."}, "--exp-name must be a name, not '..'"),
     ({"env_id": "toy_envs:NoEnv-v0"}, "must inherit from the gymnasium.Env class"),
     ({"seed": -1}, "--seed must be at least 0, not -1\n"),
     ({"gamma": 1.1}, "--gamma must be at most 1, not 1.1\n"),

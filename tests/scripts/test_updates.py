@@ -776,13 +776,15 @@ def hooked(layer):
 )
 def test_a_network_acts_in_numpy_as_in_pytorch(layers, translated):
     network = nn.Sequential(*layers).eval()
-    act, forward = ppo.in_numpy(network), mock.Mock(wraps=network.forward)
+    act, forward = ppo.in_numpy(network, "cpu"), mock.Mock(wraps=network.forward)
     with mock.patch.object(network, "forward", forward), torch.no_grad():
         for x in torch.randn(5, 3):
             expected = network(x)
             forward.reset_mock()
             torch.testing.assert_close(torch.from_numpy(act(x.numpy())), expected)
             assert forward.called == (not translated)
+            called = ppo.in_numpy(network.__call__, "cpu")  # as a method of an agent would be
+            assert called(x.numpy()).tolist() == expected.tolist()
 
 
 def test_normalized_numbers_are_clipped():
