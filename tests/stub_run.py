@@ -117,10 +117,8 @@ def train(argv):
     rows = ["step,episode,episodic_return,episodic_length" + ",success" * tells]
     for test, episodes in enumerate(tests, start=1):
         for episode, value in enumerate(episodes):
-            rows.append(
-                f"{test * args.total_timesteps // 10},{episode},{value},100"
-                + f",{value > 100:d}" * tells
-            )
+            step, success = test * args.total_timesteps // 10, f",{value > 100:d}" * tells
+            rows.append(f"{step},{episode},{value},100{success}")
     (folder / "eval.csv").write_text("\n".join(rows) + "\n")
     result = {"total_timesteps": args.total_timesteps, "wall_time_seconds": 99.0}
     result |= {"processor_seconds": 36.0, "final_return_mean": fmean(tests[-1])}

@@ -1,11 +1,10 @@
 """What the packages promise: imports that run one way, and short files."""
 
 import ast
-from pathlib import Path
 
 import pytest
+from commands import ROOT
 
-ROOT = Path(__file__).parents[1]
 PACKAGES = ["analysis", "sweep"]
 FILES = [path for package in PACKAGES for path in sorted((ROOT / package).glob("*.py"))]
 # A module imports only from those before it: by package, and within a package by name.

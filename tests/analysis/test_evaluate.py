@@ -69,6 +69,12 @@ def one(runs, algorithm):
     return sorted(runs.glob(f"*{algorithm.lower()}_continuous_noisy*"))[0]
 
 
+@pytest.fixture
+def run_dir(runs):
+    """The first run of PPO in that copy."""
+    return one(runs, "PPO")
+
+
 def files(folder):
     """All files below a folder with their content and time of writing."""
     paths = [path for path in sorted(folder.rglob("*")) if path.is_file()]
@@ -98,9 +104,8 @@ def test_clean_returns_are_those_of_the_last_evaluation(runs, algorithm):
     assert torch.get_float32_matmul_precision() == precision
 
 
-def test_noisy_returns_are_those_of_a_loop_of_ones_own(runs):
+def test_noisy_returns_are_those_of_a_loop_of_ones_own(run_dir):
     """Episode i and its noise begin with the seed SEED + i; noise on the reward is not counted."""
-    run_dir = one(runs, "PPO")
     main(Args((run_dir,), noises=(OBSERVATION, BOTH), noise_rates=(0.5,), episodes=6))
     bare = gym.make("InvertedPendulum-v5")
     policy, expected = ppo.load_policy(run_dir, bare), []
@@ -118,8 +123,7 @@ def test_noisy_returns_are_those_of_a_loop_of_ones_own(runs):
     assert [tuple(row[name] for name in columns) for row in stored(run_dir)] == expected
 
 
-def test_the_time_limit_of_training_holds(runs):
-    run_dir = one(runs, "PPO")
+def test_the_time_limit_of_training_holds(run_dir):
     edit_args(run_dir, max_episode_steps=3)
     main(Args((run_dir,), episodes=3))
     assert [row["episodic_length"] for row in stored(run_dir)] == ["3"] * 3
@@ -149,8 +153,7 @@ def test_only_what_is_not_stored_is_played(runs, monkeypatch, capsys):
     assert [row for row in again if row["episode"] != "2" and row["noise"] != ACTION] == first
 
 
-def test_another_seed_plays_everything_and_stores_nothing(runs, capsys):
-    run_dir = one(runs, "PPO")
+def test_another_seed_plays_everything_and_stores_nothing(runs, run_dir, capsys):
     main(Args((run_dir,), episodes=3))
     before = files(runs)
     args = Args((run_dir,), (OBSERVATION,), episodes=3, seed=7)
@@ -226,8 +229,7 @@ def test_damaged_episodes_are_told(said, tmp_path):
         read_episodes(tmp_path)
 
 
-def test_a_full_disk_leaves_the_previous_file(runs, monkeypatch, capsys):
-    run_dir = one(runs, "PPO")
+def test_a_full_disk_leaves_the_previous_file(runs, run_dir, monkeypatch, capsys):
     main(Args((run_dir,), episodes=1))
     before = files(runs)
     full = mock.Mock(side_effect=OSError(28, "No space left on device"))
@@ -237,8 +239,7 @@ def test_a_full_disk_leaves_the_previous_file(runs, monkeypatch, capsys):
     assert "No space left on device" in capsys.readouterr().err and files(runs) == before
 
 
-def test_a_script_that_is_not_there_or_has_changed_is_told(runs, capsys):
-    run_dir = one(runs, "PPO")
+def test_a_script_that_is_not_there_or_has_changed_is_told(run_dir, capsys):
     sha256 = json.loads((run_dir / "config.json").read_text())["script_sha256"]
     for others in (64 * "0", f"{64 * '0'}, {sha256}"):  # which resumed it
         edit_config(run_dir, script_sha256=others)
@@ -249,8 +250,7 @@ def test_a_script_that_is_not_there_or_has_changed_is_told(runs, capsys):
     assert "its script wide_continuous_noisy.py is neither" in capsys.readouterr().err
 
 
-def test_an_unfinished_run_plays_only_if_it_is_named_and_stores_nothing(runs, capsys):
-    run_dir = one(runs, "PPO")
+def test_an_unfinished_run_plays_only_if_it_is_named_and_stores_nothing(runs, run_dir, capsys):
     (run_dir / "result.json").unlink()
     header, _ = (run_dir / "eval.csv").read_text().split("\n", 1)
     (run_dir / "eval.csv").write_text(header + "\n")  # it has been resumed from before its tests
@@ -324,10 +324,9 @@ def test_phases_of_a_choice_are_rows_of_their_own(runs, capsys):
     assert {"PPO [search]", "PPO [confirmation]"} <= set(printed)
 
 
-def test_masses_by_delays_are_a_matrix(runs, capsys):
+def test_masses_by_delays_are_a_matrix(run_dir, capsys):
     names = ["RandomDynamics(0.7, 0.7)", "RandomDynamics(1.3, 1.3)"]
     pairs = [f"{mass} + RandomActionDelay({delay})" for mass in names for delay in (1, 2)]
-    run_dir = one(runs, "PPO")
     main(Args((run_dir,), (*pairs, names[0]), episodes=1))
     table = capsys.readouterr().out
     assert "tested with RandomDynamics(0" not in table
@@ -343,11 +342,10 @@ def test_masses_by_delays_are_a_matrix(runs, capsys):
 
 
 @pytest.mark.slow
-def test_videos(runs, tmp_path, monkeypatch):
+def test_videos(runs, run_dir, tmp_path, monkeypatch):
     """Without a display."""
     for name in ("DISPLAY", "MUJOCO_GL"):
         monkeypatch.delenv(name, raising=False)
-    run_dir = one(runs, "PPO")
     before = files(runs)
     line = command(run_dir, "--noises", ACTION, "--video", tmp_path / "a" / "b", "--episodes", 9)
     result = subprocess.run(line, capture_output=True, text=True)
@@ -364,17 +362,13 @@ def test_videos(runs, tmp_path, monkeypatch):
 
 
 OWN = """
-import os
-import sys
-
+import os, sys
 import gymnasium as gym
-
 
 class Own(gym.ActionWrapper):
     def action(self, action):
         {code}
         return action
-
 
 gym.register("{name}-v0", lambda **given: Own(gym.make("InvertedPendulum-v5", **given)))
 """
@@ -424,11 +418,10 @@ BAD_RUNS = {
 
 
 @pytest.mark.parametrize("message", BAD_RUNS)
-def test_a_bad_run_is_named_and_the_others_are_tested(runs, capsys, message, monkeypatch, tmp_path):
+def test_a_bad_run_hides_no_other(message, runs, run_dir, capsys, monkeypatch, tmp_path):
     (tmp_path / "broken.py").write_text("def f():\n    raise RuntimeError('not today')\nf()\n")
     (tmp_path / "exits.py").write_text("raise SystemExit('no licence')")
     monkeypatch.chdir(tmp_path)
-    run_dir = one(runs, "PPO")
     BAD_RUNS[message](run_dir)
     assert main(Args((one(runs, "TD3"), run_dir), episodes=1)) == 1
     out, err = capsys.readouterr()
@@ -481,9 +474,8 @@ def test_no_script_is_run_from_a_folder_of_runs(trained, tmp_path, monkeypatch, 
 
 
 @pytest.mark.parametrize("options", [{"noises": ("evil:Sticky(0.1)",)}, {"env_id": "evil:Mine-v0"}])
-def test_no_noise_is_imported_from_a_folder_of_runs(options, runs, monkeypatch, capsys):
+def test_no_noise_is_imported_from_a_folder_of_runs(options, runs, run_dir, monkeypatch, capsys):
     """Nor another environment; a noise in config.json is not imported at all."""
-    run_dir = one(runs, "PPO")
     (runs / "evil.py").write_text("raise SystemExit('imported')")
     edit_args(run_dir, noise=["evil:Sticky(0.1)"], noise_rate=[0.5])
     monkeypatch.chdir(runs)
@@ -525,9 +517,8 @@ def test_bad_arguments(runs, capsys, options, message, monkeypatch):
     refused(Args(**({"runs": (runs,)} | options)), message, runs, capsys)
 
 
-def test_runs_that_cannot_be_written_to_are_not_played(runs, capsys, monkeypatch):
+def test_runs_that_cannot_be_written_to_are_not_played(runs, run_dir, capsys, monkeypatch):
     monkeypatch.setattr(evaluate.os, "access", lambda path, mode: False)
-    run_dir = one(runs, "PPO")
     refused(Args((run_dir,)), "cannot be written to; with another --seed", runs, capsys)
     store_episodes(run_dir, CLEAN, np.zeros((3, 3)))
     assert main(Args((run_dir,), episodes=3)) == 0  # of what is stored there is a table
@@ -559,8 +550,7 @@ def test_a_process_that_is_killed_is_told_in_one_line(runs, tmp_path):
     assert re.search(line, result.stderr, re.MULTILINE) and "evaluate.py" not in result.stderr
 
 
-def test_a_copied_run_is_no_seed(runs, capsys):
-    run_dir = one(runs, "PPO")
+def test_a_copied_run_is_no_seed(runs, run_dir, capsys):
     shutil.copytree(run_dir, runs / "copy")
     main(Args((run_dir, runs / "copy"), episodes=1))
     told, *table = capsys.readouterr().out.splitlines()

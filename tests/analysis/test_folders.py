@@ -41,9 +41,7 @@ DAMAGED = {
     "a short line": lambda text: text.replace(",1000\n", "\n", 1),
     "nan": lambda text: re.sub(r"(?m)^(10000,0,)[^,]*", r"\1nan", text),
     "a missing episode": lambda text: re.sub(r"(?m)^20000,1,.*\n", "", text),
-    "an episode of each of two tests": lambda text: re.sub(
-        r"(?m)^(20000,1|30000,0),.*\n", "", text
-    ),
+    "an episode each of two tests": lambda text: re.sub(r"(?m)^(20000,1|30000,0),.*\n", "", text),
     "a missing evaluation at the end": lambda text: re.sub(r"(?m)^50000,.*\n", "", text),
     "steps out of order": lambda text: text.replace("\n30000,", "\n10000,"),
     "no header": lambda text: text.split("\n", 1)[1],

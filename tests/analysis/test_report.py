@@ -80,10 +80,8 @@ def test_first_screen(width, end, results, tmp_path):
     assert page["width"] <= width and page["order"]
     assert page["scrolling"] == page["broken"] == 0
     beside = {address.rpartition("/")[2] for address in page["beside"]}
-    assert beside == {
-        f"curves_SAC_{noise}{end}.svg"
-        for noise in ("RandomEarlyTermination_50", "RandomUniformScaleReward_0.5_1.5")
-    }
+    noises = "RandomEarlyTermination_50", "RandomUniformScaleReward_0.5_1.5"
+    assert beside == {f"curves_SAC_{noise}{end}.svg" for noise in noises}
     assert page["hints"] == (page["tables"] if width == 420 else 0)
     assert page["links"] and all(link.startswith("#") for link in page["links"])
 

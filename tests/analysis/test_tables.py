@@ -67,9 +67,7 @@ def test_rates_with_too_few_of_all_seeds_have_no_verdict(tmp_path, capsys):
     assert said in capsys.readouterr().out
 
 
-def test_over_environments_single_rates_have_no_verdict_where_one_of_them_has_none(
-    tmp_path, capsys
-):
+def test_rates_without_a_verdict_in_one_environment_have_none_over_several(tmp_path, capsys):
     """The least numbers of seeds of all environments are no comparison of any of them."""
     for env, baseline in (("Hopper-v5", 5), ("Pusher-v5", 20)):
         write_pairs(tmp_path / "runs", range(101, 101 + baseline), range(201, 206), env=env)

@@ -132,10 +132,8 @@ def test_averages_that_differ_in_direction_are_no_verdict():
     assert list(table["verdict"]) == ["no clear difference"]
     tested = table.assign(p_holm=table["p"], conditions=1, conditions_tested=1, where="all")
     tested = tested.assign(clean_change_percent=np.nan)
-    for said in (
-        *analysis.verdicts.in_sentences(table)["sentence"],
-        *robustness_sentences(tested, "return"),
-    ):
+    sentences = robustness_sentences(tested, "return")
+    for said in (*analysis.verdicts.in_sentences(table)["sentence"], *sentences):
         assert "no clear difference" in said and "direction" in said
 
 

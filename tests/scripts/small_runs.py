@@ -30,6 +30,11 @@ each_script = pytest.mark.parametrize("algorithm", SCRIPTS)
 two_scripts = pytest.mark.parametrize("algorithm", ["SAC", "PPO"])
 
 
+def slow(*values):
+    """Return values of a parametrized test that are left out by -m 'not slow'."""
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
 def arguments(algorithm, runs_dir, **kwargs):
     """Return the arguments of a run of a second or less."""
     common = {"env_id": "toy_envs:Tiny-v0", "eval_frequency": 20, "eval_episodes": 3}

@@ -7,18 +7,17 @@ import importlib.util
 import os
 import re
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import check_script
 import commands
 import numpy as np
 import pytest
-import sweeps
 import torch
 import watched_run
+from small_runs import ROOT, slow
+from sweeps import write_run
 
-ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "changing.md").read_text()
 SECTIONS = {
     int(number): text
@@ -75,16 +74,11 @@ def imported(number, folder):
 
 
 EVERYDAY = (1, 9)  # two that are quick, of the network and of the loop; `make test` trains all
+# the promises of the others are checked whole, below
+OTHERS = [slow(number) for number in range(1, 11) if number not in (*EVERYDAY, *WHOLE)]
 
 
-@pytest.mark.parametrize(
-    "number",
-    [  # the promises of the others are checked whole, below
-        pytest.param(n, marks=[] if n in EVERYDAY else pytest.mark.slow)
-        for n in range(1, 11)
-        if n in EVERYDAY or n not in WHOLE
-    ],
-)
+@pytest.mark.parametrize("number", [*EVERYDAY, *OTHERS])
 def test_a_change_trains(number, tmp_path):
     path = write(number, tmp_path)
     run = watched_run.train(path, OPTIONS.get(number, []), tmp_path / "runs")
@@ -177,7 +171,7 @@ def test_two_scripts_are_compared(tmp_path, capsys, monkeypatch):
     for name, change in {"my": 10, "td3": 0}.items():
         for seed in range(1, 7):
             final = [100 + change + seed]
-            sweeps.write_run(tmp_path / "runs", final, name.upper(), "Hopper-v5", seed=seed)
+            write_run(tmp_path / "runs", final, name.upper(), "Hopper-v5", seed=seed)
     monkeypatch.chdir(tmp_path)
     exec(program, {})
     out = capsys.readouterr().out

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete
-from small_runs import ROOT, SCRIPTS, run
+from small_runs import ROOT, SCRIPTS, run, slow
 
 import ppo_continuous_noisy as ppo
 
@@ -83,11 +83,7 @@ def follow_page(algorithm, env_id, folder):
 
 @pytest.mark.parametrize(
     ("algorithm", "env_id"),
-    [
-        pytest.param("SAC", "Sensors-v0", marks=pytest.mark.slow),
-        pytest.param("TD3", "Sensors-v0", marks=pytest.mark.slow),
-        ("PPO", "HalfBounded-v0"),
-    ],
+    [slow("SAC", "Sensors-v0"), slow("TD3", "Sensors-v0"), ("PPO", "HalfBounded-v0")],
 )
 def test_numpy_alone_plays_a_policy(algorithm, env_id, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -24,6 +24,7 @@ from small_runs import (
     policy,
     refused,
     run,
+    slow,
     two_scripts,
 )
 
@@ -175,7 +176,7 @@ def forget_seeds():
     torch.seed()
 
 
-@pytest.mark.parametrize("algorithm", ["PPO", pytest.param("SAC", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("algorithm", ["PPO", slow("SAC")])
 def test_a_seed_seeds_all_that_is_random_also_after_a_stop(algorithm, tmp_path):
     runs = {}
     for name, seed in (("stopped", 1), ("other", 2), ("one", 1)):
@@ -207,10 +208,8 @@ def test_what_a_constructor_draws_is_the_same_in_the_tests_of_all_runs(tmp_path,
     [("medium", {}, "medium"), ("medium", {"amx_tile": True}, "highest"), ("bf16", {}, None)]
     + [("bf16", {"avx512_bf16": True}, "highest"), ("highest", {}, "highest")],
 )
-def test_which_precision_and_threads_are_used(
-    asked, processor, used, tmp_path, monkeypatch, capsys
-):
-    """Where "medium" would round, it is "highest"; bf16 is cast explicitly."""
+def test_which_precision_is_used(asked, processor, used, tmp_path, monkeypatch, capsys):
+    """And threads. Where "medium" would round, it is "highest"; bf16 is cast explicitly."""
     found = []
 
     def learn(*_):

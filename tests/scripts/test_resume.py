@@ -34,6 +34,7 @@ from small_runs import (
     read_json,
     refused,
     run,
+    slow,
     two_scripts,
     wait_for_a_later_name,
 )
@@ -220,9 +221,9 @@ def test_killed_while_every_step_ends_an_episode_it_logs_each_once(tmp_path):
 
 @pytest.mark.slow
 def test_events_are_on_the_disk_before_the_checkpoint_is(alone, tmp_path):
-    slow = ("tensorboard.summary.writer.record_writer.RecordWriter.write", None, wait)
+    slowly = ("tensorboard.summary.writer.record_writer.RecordWriter.write", None, wait)
     in_place = ("os.replace", None, Nth("checkpoint", 1, die_once_in_place))
-    result = command("PPO", tmp_path, slow, in_place, **hopper("PPO"))
+    result = command("PPO", tmp_path, slowly, in_place, **hopper("PPO"))
     assert result.code == -signal.SIGKILL and (folder(tmp_path) / "checkpoint.pt").exists()
     assert not differing(finish("PPO", tmp_path, **hopper("PPO")), alone("PPO"))
 
@@ -231,9 +232,7 @@ def test_events_are_on_the_disk_before_the_checkpoint_is(alone, tmp_path):
 # A state that were not saved, or not loaded, would begin anew here: the run would end differently.
 
 
-@pytest.mark.parametrize(
-    "algorithm", ["PPO", *(pytest.param(name, marks=pytest.mark.slow) for name in ("SAC", "TD3"))]
-)
+@pytest.mark.parametrize("algorithm", ["PPO", slow("SAC"), slow("TD3")])
 def test_stopped_and_resumed_it_ends_as_if_left_alone(algorithm, alone, copy_of_stopped, tmp_path):
     stopped = copy_of_stopped(algorithm, tmp_path)
     (stopped / "eval.csv").write_text("damaged, and healed")
@@ -391,9 +390,7 @@ def test_a_new_option_is_another_run_unless_it_has_its_default(stopped, monkeypa
     assert "sizes [32], not [64, 64]" in untouched(capsys, stopped)
 
 
-def test_another_text_of_the_script_is_said_and_recorded(
-    stopped, tmp_path_factory, monkeypatch, capsys
-):
+def test_a_changed_script_is_said_and_recorded(stopped, tmp_path_factory, monkeypatch, capsys):
     config = read_json(stopped / "config.json")
     copy = tmp_path_factory.mktemp("copy") / "ppo_continuous_noisy.py"
     copy.write_text(Path(ppo.__file__).read_text() + "# changed\n")

@@ -134,9 +134,7 @@ def test_run_folder(tmp_path, capsys):
 
 
 @each_script
-def test_the_test_environment_is_clean_and_policies_play_without_an_environment(
-    algorithm, tmp_path
-):
+def test_tests_are_clean_and_policies_play_without_an_environment(algorithm, tmp_path):
     script = SCRIPTS[algorithm]
     noises = ("RandomEarlyTermination(2)", "RandomNormalNoisyReward(1.0, loc=100)")
     noise = {"noise": (*noises, "RandomUniformNoisyObservation(50, 60)"), "noise_rate": (1.0,)}
@@ -194,9 +192,8 @@ def test_overwrite_of_nothing_and_a_short_run(tmp_path):
     short |= {"env_id": "toy_envs:Count-v0", "learning_starts": 4}
     run_dir = run("SAC", tmp_path / "short", overwrite=True, **short)
     assert [row[0] for row in evaluations(run_dir)] == [1, 2, 3, 4, 5]  # at most ten tests
-    tested = run(
-        "TD3", tmp_path / "longer", **short | {"total_timesteps": 30, "learning_starts": 29}
-    )
+    longer = short | {"total_timesteps": 30, "learning_starts": 29}
+    tested = run("TD3", tmp_path / "longer", **longer)
     assert [row[0] for row in evaluations(tested)] == list(range(3, 31, 3))
     assert [s.EVAL_FREQUENCY for s in (sac, td3, ppo)] == [10_000, 10_000, 50_000]
     result = read_json(run_dir / "result.json")

@@ -18,7 +18,7 @@ import torch._inductor.config
 import torch.nn as nn
 import torch.nn.functional as F
 from gymnasium import wrappers
-from small_runs import SCRIPTS, curves, refused, two_scripts
+from small_runs import SCRIPTS, curves, refused, slow, two_scripts
 from torch.distributions import Normal
 
 import noisy_wrappers as noisy
@@ -203,7 +203,7 @@ class PlainTD3(PlainActorCritic):
 
 
 def plain_training(plain, env, args):
-    """Train until the first end of an episode after total_timesteps; return the ends so far."""
+    """Train until the first end of an episode after total_timesteps; return how many there were."""
     buffer, ends, step = PlainBuffer(args.buffer_size + 1), [], 0
     rng = np.random.default_rng(args.seed)
     env.action_space.seed(args.seed)
@@ -221,7 +221,8 @@ def plain_training(plain, env, args):
         if terminated or truncated:
             ends.append("terminated" if terminated else "truncated")
             if step > args.total_timesteps:
-                return ends
+                assert {"terminated", "truncated"} == set(ends)  # or tests show less than it seems
+                return len(ends)
             observation, _ = env.reset()
 
 
@@ -241,13 +242,11 @@ def assert_equal_networks(state, *networks):
     assert (actual - expected).norm() < 5e-6 * expected.norm()
 
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        pytest.param({"autotune": False, "alpha": 0.4}, marks=pytest.mark.slow),
-        {"policy_frequency": 3, "target_network_frequency": 2, "q_lr": 3e-3, **NOISE},
-    ],
-)
+FIXED = {"autotune": False, "alpha": 0.4}
+SELDOM = {"policy_frequency": 3, "target_network_frequency": 2, "q_lr": 3e-3, **NOISE}
+
+
+@pytest.mark.parametrize("case", [slow(FIXED), SELDOM])
 def test_sac_trains_as_a_plain_implementation(case, tmp_path):
     args = sac.Args(**OFF_POLICY | case)
     env = make_env(args)
@@ -255,10 +254,7 @@ def test_sac_trains_as_a_plain_implementation(case, tmp_path):
     actor, critic, _ = sac.Actor(env), sac.Critic(env), sac.Critic(env)
     actor, critic = actor.state_dict(), critic.state_dict()
     plain = PlainSAC(actor, critic, critic, env.action_space, args)
-    ends = plain_training(plain, env, args)
-    assert {"terminated", "truncated"} == set(ends)  # or this shows less than it seems to
-
-    state = checkpoint(sac, args, len(ends), tmp_path)
+    state = checkpoint(sac, args, plain_training(plain, env, args), tmp_path)
     assert_equal_networks(state["actor"], plain.actor)
     assert_equal_networks(state["critic"], plain.q1, plain.q2)
     assert_equal_networks(state["target"], plain.q1_target, plain.q2_target)
@@ -268,15 +264,10 @@ def test_sac_trains_as_a_plain_implementation(case, tmp_path):
 
 
 LOUD = {"policy_frequency": 3, "policy_noise": 1.0, "noise_clip": 0.7, "exploration_noise": 0.8}
+OFTEN = {"policy_frequency": 1, "learning_rate": 1e-3, **NOISE}
 
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        pytest.param(LOUD, marks=pytest.mark.slow),
-        {"policy_frequency": 1, "learning_rate": 1e-3, **NOISE},
-    ],
-)
+@pytest.mark.parametrize("case", [slow(LOUD), OFTEN])
 def test_td3_trains_as_a_plain_implementation(case, tmp_path):
     args = td3.Args(**OFF_POLICY | case)
     env = make_env(args)
@@ -284,10 +275,7 @@ def test_td3_trains_as_a_plain_implementation(case, tmp_path):
     actor, critic = td3.Actor(env).state_dict(), td3.Critic(env).state_dict()
     td3.Actor(env), td3.Critic(env)
     plain = PlainTD3(actor, critic, env.action_space, args)
-    ends = plain_training(plain, env, args)
-    assert {"terminated", "truncated"} == set(ends)
-
-    state = checkpoint(td3, args, len(ends), tmp_path)
+    state = checkpoint(td3, args, plain_training(plain, env, args), tmp_path)
     assert_equal_networks(state["actor"], plain.actor)
     assert_equal_networks(state["critic"], plain.q1, plain.q2)
     assert_equal_networks(state["target_actor"], plain.actor_target)
@@ -398,10 +386,7 @@ TIGHT = {"bootstrap_truncated": True, "clip_coef": 0.02, "vf_coef": 1.0, "max_gr
 STOPS = {"target_kl": 0.004, "learning_rate": 3e-3}
 
 
-SLOW = [pytest.param(c, marks=pytest.mark.slow) for c in ({"ent_coef": 0.01}, LOOSE)]
-
-
-@pytest.mark.parametrize("case", [*SLOW, TIGHT, STOPS | NOISE])
+@pytest.mark.parametrize("case", [slow({"ent_coef": 0.01}), slow(LOOSE), TIGHT, STOPS | NOISE])
 def test_ppo_trains_as_a_plain_implementation(case, tmp_path):
     args = ppo.Args(**ON_POLICY | case)
     env = make_env(args)
@@ -439,9 +424,7 @@ def test_ppo_anneals_every_learning_rate(tmp_path, monkeypatch):
     assert rates == pytest.approx([args.learning_rate / rollouts, 1e-3 / rollouts])
     [folder] = tmp_path.iterdir()
     shown = [float(value) for _, value in curves(folder)["charts/learning_rate"]]
-    assert shown == pytest.approx(
-        [args.learning_rate * left / rollouts for left in range(rollouts, 0, -1)]
-    )
+    assert shown == pytest.approx(args.learning_rate * np.arange(rollouts, 0, -1) / rollouts)
 
 
 # LOSSES: Adam hides a factor of a whole loss, and nobody else reads the curves.
@@ -493,9 +476,8 @@ def test_losses_of_td3_and_their_curves():
     torch.manual_seed(0)
     env, batch, eps = gym.make(ENV), random_batch(64), 0.1 * torch.randn(64, 2)
     actor, critic, target = td3.Actor(env), td3.Critic(env), td3.Critic(env)
-    y = batch[2] + 0.9 * (1 - batch[4]) * torch.stack(target(batch[3], actor(batch[3], eps))).amin(
-        0
-    )
+    next_values = torch.stack(target(batch[3], actor(batch[3], eps))).amin(0)
+    y = batch[2] + 0.9 * (1 - batch[4]) * next_values
     q1, q2 = critic(*batch[:2])
     losses = [nn.functional.mse_loss(q, y) for q in (q1, q2)]
     loss, curves = td3.critic_loss(critic, target, actor, batch, eps, 0.9)
@@ -545,19 +527,31 @@ def two_networks():
     return network, copy.deepcopy(network), torch.randn(5, 3)
 
 
+def learned(script, compile, coefficients):
+    """Return the weights after an update with each of these numbers."""
+    network, other, x = two_networks()
+    optimizer = torch.optim.SGD(network.parameters(), lr=0.1)
+    args = script.Args(compile=compile)
+    update = script.updater(loss_of_a_researcher, network, optimizer, args)
+    for coefficient in coefficients:
+        with torch.no_grad():
+            update(other, x, coefficient)
+    return network.state_dict()
+
+
 @two_scripts
 def test_each_term_of_a_loss_has_its_gradient_and_other_networks_are_constants(algorithm):
     script, (network, other, x) = SCRIPTS[algorithm], two_networks()
     network[0].bias.requires_grad_(False)  # frozen
-    learned = [p for p in network.parameters() if p.requires_grad]
-    optimizer = torch.optim.SGD(learned, lr=1.0)  # any optimizer
+    thawed = [p for p in network.parameters() if p.requires_grad]
+    optimizer = torch.optim.SGD(thawed, lr=1.0)  # any optimizer
     loss, _ = loss_of_a_researcher(network, other, x, 0.3)
-    gradients = torch.autograd.grad(loss, learned)
-    expected = [p.detach() - g for p, g in zip(learned, gradients, strict=True)]
+    gradients = torch.autograd.grad(loss, thawed)
+    expected = [p.detach() - g for p, g in zip(thawed, gradients, strict=True)]
     args = script.Args(compile=False)
     args.max_grad_norm = 1e9
     script.updater(loss_of_a_researcher, network, optimizer, args)(other, x, 0.3)
-    torch.testing.assert_close([p.detach() for p in learned], expected)
+    torch.testing.assert_close([p.detach() for p in thawed], expected)
     assert all(p.grad is None for p in [*parameters(other), network[0].bias])
 
 
@@ -591,17 +585,10 @@ def graphs(monkeypatch):
 @pytest.mark.slow
 @two_scripts
 def test_numbers_given_to_an_update_do_not_recompile(algorithm, graphs):
-    script, (network, other, x) = SCRIPTS[algorithm], two_networks()
-    plain = copy.deepcopy(network)
-    for learned in (network, plain):
-        optimizer = torch.optim.SGD(learned.parameters(), lr=0.1)
-        args = script.Args(compile=learned is network)
-        update = script.updater(loss_of_a_researcher, learned, optimizer, args)
-        for coefficient in (0.5, 1, 0, np.float64(0.25), *np.linspace(0, 1, 10)):
-            with torch.no_grad():
-                update(other, x, coefficient)
+    numbers = (0.5, 1, 0, np.float64(0.25), *np.linspace(0, 1, 10))
+    compiled, plain = (learned(SCRIPTS[algorithm], compile, numbers) for compile in (True, False))
     assert len(graphs) == 1
-    torch.testing.assert_close(network.state_dict(), plain.state_dict())
+    torch.testing.assert_close(compiled, plain)
 
 
 @pytest.mark.slow
@@ -639,20 +626,12 @@ def test_a_number_of_args_that_changes_too_often_says_what_to_do(graphs, capsys)
 @pytest.mark.slow
 @torch._inductor.config.patch({"cpp.cxx": (None, "/no/compiler"), "force_disable_caches": True})
 def test_what_cannot_be_compiled_is_computed_without(capsys):
-    network, other, x = two_networks()
-    plain = copy.deepcopy(network)
     torch.compiler.reset()
-    for learned in (network, plain):
-        optimizer = torch.optim.SGD(learned.parameters(), lr=0.1)
-        args = sac.Args(compile=learned is network)
-        update = sac.updater(loss_of_a_researcher, learned, optimizer, args)
-        for _ in range(3):
-            with torch.no_grad():
-                update(other, x, 0.3)
+    compiled, plain = (learned(sac, compile, 3 * [0.3]) for compile in (True, False))
     out = capsys.readouterr().out
     assert out.startswith("not compiled, so it is slower: ") and "/no/compiler" in out
     assert "the compiler's cache is " in out and out.count("\n") == 1
-    torch.testing.assert_close(network.state_dict(), plain.state_dict(), rtol=0, atol=0)
+    torch.testing.assert_close(compiled, plain, rtol=0, atol=0)
 
 
 def test_only_bf16_computes_products_in_bfloat16():

@@ -31,10 +31,8 @@ PATH = f"{os.environ['PATH']}:/usr/sbin:/sbin"
 ENV = {**os.environ, "PYTHON": sys.executable, "PATH": PATH}
 
 # Three short runs: the baseline, one noise, two noises together.
-SCALE, BOTH = (
-    "RandomUniformScaleReward(0.5, 1.5)",
-    "RandomNormalNoisyReward(1.0)+RandomEarlyTermination(1, 100)",
-)
+SCALE = "RandomUniformScaleReward(0.5, 1.5)"
+BOTH = "RandomNormalNoisyReward(1.0)+RandomEarlyTermination(1, 100)"
 GRID = ["custom", "--algos", "sac", "--envs", "Pendulum-v1", "--seeds", "1"]
 GRID += ["--noises", SCALE, BOTH, "--noise-rates", "0.5", "--baseline-seeds", "1"]
 SWEEPS = []  # the sweeps of the current test
@@ -65,9 +63,11 @@ def no_sweep_outlives_its_test():
     SWEEPS.clear()
 
 
-def run(*args, **kwargs):
+def run(*args, code=None, **kwargs):
+    """Run a command to its end, which must have this exit status if one is given."""
     process = start(*args, **kwargs)
     out, err = process.communicate(timeout=PATIENCE)
+    assert code in (None, process.returncode), out + err
     return SimpleNamespace(code=process.returncode, out=out, err=err)
 
 
@@ -255,8 +255,7 @@ def test_a_failing_and_a_killed_run(engine, tmp_path):
 
     fails.unlink()
     finished = (good / "result.json").stat().st_mtime_ns
-    again = run(*grid, *executor, env=env)
-    assert again.code == 0, again.out + again.err
+    again = run(*grid, *executor, env=env, code=0)
     assert "3 runs (1 of them without noise), 2 to do" in again.err
     assert f"analyze.py --runs-dir '{tmp_path}/my runs'\n" in again.out
     assert [len(attempts(f)) for f in (fails, killed, good)] == [2, 2, 1]
@@ -349,15 +348,13 @@ def test_machines_without_a_shared_folder(sshd, tmp_path):
     assert (folder / "checkpoint.pt").exists(), err
 
     shutil.rmtree(there / "runs")
-    again = run(*grid, *machine, env=sshd, cwd=here)
-    assert again.code == 0, again.out + again.err
+    run(*grid, *machine, env=sshd, cwd=here, code=0)
     assert attempts(folder)[1][0].startswith("resumed at step "), "not resumed"
     assert json.loads((folder / "result.json").read_text())["total_timesteps"] == 1_200_000
     assert not (folder / "checkpoint.pt").exists()  # of the first attempt
     shutil.rmtree(folder)  # the copy over there is finished, and old
     grid[-1] = "3000"
-    third = run(*grid, *machine, env=sshd, cwd=here)
-    assert third.code == 0, third.out + third.err
+    run(*grid, *machine, env=sshd, cwd=here, code=0)
     assert json.loads((folder / "result.json").read_text())["total_timesteps"] == 3_000
 
 
@@ -406,8 +403,7 @@ def test_slurm_requeues_before_the_time_limit(slurm, tmp_path):
     grid += ["--runs-dir", tmp_path / "50%A"]
     runs = folders(*grid)
     arguments = ["--executor", "slurm", '--slurm-args=--nice=7\n--comment="hello world"']
-    submitted = run(*grid, *arguments, env=slurm)
-    assert submitted.code == 0, submitted.err
+    submitted = run(*grid, *arguments, env=slurm, code=0)
     (job,) = re.findall(r"scancel (\d+)$", submitted.err.strip())
     shown = output(["scontrol", "show", "job", job], slurm)
     assert "Comment=hello world" in shown and "Nice=7" in shown and "Requeue=1" in shown
@@ -479,9 +475,6 @@ def test_a_task_is_requeued_alone_if_it_left_a_checkpoint(left, no_slurm, tmp_pa
     assert said == ("scontrol requeue 7_1\n" if left == "checkpoint.pt" else "")
 
 
-# THE COMMAND
-
-
 # CHOOSE
 
 CHOOSE = ["choose", "--algos", "ppo", "--envs", "Pendulum-v1", "--noise-rates", "1", "--confirm"]
@@ -489,32 +482,27 @@ CHOOSE += ["4", "--budget", "6", "--total-timesteps", "4000", "--noises", A]
 CHOOSE += ["RandomDropoutObservation(0.9)", "RandomMixupObservation(0.5)"]
 
 
-def chosen(folder):
-    """Return what a choice leaves behind: its lines, and the names of its runs."""
+def chosen(folder, out):
+    """Return what a choice leaves behind: its lines, the names of its runs, its verdicts."""
     names = {path.parent.relative_to(folder) for path in folder.glob("*/*/config.json")}
-    return (folder / "choice.csv").read_bytes(), names
-
-
-def verdicts(out):
-    """Return what a choice says at its end, a line for each algorithm and environment."""
-    return re.findall("^[A-Z0-9]+ on .*", out, flags=re.MULTILINE)
+    verdicts = re.findall("^[A-Z0-9]+ on .*", out, flags=re.MULTILINE)
+    return (folder / "choice.csv").read_bytes(), names, verdicts
 
 
 def undisturbed(folder, *command):
     """What a choice leaves behind, and says, if its runs are made in this process."""
     batches(parse_args("status", "/", [*command, "--runs-dir", str(folder)]))
-    said = verdicts(view("report", *command, "--runs-dir", folder).out)  # writes choice.csv
-    return *chosen(folder), said
+    said = view("report", *command, "--runs-dir", folder).out  # writes choice.csv
+    return chosen(folder, said)
 
 
 @pytest.mark.slow
 def test_choose_submits_one_batch_after_another(slurm, tmp_path):
     command = [*CHOOSE[:-1], "--budget", "2"]  # a batch of 2 runs, and one of 8
     executor = ["--executor", "slurm"]
-    result = run(*command, "--runs-dir", tmp_path / "runs", *executor, env=slurm)
-    assert result.code == 0, result.out + result.err
+    result = run(*command, "--runs-dir", tmp_path / "runs", *executor, env=slurm, code=0)
     assert result.err.count("the verdict are stored in") == 2, result.err  # once a batch
-    found = *chosen(tmp_path / "runs"), verdicts(result.out)
+    found = chosen(tmp_path / "runs", result.out)
     assert found == undisturbed(tmp_path / "expected", *command) and len(found[1]) == 10
 
 
@@ -526,9 +514,8 @@ def test_choose_survives_being_killed(stub, tmp_path):
     wait_for(lambda: len(list(tmp_path.glob("a/*/*/config.json"))) >= 9, what="the second look")
     sweep.kill()
     sweep.communicate(timeout=PATIENCE)
-    last = run(*command, "--runs-dir", tmp_path / "a", env=stub)
-    assert last.code == 0, last.out + last.err
-    assert (*chosen(tmp_path / "a"), verdicts(last.out)) == undisturbed(tmp_path / "b", *command)
+    last = run(*command, "--runs-dir", tmp_path / "a", env=stub, code=0)
+    assert chosen(tmp_path / "a", last.out) == undisturbed(tmp_path / "b", *command)
     logs = {path.name: path.read_text() for path in tmp_path.glob("a/*/logs/*__*.log")}
     again = run(*command, "--runs-dir", tmp_path / "a", env=stub)
     assert (again.code, again.out, again.err) == (0, last.out, "")

@@ -5,14 +5,13 @@ import csv
 import io
 import math
 import re
-from pathlib import Path
 from statistics import fmean
 
 import numpy as np
 import pytest
 import simulate_choose
 import stub_run
-from views import batches, view
+from views import ROOT, batches, view
 
 from analysis.choice import read_choice
 from analysis.comparisons import as_chosen, compare_all
@@ -231,11 +230,8 @@ def test_verdicts_in_words():
     assert "Borderline" not in said(unclear._replace(p=0.03), planned=25, needed=0.0126)
     returns = {(one, seed): 1.0 for one in (noise, BASELINE) for seed in state.seeds}
     kind = "PPO", "Pusher-v5", "ppo_continuous_noisy", ""
-    for comparison, needed, survives in (
-        (GOOD, 0.05, "yes"),
-        (bad, 0.05, "worse"),
-        (GOOD, 0.01, "no"),
-    ):
+    cases = (GOOD, 0.05, "yes"), (bad, 0.05, "worse"), (GOOD, 0.01, "no")
+    for comparison, needed, survives in cases:
         *_, last = halving.records(kind, state, returns, Verdict(comparison, 10, 10, needed))
         assert last == (*kind, "confirmation", "", *noise.columns, 10, 1.0, survives)
 
@@ -346,7 +342,7 @@ def test_choose_stops_where_all_tests_are_equal(tmp_path, monkeypatch, capsys):
 
 
 def test_the_readme_says_what_it_takes_by_default(tmp_path):
-    text = " ".join((Path(__file__).parents[2] / "README.md").read_text().split())
+    text = " ".join((ROOT / "README.md").read_text().split())
     pattern = r"at most (\d+) runs of a .*\((\d+) core-hours with PPO in a .*, (\d+) with SAC\)"
     runs, *hours = map(int, re.search(pattern, text).groups())
     for algorithm, announced in zip(("ppo", "sac"), hours, strict=True):

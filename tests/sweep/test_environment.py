@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from views import finish, view
+from views import ROOT, finish, view
 
 from noisy_wrappers import BASELINE
 from sweep import environment
@@ -16,7 +16,6 @@ from sweep.environment import Environment, ask, run_seconds
 from sweep.grid import make_run
 from sweep.options import parse_args
 
-ROOT = Path(__file__).parents[2]
 SCALE = "RandomUniformScaleObservation(0.8, 1.2)"
 LATE = "RandomEarlyTermination(50)"
 KNOWN = Environment(0.001, 100, 3, True, {})
@@ -106,9 +105,8 @@ def test_noise_on_rewards_that_take_few_values_is_left_out(tmp_path):
 @pytest.mark.slow
 def test_what_a_module_prints_is_no_command(tmp_path):
     """Nor what its native code prints."""
-    (tmp_path / "native_envs.py").write_text(
-        "import os\n\nprint('loaded')\nos.write(1, b'pybullet build time\\n')\n"
-    )
+    text = "import os\n\nprint('loaded')\nos.write(1, b'pybullet build time\\n')\n"
+    (tmp_path / "native_envs.py").write_text(text)
     words = ["custom", "--algos", "ppo", "--envs", "native_envs:Hopper-v5", "--seeds", "1"]
     env = os.environ | {"PYTHONPATH": "/x", "PYTHON": sys.executable}
     command = [ROOT / "benchmark.sh", *words, "--runs-dir", "runs", "--dry-run"]

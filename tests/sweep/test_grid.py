@@ -122,9 +122,8 @@ def test_spellings_and_rate_zero_are_one_run():
     noises = ["RandomUniformScaleReward(.5, 1.5)", "RandomUniformScaleReward(0.50, high=1.5)"]
     grid = ["--algos=SAC", "--envs", "Hopper-v5", "Hopper-v5", "--seeds", "3", "3", "--seeds", "4"]
     lines = dry_run("custom", *grid, "--noises", *noises, "--noise-rates", "0.10", "0", ".1")
-    assert [(line.seed, line.noise) for line in lines] == [
-        (seed, noise) for seed in (3, 4) for noise in ([], [SCALE])
-    ]
+    expected = [(seed, noise) for seed in (3, 4) for noise in ([], [SCALE])]
+    assert [(line.seed, line.noise) for line in lines] == expected
 
 
 def test_rates_of_ones_own():
@@ -227,11 +226,10 @@ def test_a_run_with_the_same_arguments_is_done(one):
 
 def test_runs_of_another_text_of_the_script_are_counted(one):
     grid, folder = one
-    made = {"env_id": "Pendulum-v1", "exp_name": "sac_continuous_noisy"}
     text = scripts.find("sac", ROOT).sha256
     for sha256, said in ((text, 0), ("ab", 1), (f"ab, {text}", 1)):
         more = {"script": "sac_continuous_noisy.py", "script_sha256": sha256}
-        finish(folder, more=more, **made)
+        finish(folder, more=more, env_id="Pendulum-v1")
         listed, status = view("dry-run", *grid), view("status", *grid)
         whole, report = view("status", "--runs-dir", folder.parent), view("report", *grid)
         assert listed.code == 0 and "0 to do" in listed.err and "1 done" in status.out
@@ -359,9 +357,8 @@ def test_what_a_source_tells_is_what_tyro_reads(algorithm):
     script = scripts.find(algorithm, ROOT)
     args = import_module(f"{algorithm}_continuous_noisy").Args
     defaults = {name: getattr(args(), name) for name in args.__dataclass_fields__}
-    assert script.defaults == {
-        name: value for name, value in defaults.items() if name != "exp_name"
-    }
+    compared = {name: value for name, value in defaults.items() if name != "exp_name"}
+    assert script.defaults == compared
     for words in (
         "--gamma 0.5 --eval_episodes=3 --no-compile --matmul_precision medium",
         "--eval-frequency None",

@@ -27,8 +27,7 @@ def test_data_of_the_environment_are_never_mutated(text):
     reward = np.array(1.5)
     reward.flags.writeable = False
     env = GenericEnv(
-        observe=lambda env: first,
-        step=lambda env, action: (owned, reward, False, False, info),
+        observe=lambda env: first, step=lambda env, action: (owned, reward, False, False, info)
     )
     env = build(text, env, 1.0)
     name = type(env).__name__

@@ -15,13 +15,9 @@ from noisy_wrappers import (
     parse_noise,
 )
 
-GOALS = Dict(  # as Gymnasium-Robotics' Fetch has it; in this order
-    {
-        "achieved_goal": Box(-np.inf, np.inf, (3,), np.float64),
-        "desired_goal": Box(-np.inf, np.inf, (3,), np.float64),
-        "observation": Box(-np.inf, np.inf, (4,), np.float64),
-    }
-)
+# As Gymnasium-Robotics' Fetch has it; in this order
+SIZES = {"achieved_goal": 3, "desired_goal": 3, "observation": 4}
+GOALS = Dict({key: Box(-np.inf, np.inf, (size,), np.float64) for key, size in SIZES.items()})
 MIXED = Dict(
     image=Box(0, 255, (2, 2), np.uint8),
     inner=Tuple((Discrete(3), Box(-1, 1, (2,), np.float32), MultiBinary(2))),

@@ -75,11 +75,7 @@ def test_canonical_notation():
     assert canonical([A], ["0.50:.5"]) == (names[1:], [0.5])
     assert canonical(np.array([A, B]), np.array([0.5, 0.0])) == canonical([A, B], [0.5, 0.0])
     inner = ["RandomDynamics(1.0, 2.0)", "RandomEarlyTermination(9)"]  # from the environment on
-    inner += [
-        "RandomActionDelay(1)",
-        "RandomNormalNoisyAction(1.0)",
-        "RandomNormalNoisyReward(1.0)",
-    ]
+    inner += ["RandomActionDelay(1)", "RandomNormalNoisyAction(1.0)", names[1]]
     assert canonical(inner[::-1], [0.5])[0] == inner
 
 

@@ -7,24 +7,16 @@ import re
 import shlex
 import subprocess
 import sys
-from pathlib import Path
 
-import commands
 import gymnasium as gym
 import numpy as np
 import pytest
 from cases import GenericEnv, named
+from commands import ROOT, run
 from gymnasium.utils.env_checker import check_env
 
-from noisy_wrappers import (
-    Configuration,
-    EnvState,
-    ObservationNoise,
-    RewardNoise,
-    parse_noise,
-)
+from noisy_wrappers import Configuration, EnvState, ObservationNoise, RewardNoise, parse_noise
 
-ROOT = Path(__file__).parents[2]
 TEXT = "my_noises:StickyAction(3)"
 PAGE = (ROOT / "docs" / "wrappers.md").read_text()
 [MODULE] = [code for code in re.findall(r"```python\n(.*?)```", PAGE, re.S) if "StickyAct" in code]
@@ -89,8 +81,8 @@ def test_what_is_wrong_is_said_in_one_line(folder, text, message):
 
 @pytest.mark.slow
 def test_a_sweep_and_a_test_from_the_folder_of_the_noise(folder):
-    def run(path, *words):
-        done = commands.run(path, words, cwd=folder)
+    def succeed(path, *words):
+        done = run(path, words, cwd=folder)
         assert done.code == 0, done.out + done.err
 
     sweep = "custom --algos ppo --envs InvertedPendulum-v5 --seeds 1 --total-timesteps 512"
@@ -102,15 +94,15 @@ def test_a_sweep_and_a_test_from_the_folder_of_the_noise(folder):
     for line in shown.splitlines():
         before, _, options = line.partition("ppo_continuous_noisy.py")
         assert "PYTHONPATH=" in before and str(folder) in before
-        run(ROOT / "ppo_continuous_noisy.py", *shlex.split(options))
+        succeed(ROOT / "ppo_continuous_noisy.py", *shlex.split(options))
     [noisy] = folder.glob("runs/p0.5_s1_my_noises--StickyAction_3__*/result.json")
     applied, of = json.loads(noisy.read_text())["noise_applied"]["StickyAction"]
     assert 0 < applied < 0.6 * of
     assert len([*folder.glob("runs/*/result.json")]) == 2
     test = ["--noises", TEXT, "--noise-rates", "1", "--episodes", "2"]
-    run(ROOT / "evaluate.py", "runs", *test)
+    succeed(ROOT / "evaluate.py", "runs", *test)
     (folder / "my_noises.py").unlink()
-    run(ROOT / "analyze.py")  # reads runs without their noise
+    succeed(ROOT / "analyze.py")  # reads runs without their noise
     tables = (folder / "runs/results/robustness.csv", folder / "runs/results/summary_PPO.csv")
     assert all(TEXT in table.read_text() for table in tables)
     rows = list(csv.DictReader((noisy.parent / "robustness.csv").open()))
