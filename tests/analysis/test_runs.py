@@ -113,10 +113,9 @@ def test_a_run_that_is_left_out_is_not_missing_besides(status, tmp_path):
     for noise, name in begun.items():
         for seed in (1, 2, 3):
             options = more | {"gamma": 0.9 if (noise, seed) == (SCALE, 2) else 0.99}
-            folder = tmp_path / f"{name.format(seed)}{end}"
-            rate = 0.5 if noise else ()
-            run_dir = write_run(tmp_path, [10], seed=seed, noise=noise, rate=rate, **options)
-            run_dir.rename(folder)
+            options |= {"noise": noise, "rate": 0.5 if noise else ()}
+            folder = write_run(tmp_path, [10], seed=seed, **options)
+            folder = folder.rename(tmp_path / f"{name.format(seed)}{end}")
             if status == "corrupt" and (noise, seed) == (SCALE, 2):
                 (folder / "config.json").write_text("{")
     assert left_out(read_runs(tmp_path))["status"].tolist() == [status]

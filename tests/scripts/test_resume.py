@@ -6,6 +6,7 @@ The commands are processes forked from a server (commands.py).
 import functools
 import io
 import os
+import random
 import resource
 import shutil
 import signal
@@ -203,6 +204,18 @@ def test_killed_again_and_again_it_ends_as_if_left_alone(algorithm, alone, tmp_p
     assert any(step % 60 for step in steps)  # in mid-rollout, for PPO
     assert cut  # there were rows of eval.csv newer than the checkpoint
     assert not differing(finish(algorithm, tmp_path, **hopper(algorithm)), alone(algorithm))
+
+
+@pytest.mark.slow
+def test_stopped_at_random_moments_it_ends_as_if_left_alone(alone, tmp_path):
+    seed = random.randrange(10**6)
+    print("seed", seed)  # which pytest shows if this fails
+    rng, codes = random.Random(seed), []
+    for action in (die, terminate) * 3:
+        moment = (TRAINING_STEP, rng.randint(1, 60), action)
+        codes.append(command("PPO", tmp_path, moment, **hopper("PPO")).code)
+    assert codes[:2] == [-signal.SIGKILL, 143] and set(codes[2:]) <= {*codes[:2], 0}
+    assert not differing(finish("PPO", tmp_path, **hopper("PPO")), alone("PPO"))
 
 
 @pytest.mark.slow
