@@ -1173,13 +1173,10 @@ class Configuration:
         """Read two cells of a csv file, :attr:`columns` or :attr:`noise` and :attr:`noise_rate`."""
         if not noise:
             return cls()
-        noises, schedules = split_noises(noise), []
-        for rate in str(noise_rate).split(" + "):
-            ends = [float(end) for end in re.split(":| to ", rate)]
-            schedules.append((ends[0], ends[-1]))  # of a single number, twice
-        if len(schedules) != len(noises):
+        noises, rates = split_noises(noise), parse_rates(noise_rate)
+        if len(rates) != len(noises):
             raise ValueError(f"{noise!r} needs a rate for each noise, got {noise_rate!r}")
-        return cls(tuple(noises), tuple(schedules))
+        return cls(tuple(noises), rates)
 
     def for_tests(self) -> Self:
         """Return it, or raise ValueError if no policy can be tested under it.
@@ -1262,6 +1259,12 @@ BASELINE = Configuration()
 def read_test_noise(noises: Sequence[str], rates: Sequence[Rate]) -> Configuration:
     """Read the noises of a run's tests, whose rate is 1 if none is given."""
     return Configuration.read(noises, [1.0] if len(noises) and not len(rates) else rates)
+
+
+def parse_rates(noise_rate: Rate) -> tuple[tuple[float, float], ...]:
+    """Read rates of a csv file or a table, "0.05 + 1.00 to 0.00", as (start, end) of each noise."""
+    rates = [re.split(":| to ", rate) for rate in str(noise_rate).split(" + ")]
+    return tuple((float(ends[0]), float(ends[-1])) for ends in rates)  # of one number, twice
 
 
 def split_noises(text: str) -> list[str]:

@@ -9,11 +9,11 @@ from matplotlib.patches import Patch
 
 from analysis import style
 from analysis.folders import SUCCESS
-from analysis.formatting import rate_order, seeds_between
+from analysis.formatting import seeds_between
 from analysis.power import CONFIDENCE
 from analysis.statistics import SEEDS_FOR_INTERVAL
 from analysis.verdicts import BETTER, UNCLEAR, WORSE
-from noisy_wrappers import BASELINE
+from noisy_wrappers import BASELINE, parse_rates
 
 MOST_RATES = 25  # lines of a figure; of more, each noise has its rates together
 LABELS = 2.0  # inches for the names of noises, at most; in a narrow figure a part of its width
@@ -43,7 +43,7 @@ def effects_caption(study, rows):
 def configurations(rows):
     """Return the (noise, rate) of rows of comparisons, in order."""
     configs = dict.fromkeys(zip(rows["noise"], rows["noise_rate"], strict=True))
-    return sorted(configs, key=lambda config: (config[0], rate_order(config[1].split(", ")[0])))
+    return sorted(configs, key=lambda config: (config[0], parse_rates(config[1].split(", ")[0])))
 
 
 def has_few(rows):

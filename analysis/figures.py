@@ -14,13 +14,13 @@ from scipy import special
 from analysis import effects, style
 from analysis.episodes import wrapper_names
 from analysis.folders import RETURN, SUCCESS
-from analysis.formatting import rate_order, seeds_between, seeds_of
+from analysis.formatting import seeds_between, seeds_of
 from analysis.heatmap import heatmaps
 from analysis.power import CONFIDENCE, LEVEL
 from analysis.runs import KEYS, rows_of
 from analysis.statistics import SEEDS_FOR_INTERVAL, least_variance
 from analysis.words import slug
-from noisy_wrappers import BASELINE
+from noisy_wrappers import BASELINE, parse_rates
 
 COLUMN_END = "_column"  # of the name of a figure that is as wide as a column
 INTERVAL, STD = "interval", "std"  # what a band shows
@@ -228,7 +228,7 @@ def parameters_figure(study, configs, band=INTERVAL, width=None):
     """Draw points of the final return: a wrapper's parameters side by side, by noise rate."""
     width = width or style.PAGE
     noises = list(dict.fromkeys(config.noise for config in configs))
-    rates = sorted({config.noise_rate for config in configs}, key=rate_order)
+    rates = sorted({config.noise_rate for config in configs}, key=parse_rates)
     colors = dict(zip(noises, style.hues(len(noises)), strict=True))
     shifts = 0.7 * ((np.arange(len(noises)) + 0.5) / len(noises) - 0.5)
     beside = dict(zip(noises, shifts, strict=True))

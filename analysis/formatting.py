@@ -11,6 +11,7 @@ from tabulate import tabulate
 
 from analysis.folders import script_name
 from analysis.power import LEVEL
+from noisy_wrappers import parse_rates
 
 WHOLE_WORDS = {"break_long_words": False, "break_on_hyphens": False}  # when text is wrapped
 DASH = "\u2013"  # of what does not exist
@@ -107,12 +108,6 @@ def not_zero(value, spread):
     text = rounded(value, spread)
     is_rounding_error = not abs(value) > 1e-9 * spread
     return rounded(value, abs(value)) if is_zero(text) and not is_rounding_error else text
-
-
-def rate_order(noise_rate):
-    """Return the key that sorts rates of tables as numbers: "0.05", "0.05 + 1.00 to 0.00"."""
-    rates = [rate.split(" to ") for rate in noise_rate.split(" + ")]
-    return [(float(ends[0]), float(ends[-1])) for ends in rates]
 
 
 def listed(names):
@@ -246,7 +241,7 @@ def shown(table):
         keys = [name for name in text if name not in ("noise_rate", "mean")]
         order = pd.MultiIndex.from_frame(text[keys].drop_duplicates())  # pivot() would sort texts
         text = text.pivot(index=keys, columns="noise_rate", values="mean").reindex(order)
-        text = text[sorted(text.columns, key=rate_order)].fillna(DASH).reset_index()
+        text = text[sorted(text.columns, key=parse_rates)].fillna(DASH).reset_index()
     return text.rename(columns=title)
 
 

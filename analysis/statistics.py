@@ -60,8 +60,10 @@ def pooled_std(samples, episodes=None):
     """
     samples = [sample for sample in samples if len(sample)]
     df = sum(len(sample) - 1 for sample in samples)
+    if df == 0:
+        return 0.0, 0
     squares = sum(((sample - np.mean(sample)) ** 2).sum() for sample in samples)
-    std = exact(sqrt(squares / max(1, df)), *samples)
+    std = exact(sqrt(squares / df), *samples)
     if episodes:
         values = np.concatenate(samples)
         least = least_variance(values.mean(), episodes * len(values))  # of the mean of all

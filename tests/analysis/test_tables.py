@@ -7,11 +7,12 @@ from sweeps import ENDING, FINALS, NAN, SCALE, row, run, small_sweep, write_pair
 
 import analysis.formatting
 from analysis.tables import COLUMNS, split_consistency
+from noisy_wrappers import parse_rates
 
 
 def test_rates_are_ordered_as_numbers():
     rates = ["0.05", "0.10 to 0.00", "0.10", "0.1234", "1.00", "1.00 + 0.05", "1.00 + 0.50 to 1.00"]
-    assert sorted(rates[::-1], key=analysis.formatting.rate_order) == rates
+    assert sorted(rates[::-1], key=parse_rates) == rates
 
 
 @pytest.fixture(scope="module")
