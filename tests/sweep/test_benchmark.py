@@ -378,13 +378,13 @@ def test_a_machine_that_goes_away_leaves_its_runs_to_the_others(tmp_path, stub):
     """Its first run is its last: it refuses each other in a moment, while the others are busy."""
     need("parallel")
     calls = tmp_path / "calls"
-    ssh = tmp_path / "ssh"  # ssh HOST -- COMMAND: whether it can run the project, and one run
+    ssh = tmp_path / "ssh"  # ssh HOST -- COMMAND, and SHELL, as sshd sets it: a check, one run
     ssh.write_text(
         f"""#!/bin/sh
 echo >>{calls}
 [ $(wc -l <{calls}) -le 2 ] || exit 255
 shift 2
-exec sh -c "$*"
+SHELL=/bin/sh exec sh -c "$*"
 """
     )
     ssh.chmod(0o755)
