@@ -26,7 +26,7 @@ from typing import Literal
 import pandas as pd
 import tyro
 
-from analysis.choice import read_choice
+from analysis.choice import choice_file, read_choice
 from analysis.comparisons import are_in, as_chosen, compare_all, runs_in
 from analysis.errors import fail, take_over_terminal
 from analysis.figures import INTERVAL, figures, write_figure
@@ -56,7 +56,8 @@ class Args:
     out: Path | None = None
     """where the tables, the figures and report.html go; by default RUNS_DIR/results"""
     latex: bool = False
-    """also write the tables as Markdown and LaTeX, and the figures as pdf"""
+    """also write the tables as Markdown and LaTeX, and the figures as pdf; once they are there,
+    each analysis into the same folder renews them"""
     figure_width: float = PAGE
     """inches of a paper's text, for which figures and LaTeX tables are made; every figure is also
     made for a column of 3.25 inches. In ICML 6.75, in NeurIPS 5.5, in ACM's sigconf 7"""
@@ -111,11 +112,12 @@ def write_table(out, table, latex, inches):
 def write_results(out, results, args):
     """Write all tables, all figures and the report."""
     out.mkdir(parents=True, exist_ok=True)
+    latex = args.latex or (out / "noises.tex").exists()  # old ones would contradict the new report
     for table in results.tables.values():
-        write_table(out, table, args.latex, args.figure_width)
+        write_table(out, table, latex, args.figure_width)
     drawn = figures(results.studies, results.tables, args.band)
     for drawing in drawn:
-        write_figure(out, drawing, args.latex, args.figure_width)
+        write_figure(out, drawing, latex, args.figure_width)
     write_report(out, results, drawn)
 
 
@@ -196,7 +198,7 @@ def analyse(args, entries, choice):
     if any(study.phase == CONFIRMATION for study in studies):
         notes.append(
             "verdicts on confirmations are those of ./benchmark.sh choose, which looks several "
-            "times, at levels of its own; one that it has not judged yet has none"
+            f"times, at levels of its own; one that {choice_file(metric)} does not name has none"
         )
     unit = POINTS if metric == SUCCESS else ""
 

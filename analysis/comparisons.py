@@ -23,6 +23,7 @@ IQM_CHANGE = ["iqm_change_percent", "iqm_change_low", "iqm_change_high"]
 # What a comparison does not tell where all returns are equal
 UNKNOWN = ["t", "p", "difference_low", "difference_high", *IQM_CHANGE]
 UNKNOWN += ["difference_percent", "percent_low", "percent_high"]
+UNTESTED = ["t", "p", "smallest_p", "detectable"]  # what none tells that has no test
 VERDICT = ["p_adjusted", "comparisons", "verdict"]
 COMPARED = [*statistics.Comparison._fields, *VERDICT, *IQM_CHANGE, *PROBABILITY, "lopsided"]
 RESULTS = ["mean", "std", "n", "baseline_mean", "baseline_std", "n_baseline", *IQM]
@@ -160,7 +161,7 @@ def judged_beside(noises, rates, family, metric, smallest_gain=None):
     """
     several = ~are_in(rates, noises)
     lopsided = several & rates["p"].notna() & (rates["lopsided"] == 1)
-    rates.loc[lopsided, ["t", "p", "smallest_p"]] = np.nan
+    rates.loc[lopsided, UNTESTED] = np.nan
     many = judged(rates[several].copy(), family, metric, smallest_gain)
     found = noises.set_index(KEYS)[VERDICT]
     only = rates[~several].drop(columns=VERDICT).join(found, on=KEYS)

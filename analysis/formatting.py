@@ -71,8 +71,13 @@ def percent_end(value):
     return f"{value:.1g} %" if text == "0.0 %" and abs(value) > 1e-9 else text
 
 
-def seeds_of(n, n_baseline):
-    """Write the seeds with and without noise: "5", or "5/10" where they differ."""
+def seeds_of(n, n_baseline, most=0):
+    """Write the seeds with and without noise: "5", or "5/10" where they differ.
+
+    most: the most without noise, of several environments: "5/10 to 13".
+    """
+    if most > n_baseline:
+        return f"{n:.0f}/{n_baseline:.0f} to {most:.0f}"
     return f"{n:.0f}" if n == n_baseline else f"{n:.0f}/{n_baseline:.0f}"
 
 

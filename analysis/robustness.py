@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from analysis import verdicts
-from analysis.comparisons import are_in
+from analysis.comparisons import UNTESTED, are_in
 from analysis.episodes import read_episodes, wrapper_names
 from analysis.folders import RETURN, SEARCH, SUCCESS, DamageError
 from analysis.formatting import listed, p_value, percent, seeds_of
@@ -36,9 +36,7 @@ SCORE_COLUMNS = [*STUDY, *SCORE_COLUMNS.split()]
 MORE = ["percent_low", "percent_high", "n_baseline_most", "primary", "elsewhere", "where"]
 MORE += ["lopsided"]  # what sentences need besides
 
-# What a score says, by the sign of the difference
-DIRECTIONS = {1: "returns more under noise", -1: "returns less under noise"}
-DIRECTIONS |= {0: "no clear difference under noise"}
+UNCLEAR = "no clear difference under noise"
 
 
 def read_robustness(runs, metric=RETURN):
@@ -254,7 +252,7 @@ def analyse_robustness(runs, metric=RETURN):
         return {}, []
     table = pd.DataFrame(condition_rows(runs), columns=COLUMNS)
     scores = pd.DataFrame(score_rows(runs, metric), columns=[*SCORE_COLUMNS, *MORE])
-    scores.loc[scores["lopsided"].astype(bool), ["t", "p", "smallest_p"]] = np.nan
+    scores.loc[scores["lopsided"].astype(bool), UNTESTED] = np.nan
     primary = scores[scores["primary"].astype(bool)]
     for _, family in primary[primary["p"].notna()].groupby([*STUDY, "elsewhere"]):
         scores.loc[family.index, "p_holm"] = holm(family["p"].to_numpy(float))
@@ -299,17 +297,20 @@ def not_compared(table, scores):
 def robustness_sentences(scores, metric):
     """Yield one plain sentence for each training configuration: does it return more under noise?"""
     unit = verdicts.POINTS if metric == SUCCESS else ""
+    more, less = "returns more under noise", "returns less under noise"
+    if metric == SUCCESS:
+        more, less = "succeeds more often under noise", "succeeds less often under noise"
     for row in scores.itertuples():
         where = row.environment or row.where
         study = study_name(*(getattr(row, name) for name in STUDY))
         start = f"{study} on {where}, trained with {row.noise} at rate {row.noise_rate}"
         over = f"over {row.conditions} of {counted(row.conditions_tested, 'test condition')}"
-        shown, limit = DIRECTIONS[0], ""
+        shown, limit = UNCLEAR, ""
         evidence = verdicts.difference_in_words(row, unit, " of the clean return without noise")
         if min(row.n, row.n_baseline) < 2:
             shown = "too few seeds for a test of robustness"
         elif row.lopsided:
-            seeds = seeds_of(row.n, row.n_baseline)
+            seeds = seeds_of(row.n, row.n_baseline, row.n_baseline_most)
             shown = f"no verdict with {seeds} seeds, which would be wrong too often,"
         else:
             corrected = p_value(row.p_holm).removeprefix("= ")
@@ -317,7 +318,7 @@ def robustness_sentences(scores, metric):
             limit = verdicts.excluded(row, unit) + verdicts.cannot_show(row)
         if verdicts.significant(row.p_holm):
             way = verdicts.direction(row.t, row.effect_size, row.difference_percent)
-            shown = DIRECTIONS[way]
+            shown = {1: more, -1: less, 0: UNCLEAR}[way]
             limit = verdicts.undirected(row)
         if pd.notna(row.clean_change_percent):
             evidence += f"; clean return {percent(row.clean_change_percent)}"

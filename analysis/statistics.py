@@ -166,7 +166,8 @@ def compare(x, y, level=LEVEL, episodes=None):
     xs, ys = columns(x), columns(y)
     pairs = list(zip(xs, ys, strict=True))
     differences = np.array([exact(a.mean() - b.mean(), a, b) for a, b in pairs])
-    stds = np.array([sqrt((mean_std(a)[1] ** 2 + mean_std(b)[1] ** 2) / 2) for a, b in pairs])
+    variances = [[len(s) * variance_of_mean(s, episodes) for s in pair] for pair in pairs]
+    stds = np.sqrt(np.mean(variances, axis=1))
     percents = [percent_of(d, b, a) for d, (a, b) in zip(differences, pairs, strict=True)]
     if episodes:
         percents = [nan]

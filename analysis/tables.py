@@ -11,7 +11,7 @@ from analysis.folders import SEARCH, SUCCESS
 from analysis.formatting import Table, listed, seeds_of
 from analysis.luck import add_luck, luck_of_studies
 from analysis.power import CONFIDENCE
-from analysis.runs import KEYS, STUDY, rows_of, study_name
+from analysis.runs import KEYS, STUDY, study_name
 from analysis.verdicts import ALL_EQUAL
 from analysis.words import slug
 from noisy_wrappers import BASELINE
@@ -65,15 +65,15 @@ def consistency_rows(judged, together):
 
     Every environment counts in the share, by the sign of its difference, but those in which all
     returns are equal; the average is over those whose baseline has a percentage, and the others are
-    named. p is that of all environments together.
+    named. p is that of the same environments together: there is none if one has too few runs.
     """
     keys = [*STUDY, "noise", "noise_rate"]
-    tests = together.set_index(keys)[["p", "p_adjusted"]].to_dict("index")
+    tests = together.set_index([*keys, "environments"])[["p", "p_adjusted"]].to_dict("index")
     told = judged["difference"].notna() & (judged["verdict"] != ALL_EQUAL)
     for key, group in judged[told].groupby(keys):
         mean, std, _ = statistics.mean_std(group["difference_percent"])
         without = group.loc[group["difference_percent"].isna(), "environment"]
-        row = dict(zip(keys, key, strict=True)) | tests.get(key, {})
+        row = dict(zip(keys, key, strict=True)) | tests.get((*key, len(group)), {})
         yield row | {
             "percent_of_environments": 100 * (group["difference"] >= 0).mean(),
             "average_improvement_percent": mean,
@@ -128,17 +128,19 @@ def lopsided_notes(compared):
 
     def note(key, rows, said):
         seeds = sorted({seeds_of(*pair) for pair in rows[["n", "n_baseline"]].to_numpy()})
-        where = f"{study_name(*key)}, {', '.join(rows['environment'].unique())}"
+        where = ", ".join([study_name(*key), *filter(None, rows["environment"].unique())])
         return f"{where}: with {listed(seeds)} runs with and without noise {said}"
 
     notes = [
         note(key, rows, "a verdict may be wrong more often than in 5 %")
         for key, rows in noises.groupby(STUDY, sort=False)
     ]
-    for key, rows in rates.groupby(STUDY, sort=False):
-        also = " and over several environments" if rows_of(together, key).any() else ""
-        said = f"single rates have no verdict there{also}, which would be wrong too often"
-        notes.append(note(key, rows, said))
+    for key, rows in pd.concat([rates, together]).groupby(STUDY, sort=False):
+        alone = rows[rows["environment"] != ""]
+        places = ["there"] * (len(alone) > 0)
+        places += ["over several environments"] * (len(alone) < len(rows))
+        said = f"single rates have no verdict {listed(places)}, which would be wrong too often"
+        notes.append(note(key, alone if len(alone) else rows, said))
     return notes
 
 

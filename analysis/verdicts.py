@@ -94,6 +94,9 @@ def difference_in_words(row, unit="", of=""):
         text = f"{row.effect_size:+z.2f} standard deviations in the median environment"
         if pd.isna(row.effect_size):
             text = "effects that have no median"
+        elif np.isinf(row.effect_size):
+            way = "higher" if row.effect_size > 0 else "lower"
+            text = f"{way} in the median environment, where neither side's runs vary"
     else:
         spread = spread_of(row)
         text = rounded(row.difference, spread)
@@ -144,7 +147,7 @@ def corrected(p, number, what):
 
 def borderline(row, level=LEVEL):
     """Say where the interval of a comparison, of this level, and its p differ, or ""."""
-    if pd.isna(row.difference_low):
+    if pd.isna(row.difference_low) or pd.isna(row.p):
         return ""
     excludes_zero = row.difference_low > 0 or row.difference_high < 0
     if excludes_zero == significant(row.p, level):

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from sweeps import NAN, SCALE, main, run, small_sweep, write_pairs, write_run
+from sweeps import ENDING, NAN, SCALE, main, run, small_sweep, write_pairs, write_run
 
 import analyze
 
@@ -51,6 +51,14 @@ def test_results_go_beside_the_runs(tmp_path, monkeypatch):
         with pytest.raises(SystemExit):
             main(analyze.Args(runs_dir=tmp_path / "runs", out=out))
     assert list(tmp_path.rglob("report.html")) == [tmp_path / "runs/results/report.html"]
+
+
+def test_tables_for_a_paper_never_lag_behind(tmp_path):
+    write_pairs(tmp_path / "runs", [1], [2])
+    run(tmp_path)
+    write_pairs(tmp_path / "runs", [], [3], noise=ENDING)
+    main(analyze.Args(tmp_path / "runs", tmp_path / "results"))
+    assert ENDING in (tmp_path / "results/noises.md").read_text()
 
 
 @pytest.mark.parametrize(

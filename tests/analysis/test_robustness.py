@@ -119,9 +119,15 @@ def test_lopsided_numbers_of_seeds_have_no_verdict(tmp_path, capsys):
     assert alone["p"] < 0.01 and "returns more under noise over" in capsys.readouterr().out
     write_tests(tmp_path / "runs", {(SENSOR, 0.1): noisy}, "Hopper-v5", range(1, 6))
     scores = run(tmp_path)["robustness_score"]
-    assert scores[["p", "p_holm"]].isna().all(axis=None) and scores["difference_low"].notna().all()
+    untested = scores[["p", "p_holm", "detectable"]].isna()
+    assert untested.all(axis=None) and scores["difference_low"].notna().all()
+    out = capsys.readouterr().out
     said = "no verdict with 5/9 seeds, which would be wrong too often, over 1 of 1 test condition"
-    assert capsys.readouterr().out.count(said) == 2
+    assert out.count(said) == 2 and "Borderline" not in out
+    fewer = {("", 0.0): returns, (SENSOR, 0.2): noisy, (SENSOR, 0.1): noisy}
+    write_tests(tmp_path / "runs", fewer, "Maze-v0", range(1, 6))
+    run(tmp_path)
+    assert capsys.readouterr().out.count("no verdict with 5/5 to 9 seeds, which") == 2
 
 
 def test_environments_without_any_difference_are_not_averaged(tmp_path, capsys):

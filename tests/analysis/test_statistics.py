@@ -238,6 +238,7 @@ def test_seeds_that_all_succeed_are_no_proof():
     found = statistics.compare(x, y, episodes=10)
     assert found.difference_low < 100 == found.difference_high  # no more than 100 points
     assert np.isnan(found.difference_percent)
+    assert found.effect_size == pytest.approx(100 / (error * sqrt(5 / 2)))  # not infinite
     spread = np.array([20.0, 50, 80, 90, 10])  # the seeds' own variance is larger
     assert statistics.variance_of_mean(spread, 10) == spread.var(ddof=1) / 5
 

@@ -119,7 +119,7 @@ def test_robustness_is_judged_by_success(tmp_path, capsys):
                 (folder / "robustness.csv").write_text(header + text)
     tables = run(tmp_path, metric="success_rate")
     said = capsys.readouterr().out
-    assert "returns more under noise over 1 of 1 test condition (+40 [" in said
+    assert "succeeds more often under noise over 1 of 1 test condition (+40 [" in said
     assert "] percentage points of success, p = 0.0079" in said
     assert "no test of robustness tells success in 1 test condition\n" in said
     scores = tables["robustness_score"]

@@ -62,7 +62,8 @@ def test_rates_with_too_few_of_all_seeds_have_no_verdict(tmp_path, capsys):
     write_pairs(tmp_path / "runs", [], range(201, 206), rate=0.2)
     tables = run(tmp_path)
     rates = tables["statistics"].query("noise == @SCALE")
-    assert rates[["p", "verdict"]].isna().all(axis=None) and rates["difference_low"].notna().all()
+    untested = rates[["p", "verdict", "detectable"]].isna()
+    assert untested.all(axis=None) and rates["difference_low"].notna().all()
     assert tables["noises"]["verdict"].tolist() == ["better"]  # 10 against 20
     said = "with 5/20 runs with and without noise single rates have no verdict there, which"
     assert said in capsys.readouterr().out
@@ -82,6 +83,26 @@ def test_rates_without_a_verdict_in_one_environment_have_none_over_several(tmp_p
     assert set(alone["verdict"]) == {"better"}
     said = capsys.readouterr().out
     assert "Pusher-v5: with 5/20 runs" in said and "there and over several environments" in said
+
+
+def test_a_rate_over_several_environments_alone_may_have_no_verdict(tmp_path, capsys):
+    """In each it is the noise's only rate, and has the verdict of the noise."""
+    for env, rate in (("Hopper-v5", 0.1), ("Pusher-v5", 0.1), ("Maze-v0", 0.2)):
+        write_pairs(tmp_path / "runs", range(101, 111), range(201, 206), rate=rate, env=env)
+    rates = run(tmp_path)["statistics"].query("noise == @SCALE")
+    assert rates["verdict"].tolist() == 3 * ["better"]
+    said = "SAC: with 5/10 runs with and without noise single rates have no verdict over several"
+    assert said in capsys.readouterr().out
+
+
+def test_p_of_other_environments_is_none_of_a_share(tmp_path):
+    """A first seed counts in the share, but nothing is tested with it."""
+    for env, seeds in (("Hopper-v5", 5), ("Pusher-v5", 5), ("Maze-v0", 1)):
+        write_pairs(tmp_path / "runs", range(101, 101 + seeds), range(201, 201 + seeds), env=env)
+    tables = run(tmp_path)
+    share, together = tables["consistent"].iloc[0], tables["statistics_together"].iloc[0]
+    assert (share["environments"], together["environments"]) == (3, 2)
+    assert np.isnan(share["p"]) and together["p"] < 0.01
 
 
 def test_a_note_on_lopsided_seeds_needs_a_verdict(tmp_path, capsys):

@@ -122,6 +122,13 @@ def test_together_are_the_environments_that_can_tell_something():
     assert "PPO on 2 environments together" in text
 
 
+def test_returns_that_never_vary_have_no_standard_deviations():
+    noisy = Configuration.parse("RandomEarlyTermination(50)", 1.0)
+    table = compare_all([study(["A", "B"], {BASELINE: np.ones((5, 2)), noisy: np.zeros((5, 2))})])
+    [text] = analysis.verdicts.in_sentences(table.noises_together)["sentence"]
+    assert "worse than no noise: lower in the median environment, where neither side's" in text
+
+
 def test_averages_that_differ_in_direction_are_no_verdict():
     """Three environments gain 1 %, always, and one may lose more."""
     baseline = np.stack([TEN[:5] + 900] * 3 + [np.array([10.0, 60, 100, 140, 190])], axis=1)
