@@ -1450,8 +1450,8 @@ def make_environments(
     ``test_seed``.
 
     Raises:
-        SpaceError: as :func:`make_flat`; the environment is no gymnasium.Env, or does not take one
-            of ``env_kwargs``; or a noise cannot act in it.
+        SpaceError: as :func:`make_flat`; the environment is no gymnasium.Env, does not take one of
+            ``env_kwargs``, or keeps statistics to normalize by; or a noise cannot act in it.
     """
     kwargs = parse_env_kwargs(args["env_kwargs"])
     kwargs["max_episode_steps"] = args["max_episode_steps"]
@@ -1466,6 +1466,12 @@ def make_environments(
         raise SpaceError(str(error)) from error
     with contextlib.ExitStack() as stack:  # closes them if anything is raised
         stack.callback(test_env.close)
+        normalizers = (gym.wrappers.NormalizeObservation, gym.wrappers.NormalizeReward)
+        if any(layer.update_running_mean for layer in _layers(test_env, normalizers)):
+            raise SpaceError(
+                "NormalizeObservation and NormalizeReward have other statistics in tests, and none "
+                "after a resume: PPO normalizes by itself, SAC by change 8 of docs/changing.md"
+            )
         seed_globals(args["seed"])
         env = make_env(args["env_id"], **kwargs)
         stack.callback(env.close)

@@ -31,6 +31,7 @@ import numpy as np
 import torch
 import torch.nn as nn
 from torch.func import functional_call, grad_and_value
+from torch.utils._pytree import tree_leaves
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 from tqdm import tqdm
@@ -377,6 +378,9 @@ def updater(loss, network, optimizer, args):
     module = nn.ModuleList([network])
     module.forward = functools.partial(loss, network)
     parameters = dict(module.named_parameters())
+    own = set(map(id, parameters.values()))
+    if any(id(p) not in own for group in optimizer.param_groups for p in group["params"]):
+        fail("an optimizer also steps tensors that its update does not learn: leave them out", 1)
     layers = [x for _, x in module.named_modules(remove_duplicate=False) if x._parameters]
     is_shared = len(set(layers)) < len(layers)  # a layer at two places must be swapped once
     call = functools.partial(functional_call, module, tie_weights=not is_shared)
@@ -415,7 +419,7 @@ def in_numpy(network, device):
     """
     layers = [*network] if type(network) is nn.Sequential else [network]
     is_plain = {type(x) for x in layers} <= {nn.Linear, nn.Tanh, nn.ReLU}
-    if not is_plain or any(x._forward_hooks or x._forward_pre_hooks for x in layers):
+    if not is_plain or any(x._forward_hooks or x._forward_pre_hooks for x in network.modules()):
         return lambda x: network(torch.from_numpy(x).to(device)).numpy(force=True)
     arrays = [{name: p.numpy(force=True) for name, p in x.named_parameters()} for x in layers]
 
@@ -469,7 +473,7 @@ def compiled(function):
             return graph(*inputs)
         except torch._dynamo.exc.FailOnRecompileLimitHit:
             fail("a size, or a number read from args, changes too often: pass it to the update", 1)
-        except torch._dynamo.exc.TorchDynamoException as error:
+        except (torch._dynamo.exc.TorchDynamoException, AssertionError) as error:
             cache = torch._inductor.runtime.cache_dir_utils.cache_dir()
             reason = " ".join(str(error).split())[:200]
             say(f"not compiled, so it is slower: {reason} (the compiler's cache is {cache})")
@@ -565,6 +569,7 @@ class Run:
                     file = io.BytesIO()
                     torch.save(part.state_dict(), file)
                     read_state(io.BytesIO(file.getvalue()))
+            self._state_dicts()
         self._write("config.json", json.dumps(self.config, indent=2) + "\n")
         self._write("eval.csv", self.eval_csv)
         # TensorBoard drops what was logged after the checkpoint
@@ -588,12 +593,21 @@ class Run:
         for summary in hparams(args, dict.fromkeys(metrics, 0)):
             self.writer.file_writer.add_summary(summary)
 
+    def _state_dicts(self):
+        """Return those of all parts; they hold each tensor that an optimizer steps."""
+        states = {name: part.state_dict() for name, part in self.state.items()}
+        saved = {x.data_ptr() for x in tree_leaves(states) if torch.is_tensor(x)}
+        groups = [group for x in self.state.values() for group in getattr(x, "param_groups", [])]
+        if any(p.data_ptr() not in saved for group in groups for p in group["params"]):
+            fail("`state` lacks a tensor that an optimizer steps (was a layer replaced?)", 1)
+        return states
+
     def save(self, step):
         """Write a checkpoint: all that resuming needs, between two episodes."""
         self.writer.flush()  # so that the curves reach as far as the checkpoint
         checkpoint = {
             "step": step,
-            "state": {name: part.state_dict() for name, part in self.state.items()},
+            "state": self._state_dicts(),
             "torch": torch.get_rng_state(),
             "eval_csv": self.eval_csv,
             "processor_seconds": time.process_time() - self.processor_begun,

@@ -31,6 +31,7 @@ import numpy as np
 import torch
 import torch.nn as nn
 from torch.func import functional_call, grad_and_value
+from torch.utils._pytree import tree_leaves
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 from tqdm import tqdm
@@ -158,8 +159,6 @@ class ReplayBuffer:
     The final observation of an episode has a row, too: it is no step, so it is never drawn.
     """
 
-    ARRAYS = ("observations", "actions", "rewards", "terminated", "is_step")
-
     def __init__(self, rows, env):
         self.rows, self.position, self.size = rows, 0, 0
         self.observations = np.zeros((rows, *env.observation_space.shape), np.float32)
@@ -186,15 +185,21 @@ class ReplayBuffer:
         return [torch.from_numpy(array) for array in batch]
 
     def state_dict(self):
-        """Return the filled rows, as tensors: torch.save() writes these without copying them."""
-        state = {name: torch.from_numpy(getattr(self, name)[: self.size]) for name in self.ARRAYS}
-        return state | {"position": self.position, "size": self.size}
+        """Return all attributes; of arrays that have a row for each step the filled rows."""
+        state = dict(vars(self))
+        for name, array in state.items():
+            if isinstance(array, np.ndarray) and array.shape[:1] == (self.rows,):
+                state[name] = torch.from_numpy(array[: self.size])  # torch.save() copies no tensor
+        return state
 
     def load_state_dict(self, state):
-        """Copy the rows of a state_dict back."""
-        self.position, self.size = state["position"], state["size"]
-        for name in self.ARRAYS:
-            getattr(self, name)[: self.size] = state[name].numpy()
+        """Take the attributes of a state_dict, and copy the rows back."""
+        for name, value in state.items():
+            array = getattr(self, name)
+            if isinstance(array, np.ndarray) and torch.is_tensor(value):
+                array[: len(value)] = value.numpy()
+            else:
+                setattr(self, name, value)
 
 
 # LOSSES. Each returns (loss, {curve: value}). updater() differentiates it with respect to the
@@ -359,6 +364,9 @@ def updater(loss, network, optimizer, args):
     module = nn.ModuleList([network])
     module.forward = functools.partial(loss, network)
     parameters = dict(module.named_parameters())
+    own = set(map(id, parameters.values()))
+    if any(id(p) not in own for group in optimizer.param_groups for p in group["params"]):
+        fail("an optimizer also steps tensors that its update does not learn: leave them out", 1)
     layers = [x for _, x in module.named_modules(remove_duplicate=False) if x._parameters]
     is_shared = len(set(layers)) < len(layers)  # a layer at two places must be swapped once
     call = functools.partial(functional_call, module, tie_weights=not is_shared)
@@ -428,7 +436,7 @@ def compiled(function):
             return graph(*inputs)
         except torch._dynamo.exc.FailOnRecompileLimitHit:
             fail("a size, or a number read from args, changes too often: pass it to the update", 1)
-        except torch._dynamo.exc.TorchDynamoException as error:
+        except (torch._dynamo.exc.TorchDynamoException, AssertionError) as error:
             cache = torch._inductor.runtime.cache_dir_utils.cache_dir()
             reason = " ".join(str(error).split())[:200]
             say(f"not compiled, so it is slower: {reason} (the compiler's cache is {cache})")
@@ -524,6 +532,7 @@ class Run:
                     file = io.BytesIO()
                     torch.save(part.state_dict(), file)
                     read_state(io.BytesIO(file.getvalue()))
+            self._state_dicts()
         self._write("config.json", json.dumps(self.config, indent=2) + "\n")
         self._write("eval.csv", self.eval_csv)
         # TensorBoard drops what was logged after the checkpoint
@@ -547,12 +556,21 @@ class Run:
         for summary in hparams(args, dict.fromkeys(metrics, 0)):
             self.writer.file_writer.add_summary(summary)
 
+    def _state_dicts(self):
+        """Return those of all parts; they hold each tensor that an optimizer steps."""
+        states = {name: part.state_dict() for name, part in self.state.items()}
+        saved = {x.data_ptr() for x in tree_leaves(states) if torch.is_tensor(x)}
+        groups = [group for x in self.state.values() for group in getattr(x, "param_groups", [])]
+        if any(p.data_ptr() not in saved for group in groups for p in group["params"]):
+            fail("`state` lacks a tensor that an optimizer steps (was a layer replaced?)", 1)
+        return states
+
     def save(self, step):
         """Write a checkpoint: all that resuming needs, between two episodes."""
         self.writer.flush()  # so that the curves reach as far as the checkpoint
         checkpoint = {
             "step": step,
-            "state": {name: part.state_dict() for name, part in self.state.items()},
+            "state": self._state_dicts(),
             "torch": torch.get_rng_state(),
             "eval_csv": self.eval_csv,
             "processor_seconds": time.process_time() - self.processor_begun,

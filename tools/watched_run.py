@@ -25,6 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import noisy_wrappers as noisy  # noqa: E402
 from analysis.errors import fail  # noqa: E402
+from analysis.words import counted  # noqa: E402
 from sweep.options import GIVEN_BY_THE_GRID  # noqa: E402
 
 # A test and the end of a rollout fall within an episode; the buffer is filled twice. Episodes have
@@ -146,7 +147,7 @@ def train(path, options, runs_dir, episodes=0, updates=0, **changed):
     It is stopped when it has learned with a number of updates, and after a number of episodes.
     Return what was seen:
     - `updates`, for each loss the network that it learns, its parameters before the first update,
-      the curves and the gradient of the first, the inputs of the last
+      the curves and the gradient of the first, the inputs of the last, and see plain_gradient()
     - `idle`, {name: (network, optimizer)} of the losses whose update was never called
     - `with_gradient`, the ids of parameters that had a gradient in any update
     - `start`, the step at which it began, and `episodes`, how many ended
@@ -213,11 +214,7 @@ def watch_updates(updater, seen):
         own = SimpleNamespace(name=getattr(loss, "__name__", "a loss"), loss=loss, network=network)
         own.parameters, known = parameters, set(map(id, network.parameters()))
         own.optimizer = optimizer
-        own.stepped = stepped = {id(p) for group in optimizer.param_groups for p in group["params"]}
-        text = f"the optimizer of {own.name}() also steps {len(stepped - known)} tensors of others"
-        check(
-            stepped <= known, f"{text}, by old gradients: give it this network's parameters alone"
-        )
+        own.stepped = {id(p) for group in optimizer.param_groups for p in group["params"]}
         seen.idle[own.name] = (network, optimizer)
 
         def watched(*inputs):
@@ -228,6 +225,7 @@ def watch_updates(updater, seen):
                 with noisy.kept_generators(), Broadcasts(own.name):
                     # copies, because a layer may change in forward(), as spectral_norm() does
                     loss(*copy.deepcopy((network, *inputs)))
+                expected, own.strays = plain_gradient(loss, network, inputs)
             if seen.start == 0:
                 check_transitions(own.name, inputs, seen.places)
             curves, own.inputs = update(*inputs), inputs
@@ -239,11 +237,43 @@ def watch_updates(updater, seen):
                 own.before = before
                 learned = {name: p for name, p in parameters.items() if p.grad is not None}
                 own.first = curves | {name: p.grad.clone() for name, p in learned.items()}
+                gradient = {name: own.first.get(name, p.new_zeros(p.shape)) for name, p in expected}
+                own.gradient_gap = gap_between(gradient.values(), (p for _, p in expected))
             return curves
 
         return watched
 
     return watched_updater
+
+
+def plain_gradient(loss, network, inputs):
+    """Return a loss's gradient by autograd, [(name, tensor)], and how many strays have one, too.
+
+    A stray is a tensor that requires a gradient and is in no module that the loss was given.
+    """
+    modules = [x for x in (network, *inputs) if isinstance(x, torch.nn.Module)]
+    states = copy.deepcopy([module.state_dict() for module in modules])
+    with noisy.kept_generators(), torch.enable_grad():
+        value, _ = loss(network, *inputs)
+    given = {id(p) for module in modules for p in module.parameters()}
+    given |= set(map(id, tensors_among(inputs)))
+    nodes, strays = {value.grad_fn}, set()
+    new = nodes
+    while new:
+        new = {node for parent in new for node, _ in parent.next_functions if node} - nodes
+        nodes |= new
+        strays |= {id(node.variable) for node in new if hasattr(node, "variable")} - given
+    learned = [(name, p) for name, p in network.named_parameters() if p.requires_grad]
+    found = torch.autograd.grad(value, [p for _, p in learned], materialize_grads=True)
+    for module, state in zip(modules, states, strict=True):
+        module.load_state_dict(state)
+    return [(name, p) for (name, _), p in zip(learned, found, strict=True)], len(strays)
+
+
+def gap_between(gradient, other):
+    """Return how far the directions of two gradients are from each other; PPO clips the length."""
+    gradient, other = (torch.cat([p.flatten() for p in tensors]) for tensors in (gradient, other))
+    return float((gradient / gradient.norm() - other / other.norm()).abs().max())
 
 
 class Broadcasts(TorchFunctionMode):
@@ -324,6 +354,12 @@ def remarks(seen):
     """Yield what may be meant so."""
     for name in seen.idle:
         yield f" (with these options nothing learns by {name}())"
+    for update in seen.updates:
+        if update.strays:
+            what = f"{counted(update.strays, 'tensor')} outside of its modules that nothing learns"
+            yield f" ({update.name}() depends on {what})"
+        if update.gradient_gap > 1e-6:  # it is not a number where the gradient is zero
+            yield f" ({update.name}() is learned by another gradient than autograd's)"
     tried = [(update, *one) for update in seen.updates for one in try_inputs(update)]
     used = {id(part) for _, _, part, is_used in tried if is_used}
     for update, name, part, is_used in tried:

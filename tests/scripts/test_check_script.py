@@ -64,7 +64,7 @@ MISTAKES = {  # the promise, the script and what is said: the texts that are rep
     ("acts", "sac", "actor_loss() learns actions"): [  # others, in the second dimension
         ("        return actions, log", "        return squashed * self.action_scale, log")
     ],
-    ("trains", "sac", "also steps 12 tensors of others"): [
+    ("trains", "sac", "steps tensors that its update does not learn"): [
         ("Adam(actor.parameters(), ", "Adam([*actor.parameters(), *critic.parameters()], ")
     ],
     ("trains", "td3", "changes an observation in place"): [
@@ -210,6 +210,25 @@ def test_a_part_that_two_optimizers_hold_is_told(tmp_path):
     assert "and actor_loss() share 2 tensors" in check_script.trains(broken(tmp_path, "sac", layer))
 
 
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (
+            before("    update_critic = up", "[p.register_hook(abs) for p in critic.parameters()]"),
+            "critic_loss() is learned by another gradient than autograd's",
+        ),
+        (
+            (INPUTS, "inputs = torch.cat([observations, self.encoder[0](actions)], 1)"),
+            "critic_loss() depends on 2 tensors outside of its modules that nothing learns",
+        ),
+    ],
+)
+def test_a_gradient_that_is_lost_is_told(change, told, tmp_path):
+    """It needs eyes that no error has: everything trains."""
+    layer = before("        self.networks = nn.", "self.encoder = [nn.Linear(1, 1)]")
+    assert f"({told})" in check_script.trains(broken(tmp_path, "sac", layer, change))
+
+
 def test_what_is_right_is_told_by_no_word(tmp_path):
     """A layer that is frozen at first, and a number that a loss knows to be a tensor."""
     frozen = "actor.network[0].requires_grad_(global_step > 60)"
@@ -246,7 +265,8 @@ def test_an_item_of_a_minibatch_that_another_loss_uses_is_no_remark():
 
     def update(name, loss):
         more = {"loss": loss, "network": network, "inputs": [batch], "optimizer": None}
-        return SimpleNamespace(name=name, stepped=set(), **more)
+        more |= {"stepped": set(), "strays": 0, "gradient_gap": 0}
+        return SimpleNamespace(name=name, **more)
 
     updates = [update("a", lambda network, batch: (batch[0].sum(), {}))]
     args = ppo.Args()

@@ -316,6 +316,19 @@ def test_state_that_cannot_be_read_back_is_named_at_the_start(tmp_path, capsys):
         assert line.startswith("error: 'mine' needs a state_dict() of tensors, arrays, numbers: ")
 
 
+def test_what_an_optimizer_steps_is_in_the_state(tmp_path, capsys):
+    network = torch.nn.Sequential(torch.nn.Linear(1, 1))
+    optimizer = torch.optim.SGD(network.parameters())
+    line = refused(capsys, lambda: a_run(tmp_path / "0").resume({"optimizer": optimizer}), code=1)
+    assert "`state` lacks a tensor that an optimizer steps" in line
+    run = a_run(tmp_path / "1")
+    run.resume({"mine": Part(nested=[{"a": network[0].state_dict()}]), "optimizer": optimizer})
+    run.save(8)  # a part may keep a network as it likes
+    run.state["mine"] = network
+    network[0] = torch.nn.Linear(1, 1)
+    assert "(was a layer replaced?)" in refused(capsys, run.save, 16, code=1)
+
+
 def test_a_checkpoint_of_other_parts_is_named(tmp_path, capsys):
     save(tmp_path, Part(a=1))
     state = {"mine": Part(a=1), "scheduler": Part(b=2)}

@@ -634,6 +634,27 @@ def test_what_cannot_be_compiled_is_computed_without(capsys):
     torch.testing.assert_close(compiled, plain, rtol=0, atol=0)
 
 
+@pytest.mark.slow
+def test_numbers_of_numpy_in_a_loss_are_computed_without_the_compiler(capsys):
+    network, _, x = two_networks()
+    scale = [np.float64(2)]
+
+    def loss(network, x):
+        return scale[0] * network(x).sum(), {}
+
+    args = sac.Args()
+    sac.updater(loss, network, torch.optim.SGD(network.parameters()), args)(x)
+    assert capsys.readouterr().out.startswith("not compiled, so it is slower: ")
+
+
+@pytest.mark.parametrize("script", SCRIPTS.values())
+def test_an_optimizer_steps_only_what_its_update_learns(script, capsys):
+    network, other, _ = two_networks()
+    optimizer = torch.optim.SGD([*network.parameters(), *other.parameters()])
+    line = refused(capsys, script.updater, print, network, optimizer, script.Args(), code=1)
+    assert "also steps tensors that its update does not learn" in line
+
+
 def test_only_bf16_computes_products_in_bfloat16():
     def loss(network, x):
         product = network(x)
@@ -641,7 +662,7 @@ def test_only_bf16_computes_products_in_bfloat16():
 
     for precision, dtype in [("highest", torch.float32), ("bf16", torch.bfloat16)]:
         network, args = nn.Linear(3, 2), sac.Args(compile=False, matmul_precision=precision)
-        curves = sac.updater(loss, network, mock.Mock(), args)(torch.ones(4, 3))
+        curves = sac.updater(loss, network, mock.Mock(param_groups=[]), args)(torch.ones(4, 3))
         assert curves["product"].dtype == dtype
         assert network.bias.grad.dtype == torch.float32
 
@@ -764,6 +785,7 @@ def test_a_network_acts_in_numpy_as_in_pytorch(layers, translated):
             assert forward.called == (not translated)
             called = ppo.in_numpy(network.__call__, "cpu")  # as a method of an agent would be
             assert called(x.numpy()).tolist() == expected.tolist()
+        assert ppo.in_numpy(hooked(network), "cpu")(x.numpy()).tolist() == network(x).tolist()
 
 
 def test_normalized_numbers_are_clipped():
@@ -777,3 +799,21 @@ def test_a_replay_buffer_stores_each_observation_once():
     )
     state = sac.ReplayBuffer(50, env).__dict__
     assert sum(x.nbytes for x in state.values() if isinstance(x, np.ndarray)) < 50 * 1000 * 4 * 1.1
+
+
+@pytest.mark.parametrize("script", [sac, td3])
+def test_what_is_added_to_a_replay_buffer_is_resumed(script):
+    """Such as priorities: a row for each step, a tree of them, a tensor and a number."""
+    box = gym.spaces.Box(-1, 1, (2,))
+    old, new = (
+        script.ReplayBuffer(4, SimpleNamespace(observation_space=box, action_space=box))
+        for _ in range(2)
+    )
+    for buffer, value in ((old, 1.0), (new, 0.0)):
+        buffer.priorities, buffer.tree = np.full(4, value), np.full(7, value)
+        buffer.tensor, buffer.beta = torch.full((4,), value), value
+    old.add(*np.ones((2, 2)), 1.0, np.ones(2), False, False)
+    new.load_state_dict(old.state_dict())
+    assert new.priorities.tolist() == [1, 1, 0, 0] and new.tree.tolist() == 7 * [1]
+    assert new.tensor.tolist() == 4 * [1] and (new.beta, new.size, new.position) == (1, 2, 1)
+    assert new.rewards.tolist() == [1, 0, 0, 0] and new.is_step.tolist() == [True] + 3 * [False]

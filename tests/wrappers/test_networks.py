@@ -3,6 +3,7 @@
 import json
 import random
 import weakref
+from contextlib import nullcontext
 from types import SimpleNamespace
 from unittest import mock
 
@@ -114,6 +115,21 @@ def test_what_was_made_is_closed_where_the_rest_cannot_be_made(broken):
     with pytest.raises((RuntimeError, SpaceError)):
         make_environments(make_env, args, test_seed=1)
     assert len(made) == 2 - broken and all(env.close.call_count == 1 for env in made)
+
+
+@pytest.mark.parametrize("name", ["NormalizeObservation", "NormalizeReward"])
+def test_statistics_that_only_training_would_have_are_refused(name):
+    args = {"env_id": "Given", "seed": 1, "env_kwargs": (), "max_episode_steps": None}
+    args |= dict.fromkeys(("noise", "noise_rate", "test_noise", "test_noise_rate"), ())
+
+    def make_env(env_id, **kwargs):
+        env = getattr(gym.wrappers, name)(Given(BOX))
+        env.update_running_mean = updates
+        return env
+
+    for updates in (False, True):
+        with pytest.raises(SpaceError, match="other statistics") if updates else nullcontext():
+            make_environments(make_env, args, test_seed=1)
 
 
 def test_an_environment_may_tell_of_a_noise_of_its_own():
