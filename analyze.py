@@ -57,7 +57,7 @@ class Args:
     """where the tables, the figures and report.html go; by default RUNS_DIR/results"""
     latex: bool = False
     """also write the tables as Markdown and LaTeX, and the figures as pdf; once they are there,
-    each analysis into the same folder renews them"""
+    each analysis into the same folder renews them, at the --figure-width that it is given"""
     figure_width: float = PAGE
     """inches of a paper's text, for which figures and LaTeX tables are made; every figure is also
     made for a column of 3.25 inches. In ICML 6.75, in NeurIPS 5.5, in ACM's sigconf 7"""

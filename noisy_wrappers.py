@@ -1470,7 +1470,8 @@ def make_environments(
         if any(layer.update_running_mean for layer in _layers(test_env, normalizers)):
             raise SpaceError(
                 "NormalizeObservation and NormalizeReward have other statistics in tests, and none "
-                "after a resume: PPO normalizes by itself, SAC by change 8 of docs/changing.md"
+                "after a resume: PPO normalizes both itself; for observations of SAC see change 8 "
+                "of docs/changing.md"
             )
         seed_globals(args["seed"])
         env = make_env(args["env_id"], **kwargs)

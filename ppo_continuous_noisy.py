@@ -234,8 +234,8 @@ def learn(args, env, test_env, stop):
     update = updater(ppo_loss, agent, optimizer, args)
 
     # RESUME: all that training changes belongs in `state`. What is missing there starts anew when a
-    # run is resumed, without a warning: tools/check_script.py finds it. Random numbers are drawn on
-    # the CPU, because the generator of a GPU is not saved.
+    # run is resumed: tools/check_script.py finds it. Random numbers are drawn on the CPU, because
+    # the generator of a GPU is not saved.
     state = {"agent": agent, "optimizer": optimizer, "rollout": rollout}
     state |= {"observation_stats": observation_stats, "return_stats": return_stats}
     start = run.resume(state | {"env": noisy.EnvState(env, rng)})
@@ -379,7 +379,8 @@ def updater(loss, network, optimizer, args):
     module.forward = functools.partial(loss, network)
     parameters = dict(module.named_parameters())
     own = set(map(id, parameters.values()))
-    if any(id(p) not in own for group in optimizer.param_groups for p in group["params"]):
+    groups = getattr(optimizer, "param_groups", [])
+    if any(id(p) not in own for group in groups for p in group["params"]):
         fail("an optimizer also steps tensors that its update does not learn: leave them out", 1)
     layers = [x for _, x in module.named_modules(remove_duplicate=False) if x._parameters]
     is_shared = len(set(layers)) < len(layers)  # a layer at two places must be swapped once
@@ -569,7 +570,7 @@ class Run:
                     file = io.BytesIO()
                     torch.save(part.state_dict(), file)
                     read_state(io.BytesIO(file.getvalue()))
-            self._state_dicts()
+        self._state_dicts()
         self._write("config.json", json.dumps(self.config, indent=2) + "\n")
         self._write("eval.csv", self.eval_csv)
         # TensorBoard drops what was logged after the checkpoint

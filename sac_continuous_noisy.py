@@ -184,22 +184,21 @@ class ReplayBuffer:
         batch += [self.observations[(rows + 1) % self.rows], self.terminated[rows]]
         return [torch.from_numpy(array) for array in batch]
 
+    def _arrays(self):
+        """Return {name: array} of all arrays with a row for each step, also of those you add."""
+        arrays = {name: x for name, x in vars(self).items() if isinstance(x, np.ndarray)}
+        return {name: x for name, x in arrays.items() if x.shape[:1] == (self.rows,)}
+
     def state_dict(self):
-        """Return all attributes; of arrays that have a row for each step the filled rows."""
-        state = dict(vars(self))
-        for name, array in state.items():
-            if isinstance(array, np.ndarray) and array.shape[:1] == (self.rows,):
-                state[name] = torch.from_numpy(array[: self.size])  # torch.save() copies no tensor
-        return state
+        """Return the filled rows, as tensors: torch.save() writes these without copying them."""
+        state = {name: torch.from_numpy(x[: self.size]) for name, x in self._arrays().items()}
+        return state | {"position": self.position, "size": self.size}
 
     def load_state_dict(self, state):
-        """Take the attributes of a state_dict, and copy the rows back."""
-        for name, value in state.items():
-            array = getattr(self, name)
-            if isinstance(array, np.ndarray) and torch.is_tensor(value):
-                array[: len(value)] = value.numpy()
-            else:
-                setattr(self, name, value)
+        """Copy the rows of a state_dict back."""
+        self.position, self.size = state["position"], state["size"]
+        for name, array in self._arrays().items():
+            array[: self.size] = state[name].numpy()
 
 
 # LOSSES. Each returns (loss, {curve: value}). updater() differentiates it with respect to the
@@ -271,8 +270,8 @@ def learn(args, env, test_env, stop):
     critic_parameters, target_parameters = list(critic.parameters()), list(target.parameters())
 
     # RESUME: all that training changes belongs in `state`. What is missing there starts anew when a
-    # run is resumed, without a warning: tools/check_script.py finds it. Random numbers are drawn on
-    # the CPU, because the generator of a GPU is not saved.
+    # run is resumed: tools/check_script.py finds it. Random numbers are drawn on the CPU, because
+    # the generator of a GPU is not saved.
     state = {"actor": actor, "critic": critic, "target": target, "temperature": temperature}
     state |= {"actor_optimizer": actor_optimizer, "q_optimizer": q_optimizer}
     state |= {"alpha_optimizer": alpha_optimizer, "buffer": buffer, "env": noisy.EnvState(env, rng)}
@@ -365,7 +364,8 @@ def updater(loss, network, optimizer, args):
     module.forward = functools.partial(loss, network)
     parameters = dict(module.named_parameters())
     own = set(map(id, parameters.values()))
-    if any(id(p) not in own for group in optimizer.param_groups for p in group["params"]):
+    groups = getattr(optimizer, "param_groups", [])
+    if any(id(p) not in own for group in groups for p in group["params"]):
         fail("an optimizer also steps tensors that its update does not learn: leave them out", 1)
     layers = [x for _, x in module.named_modules(remove_duplicate=False) if x._parameters]
     is_shared = len(set(layers)) < len(layers)  # a layer at two places must be swapped once
@@ -532,7 +532,7 @@ class Run:
                     file = io.BytesIO()
                     torch.save(part.state_dict(), file)
                     read_state(io.BytesIO(file.getvalue()))
-            self._state_dicts()
+        self._state_dicts()
         self._write("config.json", json.dumps(self.config, indent=2) + "\n")
         self._write("eval.csv", self.eval_csv)
         # TensorBoard drops what was logged after the checkpoint

@@ -22,7 +22,7 @@ IQM = ["iqm", "iqm_low", "iqm_high"]
 IQM_CHANGE = ["iqm_change_percent", "iqm_change_low", "iqm_change_high"]
 # What a comparison does not tell where all returns are equal
 UNKNOWN = ["t", "p", "difference_low", "difference_high", *IQM_CHANGE]
-UNKNOWN += ["difference_percent", "percent_low", "percent_high"]
+UNKNOWN += ["difference_percent", "percent_low", "percent_high", "detectable"]
 UNTESTED = ["t", "p", "smallest_p", "detectable"]  # what none tells that has no test
 VERDICT = ["p_adjusted", "comparisons", "verdict"]
 COMPARED = [*statistics.Comparison._fields, *VERDICT, *IQM_CHANGE, *PROBABILITY, "lopsided"]

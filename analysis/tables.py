@@ -65,7 +65,7 @@ def consistency_rows(judged, together):
 
     Every environment counts in the share, by the sign of its difference, but those in which all
     returns are equal; the average is over those whose baseline has a percentage, and the others are
-    named. p is that of the same environments together: there is none if one has too few runs.
+    named. p is that of the same environments together: there is none if one cannot be tested.
     """
     keys = [*STUDY, "noise", "noise_rate"]
     tests = together.set_index([*keys, "environments"])[["p", "p_adjusted"]].to_dict("index")
@@ -127,7 +127,8 @@ def lopsided_notes(compared):
     together = compared.rates_together[compared.rates_together["smallest_p"].isna()]
 
     def note(key, rows, said):
-        seeds = sorted({seeds_of(*pair) for pair in rows[["n", "n_baseline"]].to_numpy()})
+        numbers = rows[["n", "n_baseline", "n_baseline_most"]].to_numpy()
+        seeds = sorted({seeds_of(*row) for row in numbers})
         where = ", ".join([study_name(*key), *filter(None, rows["environment"].unique())])
         return f"{where}: with {listed(seeds)} runs with and without noise {said}"
 

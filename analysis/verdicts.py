@@ -96,7 +96,7 @@ def difference_in_words(row, unit="", of=""):
             text = "effects that have no median"
         elif np.isinf(row.effect_size):
             way = "higher" if row.effect_size > 0 else "lower"
-            text = f"{way} in the median environment, where neither side's runs vary"
+            text = f"{way}, by returns that never vary in at least half of the environments"
     else:
         spread = spread_of(row)
         text = rounded(row.difference, spread)

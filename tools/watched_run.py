@@ -214,7 +214,9 @@ def watch_updates(updater, seen):
         own = SimpleNamespace(name=getattr(loss, "__name__", "a loss"), loss=loss, network=network)
         own.parameters, known = parameters, set(map(id, network.parameters()))
         own.optimizer = optimizer
-        own.stepped = {id(p) for group in optimizer.param_groups for p in group["params"]}
+        own.stepped = stepped = {id(p) for group in optimizer.param_groups for p in group["params"]}
+        text = f"the optimizer of {own.name}() also steps {len(stepped - known)} tensors of others"
+        check(stepped <= known, f"{text}: give it this network's parameters alone")
         seen.idle[own.name] = (network, optimizer)
 
         def watched(*inputs):
@@ -225,7 +227,8 @@ def watch_updates(updater, seen):
                 with noisy.kept_generators(), Broadcasts(own.name):
                     # copies, because a layer may change in forward(), as spectral_norm() does
                     loss(*copy.deepcopy((network, *inputs)))
-                expected, own.strays = plain_gradient(loss, network, inputs)
+                trainable = [(n, p) for n, p in network.named_parameters() if p.requires_grad]
+                expected, own.strays = plain_gradient(loss, network, inputs, trainable)
             if seen.start == 0:
                 check_transitions(own.name, inputs, seen.places)
             curves, own.inputs = update(*inputs), inputs
@@ -237,8 +240,8 @@ def watch_updates(updater, seen):
                 own.before = before
                 learned = {name: p for name, p in parameters.items() if p.grad is not None}
                 own.first = curves | {name: p.grad.clone() for name, p in learned.items()}
-                gradient = {name: own.first.get(name, p.new_zeros(p.shape)) for name, p in expected}
-                own.gradient_gap = gap_between(gradient.values(), (p for _, p in expected))
+                gradient = [torch.zeros_like(p) if p.grad is None else p.grad for _, p in trainable]
+                own.gradient_gap = gap_between(gradient, expected)
             return curves
 
         return watched
@@ -246,11 +249,13 @@ def watch_updates(updater, seen):
     return watched_updater
 
 
-def plain_gradient(loss, network, inputs):
-    """Return a loss's gradient by autograd, [(name, tensor)], and how many strays have one, too.
+def plain_gradient(loss, network, inputs, trainable):
+    """Return a loss's gradient by autograd, of [(name, parameter)], and the ids of strays.
 
     A stray is a tensor that requires a gradient and is in no module that the loss was given.
     """
+    if not trainable:
+        return [], set()
     modules = [x for x in (network, *inputs) if isinstance(x, torch.nn.Module)]
     states = copy.deepcopy([module.state_dict() for module in modules])
     with noisy.kept_generators(), torch.enable_grad():
@@ -263,15 +268,16 @@ def plain_gradient(loss, network, inputs):
         new = {node for parent in new for node, _ in parent.next_functions if node} - nodes
         nodes |= new
         strays |= {id(node.variable) for node in new if hasattr(node, "variable")} - given
-    learned = [(name, p) for name, p in network.named_parameters() if p.requires_grad]
-    found = torch.autograd.grad(value, [p for _, p in learned], materialize_grads=True)
+    gradient = torch.autograd.grad(value, [p for _, p in trainable], materialize_grads=True)
     for module, state in zip(modules, states, strict=True):
         module.load_state_dict(state)
-    return [(name, p) for (name, _), p in zip(learned, found, strict=True)], len(strays)
+    return gradient, strays
 
 
 def gap_between(gradient, other):
     """Return how far the directions of two gradients are from each other; PPO clips the length."""
+    if not gradient:
+        return 0.0
     gradient, other = (torch.cat([p.flatten() for p in tensors]) for tensors in (gradient, other))
     return float((gradient / gradient.norm() - other / other.norm()).abs().max())
 
@@ -354,11 +360,13 @@ def remarks(seen):
     """Yield what may be meant so."""
     for name in seen.idle:
         yield f" (with these options nothing learns by {name}())"
+    learned = set().union(*(update.stepped for update in seen.updates))
+    rounds = seen.args.matmul_precision == "bf16"
     for update in seen.updates:
-        if update.strays:
-            what = f"{counted(update.strays, 'tensor')} outside of its modules that nothing learns"
-            yield f" ({update.name}() depends on {what})"
-        if update.gradient_gap > 1e-6:  # it is not a number where the gradient is zero
+        if update.strays - learned:
+            number = counted(len(update.strays - learned), "tensor")
+            yield f" ({update.name}() depends on {number} outside its modules that nothing learns)"
+        if update.gradient_gap > 1e-6 and not rounds:  # no number where the gradient is zero
             yield f" ({update.name}() is learned by another gradient than autograd's)"
     tried = [(update, *one) for update in seen.updates for one in try_inputs(update)]
     used = {id(part) for _, _, part, is_used in tried if is_used}

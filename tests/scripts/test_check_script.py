@@ -219,7 +219,7 @@ def test_a_part_that_two_optimizers_hold_is_told(tmp_path):
         ),
         (
             (INPUTS, "inputs = torch.cat([observations, self.encoder[0](actions)], 1)"),
-            "critic_loss() depends on 2 tensors outside of its modules that nothing learns",
+            "critic_loss() depends on 2 tensors outside its modules that nothing learns",
         ),
     ],
 )
@@ -265,7 +265,7 @@ def test_an_item_of_a_minibatch_that_another_loss_uses_is_no_remark():
 
     def update(name, loss):
         more = {"loss": loss, "network": network, "inputs": [batch], "optimizer": None}
-        more |= {"stepped": set(), "strays": 0, "gradient_gap": 0}
+        more |= {"stepped": set(), "strays": set(), "gradient_gap": 0}
         return SimpleNamespace(name=name, **more)
 
     updates = [update("a", lambda network, batch: (batch[0].sum(), {}))]
