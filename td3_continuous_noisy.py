@@ -405,6 +405,7 @@ def compiled(function):
             return graph(*inputs)
         except torch._dynamo.exc.FailOnRecompileLimitHit:
             fail("a size, or a number read from args, changes too often: pass it to the update", 1)
+        # an AssertionError where a loss reads a number of NumPy
         except (torch._dynamo.exc.TorchDynamoException, AssertionError) as error:
             cache = torch._inductor.runtime.cache_dir_utils.cache_dir()
             reason = " ".join(str(error).split())[:200]

@@ -36,8 +36,6 @@ SCORE_COLUMNS = [*STUDY, *SCORE_COLUMNS.split()]
 MORE = ["percent_low", "percent_high", "n_baseline_most", "primary", "elsewhere", "where"]
 MORE += ["lopsided"]  # what sentences need besides
 
-UNCLEAR = "no clear difference under noise"
-
 
 def read_robustness(runs, metric=RETURN):
     """Read robustness.csv of runs that count: one row per run and condition.
@@ -297,15 +295,15 @@ def not_compared(table, scores):
 def robustness_sentences(scores, metric):
     """Yield one plain sentence for each training configuration: does it return more under noise?"""
     unit = verdicts.POINTS if metric == SUCCESS else ""
-    more, less = "returns more under noise", "returns less under noise"
+    ways = {1: "returns more", -1: "returns less", 0: verdicts.UNCLEAR}
     if metric == SUCCESS:
-        more, less = "succeeds more often under noise", "succeeds less often under noise"
+        ways |= {1: "succeeds more often", -1: "succeeds less often"}
     for row in scores.itertuples():
         where = row.environment or row.where
         study = study_name(*(getattr(row, name) for name in STUDY))
         start = f"{study} on {where}, trained with {row.noise} at rate {row.noise_rate}"
         over = f"over {row.conditions} of {counted(row.conditions_tested, 'test condition')}"
-        shown, limit = UNCLEAR, ""
+        shown, limit = f"{ways[0]} under noise", ""
         evidence = verdicts.difference_in_words(row, unit, " of the clean return without noise")
         if min(row.n, row.n_baseline) < 2:
             shown = "too few seeds for a test of robustness"
@@ -318,7 +316,7 @@ def robustness_sentences(scores, metric):
             limit = verdicts.excluded(row, unit) + verdicts.cannot_show(row)
         if verdicts.significant(row.p_holm):
             way = verdicts.direction(row.t, row.effect_size, row.difference_percent)
-            shown = {1: more, -1: less, 0: UNCLEAR}[way]
+            shown = f"{ways[way]} under noise"
             limit = verdicts.undirected(row)
         if pd.notna(row.clean_change_percent):
             evidence += f"; clean return {percent(row.clean_change_percent)}"

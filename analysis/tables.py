@@ -138,8 +138,9 @@ def lopsided_notes(compared):
     ]
     for key, rows in pd.concat([rates, together]).groupby(STUDY, sort=False):
         alone = rows[rows["environment"] != ""]
-        places = ["there"] * (len(alone) > 0)
-        places += ["over several environments"] * (len(alone) < len(rows))
+        places = ["there"] if len(alone) else []
+        if len(alone) < len(rows):
+            places.append("over several environments")
         said = f"single rates have no verdict {listed(places)}, which would be wrong too often"
         notes.append(note(key, alone if len(alone) else rows, said))
     return notes

@@ -216,6 +216,7 @@ def watch_updates(updater, seen):
         own.optimizer = optimizer
         own.stepped = stepped = {id(p) for group in optimizer.param_groups for p in group["params"]}
         text = f"the optimizer of {own.name}() also steps {len(stepped - known)} tensors of others"
+        # as updater() itself says, unless it was rewritten
         check(stepped <= known, f"{text}: give it this network's parameters alone")
         seen.idle[own.name] = (network, optimizer)
 
@@ -227,7 +228,7 @@ def watch_updates(updater, seen):
                 with noisy.kept_generators(), Broadcasts(own.name):
                     # copies, because a layer may change in forward(), as spectral_norm() does
                     loss(*copy.deepcopy((network, *inputs)))
-                trainable = [(n, p) for n, p in network.named_parameters() if p.requires_grad]
+                trainable = [p for p in network.parameters() if p.requires_grad]
                 expected, own.strays = plain_gradient(loss, network, inputs, trainable)
             if seen.start == 0:
                 check_transitions(own.name, inputs, seen.places)
@@ -240,7 +241,7 @@ def watch_updates(updater, seen):
                 own.before = before
                 learned = {name: p for name, p in parameters.items() if p.grad is not None}
                 own.first = curves | {name: p.grad.clone() for name, p in learned.items()}
-                gradient = [torch.zeros_like(p) if p.grad is None else p.grad for _, p in trainable]
+                gradient = [torch.zeros_like(p) if p.grad is None else p.grad for p in trainable]
                 own.gradient_gap = gap_between(gradient, expected)
             return curves
 
@@ -250,7 +251,7 @@ def watch_updates(updater, seen):
 
 
 def plain_gradient(loss, network, inputs, trainable):
-    """Return a loss's gradient by autograd, of [(name, parameter)], and the ids of strays.
+    """Return a loss's gradient by autograd, for these parameters, and the ids of strays.
 
     A stray is a tensor that requires a gradient and is in no module that the loss was given.
     """
@@ -268,7 +269,7 @@ def plain_gradient(loss, network, inputs, trainable):
         new = {node for parent in new for node, _ in parent.next_functions if node} - nodes
         nodes |= new
         strays |= {id(node.variable) for node in new if hasattr(node, "variable")} - given
-    gradient = torch.autograd.grad(value, [p for _, p in trainable], materialize_grads=True)
+    gradient = torch.autograd.grad(value, trainable, materialize_grads=True)
     for module, state in zip(modules, states, strict=True):
         module.load_state_dict(state)
     return gradient, strays

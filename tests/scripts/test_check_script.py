@@ -224,7 +224,7 @@ def test_a_part_that_two_optimizers_hold_is_told(tmp_path):
     ],
 )
 def test_a_gradient_that_is_lost_is_told(change, told, tmp_path):
-    """It needs eyes that no error has: everything trains."""
+    """The script itself trains as if nothing were wrong."""
     layer = before("        self.networks = nn.", "self.encoder = [nn.Linear(1, 1)]")
     assert f"({told})" in check_script.trains(broken(tmp_path, "sac", layer, change))
 

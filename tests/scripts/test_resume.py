@@ -323,7 +323,7 @@ def test_what_an_optimizer_steps_is_in_the_state(tmp_path, capsys):
     assert "`state` lacks a tensor that an optimizer steps" in line
     run = a_run(tmp_path / "1")
     run.resume({"mine": Part(nested=[{"a": network[0].state_dict()}]), "optimizer": optimizer})
-    run.save(8)  # a part may keep a network as it likes
+    run.save(8)  # the tensors may lie anywhere in a state_dict()
     run.state["mine"] = network
     network[0] = torch.nn.Linear(1, 1)
     assert "(was a layer replaced?)" in refused(capsys, run.save, 16, code=1)
